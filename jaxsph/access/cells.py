@@ -1,0 +1,59 @@
+"""The sparse perspective grid: for every cell, the windows of its bundle's list that can touch it.
+
+Flow: lists -> [cells] -> cast -> image.
+
+A cell is a bundle of 8 x 8 rays times a slab of samples. Nothing is copied along depth: a particle that touches ten cells of
+a bundle is listed once and lies in ten windows. There is a window for each class of supports.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxsph.access.lists import BundleLists
+from jaxsph.access.ordering import Ordered
+
+
+@dataclasses.dataclass(frozen=True)
+class Cells:
+    """Windows `rank[begin : begin + length]` of a bundle's list, and their sum over classes.
+
+    A cell with `count` 0 is empty: no particle can touch it.
+    """
+
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+    count: Int[Array, "slabs bundles"]
+
+
+def find_cells(ordered: Ordered, lists: BundleLists) -> Cells:
+    """Bisect every bundle's list for the first and last rank of every slab and class."""
+    low, high = lists.start[:-1], lists.start[1:]
+    begin = _bisect(lists.rank, ordered.first_rank, low, high)
+    end = _bisect(lists.rank, ordered.last_rank, low, high)
+    length = jnp.maximum(end - begin, 0)
+    return Cells(begin, length, length.sum(0))
+
+
+def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
+    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (class, slab) pairs."""
+    shape = (*wanted.shape, low.shape[0])
+    low, high = jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape)
+    wanted = wanted[..., None]
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) // 2
+        smaller = (rank[jnp.minimum(middle, rank.shape[0] - 1)] < wanted) & (low < high)
+        return jnp.where(smaller, middle + 1, low), jnp.where(smaller, high, jnp.maximum(middle, low))
+
+    steps = lax.fori_loop(0, rank.shape[0].bit_length(), halve, (low, high))
+    return steps[0]
+
+
+jax.tree_util.register_dataclass(Cells, data_fields=["begin", "length", "count"], meta_fields=[])

@@ -1,0 +1,96 @@
+r"""Which rays a support sphere can touch: exact tests, rounded outwards.
+
+Flow: ordering -> [footprint] -> lists.
+
+Every test errs on the side of touching. Rounding is covered by terms that bound it, `ROUNDING * eps` of the magnitudes that
+enter, never by a share of the support.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.ordering import ROUNDING, Ordered
+from jaxsph.model.camera import Camera
+
+
+def pixel_ranges(
+    ordered: Ordered, camera: Camera, first_depth: Float[Array, ""], last_depth: Float[Array, ""]
+) -> tuple[Int[Array, " particles"], ...]:
+    """First and last column, first and last row of pixels whose rays can meet each sphere between the two depths.
+
+    Where the whole sphere lies in front of the eye, the tangents of its silhouette in the (x, z) plane bound x / z exactly;
+    the box `[x - H, x + H] / [s_0, s_1]` bounds it always. The tighter is taken. Empty ranges have first > last.
+    """
+    front = jnp.maximum(ordered.z - ordered.reach, first_depth)
+    back = jnp.minimum(ordered.z + ordered.reach, last_depth)
+    left, right = _lateral(ordered.x, ordered, front, back, camera.is_perspective)
+    bottom, top = _lateral(ordered.y, ordered, front, back, camera.is_perspective)
+    half_width = camera.half_height * (camera.width / camera.height)
+    columns = _pixels(0.5 * camera.width * (left / half_width + 1), 0.5 * camera.width * (right / half_width + 1), camera.width)
+    half_height = camera.half_height
+    rows = _pixels(0.5 * camera.height * (1 - top / half_height), 0.5 * camera.height * (1 - bottom / half_height), camera.height)
+    last_column = jnp.where(ordered.live & (front <= back), columns[1], -1)
+    return columns[0], last_column, rows[0], rows[1]
+
+
+def _lateral(x: Array, ordered: Ordered, front: Array, back: Array, perspective: bool) -> tuple[Array, Array]:
+    """Bounds of the ray coordinate (x / s, or x if orthographic) over the sphere between `front` and `back`."""
+    z, reach = ordered.z, ordered.reach
+    eps = jnp.finfo(x.dtype).eps * ROUNDING
+    low, high = x - reach, x + reach
+    if not perspective:
+        margin = eps * (jnp.abs(x) + reach)
+        return low - margin, high + margin
+    low, high = low / jnp.where(low < 0, front, back), high / jnp.where(high < 0, back, front)
+    low, high = low - eps * jnp.abs(low), high + eps * jnp.abs(high)
+    ahead = z > reach * (1 + eps)
+    product = jnp.where(ahead, (z - reach) * (z + reach), 1)
+    tangent = reach * jnp.sqrt(x * x + product)
+    margin = eps * (jnp.abs(x) * z + tangent) * (z / jnp.where(ahead, z - reach, 1))
+    low = jnp.where(ahead, jnp.maximum(low, (x * z - tangent - margin) / product), low)
+    high = jnp.where(ahead, jnp.minimum(high, (x * z + tangent + margin) / product), high)
+    return low, high
+
+
+def _pixels(low: Array, high: Array, size: int) -> tuple[Array, Array]:
+    """Pixels whose centres lie in [low, high] (image-space units), clipped to the image."""
+    margin = jnp.finfo(low.dtype).eps * ROUNDING * size
+    margin_low, margin_high = margin * (1 + jnp.abs(low) / size), margin * (1 + jnp.abs(high) / size)
+    first = jnp.ceil(low - margin_low - 0.5)
+    last = jnp.floor(high + margin_high - 0.5)
+    return jnp.clip(first, 0, size).astype(jnp.int32), jnp.clip(last, -1, size - 1).astype(jnp.int32)
+
+
+def side_distances(
+    x: Float[Array, "..."], z: Float[Array, "..."], low: Float[Array, "..."], high: Float[Array, "..."], perspective: bool
+) -> tuple[Array, Array]:
+    """Signed distance of (x, z) to the wedge of rays between coordinates `low` and `high`, and the normal's z-part.
+
+    Positive outside. The nearer to being outside of the two planes is the one that counts.
+    """
+    if not perspective:
+        outside = jnp.maximum(low - x, x - high)
+        return outside, jnp.zeros_like(outside)
+    low_norm, high_norm = 1 / jnp.sqrt(1 + low * low), 1 / jnp.sqrt(1 + high * high)
+    below, above = (z * low - x) * low_norm, (x - z * high) * high_norm
+    return jnp.maximum(below, above), jnp.where(below > above, low * low_norm, -high * high_norm)
+
+
+def touches(
+    x_side: tuple[Array, Array], y_side: tuple[Array, Array], reach: Float[Array, "..."], size: Float[Array, "..."]
+) -> Bool[Array, "..."]:
+    r"""Whether a sphere meets the pyramid of rays, given its distances to the two wedges.
+
+    With unit normals $n_1, n_2$ of the two violated planes, $c = n_1 \cdot n_2$, distances $a \ge b$: the nearest point of plane
+    one is $a$ away, and from there plane two is still $b - c a$ away along a direction of length $\sqrt{1 - c^2}$ a unit, so
+    the distance is $\sqrt{a^2 + \max(b - c a, 0)^2 / (1 - c^2)}$. `size` bounds the coordinates, for the rounding.
+    """
+    (dx, nx), (dy, ny) = x_side, y_side
+    cosine = nx * ny
+    far, near = jnp.maximum(dx, dy), jnp.minimum(dx, dy)
+    beyond = jnp.maximum(near - cosine * far, 0)
+    far = jnp.maximum(far, 0)
+    limit = reach + jnp.finfo(reach.dtype).eps * ROUNDING * size
+    return far * far + beyond * beyond / (1 - cosine * cosine) * (far > 0) <= limit * limit

@@ -1,0 +1,137 @@
+r"""Rank particles by support class and depth, so that a slab of samples meets a *window* of ranks.
+
+Flow: particles -> [ordering] -> lists -> cells -> cast -> image.
+
+Particles of similar support form a class (a factor of two wide); within a class they are ranked by depth. A particle of class
+c can touch a sample at depth s only if $|z - s| < H_c$, the largest support of the class, so the particles that can touch a
+slab of samples are at most one contiguous window of ranks a class. With supports spread over 20 000 : 1 a window of all
+particles together would hold nearly everything; a window a class is never more than about twice too deep.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.model import kernels
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles
+from jaxsph.numerics import faults
+
+DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
+DEAD_CLASS = 255
+ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
+
+
+@dataclasses.dataclass(frozen=True)
+class Ordered:
+    """Particles in view space, in rank order (class, then depth); those that no sample can meet come last and are not `live`.
+
+    `reach` is the support widened by the rounding of coordinates: what lies outside it has weight zero in floating point.
+    For a kernel homogeneous of degree n (poly6: 3) the particle's strength m = V / H^3 is folded into its lengths,
+    `weight = m^(1/n)` and `scale = sqrt(weight) / H`; otherwise `weight = m` and `scale = 1 / H`.
+    """
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    reach: Float[Array, " particles"]
+    scale: Float[Array, " particles"]
+    weight: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+    live: Bool[Array, " particles"]
+    first_rank: Int[Array, "classes slabs"]
+    last_rank: Int[Array, "classes slabs"]
+    faults: Int[Array, ""]
+
+
+def order_particles(
+    particles: Particles, camera: Camera, depths: Float[Array, " samples"], cell_samples: int, num_classes: int
+) -> Ordered:
+    """Rank `particles` for the sample `depths` (ascending), in slabs of `cell_samples`.
+
+    Windows are conservative: the depth key is monotone but for the rounding of a logarithm, and one key more is taken on
+    either side.
+    """
+    view = camera.to_view(particles.position)
+    x, y, z = view[:, 0], view[:, 1], view[:, 2]
+    finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
+    usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
+    usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
+    bad = faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any())
+    eps = jnp.finfo(view.dtype).eps * ROUNDING
+    offset = jnp.abs(particles.position - camera.eye).max(1)
+    reach = particles.support * (1 + eps) + eps * offset
+    live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
+
+    largest = jnp.where(live, reach, 0).max(initial=0)
+    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
+    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
+    widest = jax.ops.segment_max(jnp.where(live, reach, 0), octave.astype(jnp.int32), num_segments=num_classes)
+
+    key = (octave << DEPTH_BITS) | _depth_key(camera, z)
+    key, order = _sort_by(key)
+
+    slabs = math.ceil(depths.shape[0] / cell_samples)
+    front = depths[::cell_samples]
+    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * cell_samples, depths.shape[0]) - 1]
+    class_key = (jnp.arange(num_classes, dtype=jnp.uint32) << DEPTH_BITS)[:, None]
+    widest = jnp.maximum(widest, 0)[:, None]
+    lowest = _depth_key(camera, front[None] - widest * (1 + eps))
+    highest = _depth_key(camera, back[None] + widest * (1 + eps))
+    lowest = class_key | jnp.where(lowest > 0, lowest - 1, 0)
+    highest = class_key | jnp.minimum(highest + 1, (1 << DEPTH_BITS) - 1)
+    first_rank = jnp.searchsorted(key, lowest, side="left").astype(jnp.int32)
+    last_rank = jnp.searchsorted(key, highest, side="right").astype(jnp.int32)
+
+    scale, weight = _folded(particles, live)
+    quantity = jnp.where(live, particles.quantity, 0)
+    columns = [jnp.where(live, v, 0) for v in (x, y, z)] + [reach, scale, weight, quantity, live]
+    return Ordered(*(column[order] for column in columns), first_rank, last_rank, bad)
+
+
+def _depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
+    """Depth as an integer of `DEPTH_BITS` bits, uniform in sample space, clamped at near and far."""
+    z = jnp.clip(z, camera.near, camera.far)
+    if camera.is_perspective:
+        part = jnp.log(z / camera.near) / jnp.log(camera.far / camera.near)
+    else:
+        part = (z - camera.near) / (camera.far - camera.near)
+    part = jnp.clip(part.astype(jnp.float32), 0, 1)
+    return jnp.minimum(part * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
+
+
+def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
+    """Sorted keys and the permutation, by one packed 64-bit sort: twice as fast as a key-payload sort on a CPU."""
+    with jax.enable_x64(True):
+        packed = (key.astype(jnp.uint64) << 32) | lax.iota(jnp.uint64, key.shape[0])
+        packed = lax.sort(packed)
+        return (packed >> 32).astype(jnp.uint32), packed.astype(jnp.uint32).astype(jnp.int32)
+
+
+def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array]:
+    """`scale` and `weight` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1."""
+    support = jnp.where(live, particles.support, 1)
+    inverse = 1 / support
+    smallest = jnp.where(live, particles.support, jnp.inf).min(initial=jnp.inf)
+    relative = jnp.where(jnp.isfinite(smallest), smallest, 1) * inverse
+    strength = jnp.where(live, particles.volume, 0) * relative * relative * relative
+    peak = strength.max(initial=0)
+    strength = strength / jnp.where(peak > 0, peak, 1)
+    degree = kernels.by_name(particles.kernel).homogeneous
+    if degree is None:
+        return inverse, strength
+    weight = strength ** (1 / degree) if degree != 3 else jnp.cbrt(strength)
+    return inverse * jnp.sqrt(weight), weight
+
+
+jax.tree_util.register_dataclass(
+    Ordered,
+    data_fields=[field.name for field in dataclasses.fields(Ordered)],
+    meta_fields=[],
+)

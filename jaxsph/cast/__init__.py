@@ -1,0 +1,1 @@
+"""Along rays: from particles near a cell to colour and transmittance."""

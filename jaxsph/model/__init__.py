@@ -1,0 +1,10 @@
+"""What is looked at and from where: particles, kernels, transfer function, camera, scene, settings, image."""
+
+from jaxsph.model.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer import TransferFunction
+
+__all__ = ["Camera", "Image", "Particles", "Scene", "Settings", "TransferFunction"]

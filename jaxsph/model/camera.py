@@ -1,0 +1,243 @@
+"""Camera: where the scene is looked at from, and where samples sit along its rays.
+
+Flow: [camera] -> access -> cast -> image.
+
+View space has the eye at the origin, x right, y up and z forward (depth). The ray of pixel (row r, column c) passes
+`(s^p u_c, s^p v_r, s)` at depth s, with p = 1 for a perspective camera (u, v are tangents) and p = 0 for an orthographic
+one (u, v are lengths). Samples are uniform in *sample space* `[0, N]`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsph.model.particles import Particles
+from jaxsph.numerics.checks import is_traced, require_finite
+
+PROJECTIONS = ("perspective", "orthographic")
+LARGEST_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A perspective or orthographic camera; make it with `look_at`, `orthographic` or `framing`.
+
+    Attributes:
+        eye: position of the eye in world space, length units.
+        axes: rows are right, up and forward, orthonormal.
+        half_height: tan(fov / 2), or half the visible height (length units) if orthographic.
+        near: depth of the first sample slab's front, length units; > 0 if perspective.
+        far: depth of the last sample slab's back, > near.
+        width: pixels a row.
+        height: rows.
+        projection: `"perspective"` or `"orthographic"`.
+    """
+
+    eye: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+    half_height: Float[Array, ""]
+    near: Float[Array, ""]
+    far: Float[Array, ""]
+    width: int = 512
+    height: int = 512
+    projection: str = "perspective"
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        fov_degrees: Any = 45.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        near: Any,
+        far: Any,
+    ) -> Camera:
+        """Perspective camera at `eye` that looks at `target`.
+
+        Args:
+            eye: (3,) world position, length units.
+            target: (3,) world position in the middle of the image, not the eye.
+            up: (3,) direction that points upwards in the image; not parallel to the line of sight.
+            fov_degrees: vertical field of view, in (0, 180).
+            width, height: size in pixels, at least 1.
+            near, far: depths between which samples are taken, 0 < near < far, length units. The depth of a sample is
+                `near * (far / near) ** (u / N)`: snug values sample better.
+
+        Raises:
+            ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
+        """
+        _require_fov(fov_degrees)
+        half = jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360)) if is_traced(fov_degrees) else math.tan(math.radians(fov_degrees) / 2)
+        return _make(eye, target, up, half, width, height, near, far, "perspective")
+
+    @classmethod
+    def orthographic(
+        cls,
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        view_height: Any = 1.0,
+        width: int = 512,
+        height: int = 512,
+        *,
+        near: Any,
+        far: Any,
+    ) -> Camera:
+        """Camera with parallel rays; `view_height` is the visible height (length units), depths may be negative.
+
+        Raises:
+            ValueError: as `look_at`, and for `view_height` <= 0.
+        """
+        if not is_traced(view_height) and not (np.isfinite(view_height) and view_height > 0):
+            raise ValueError(f"`view_height` must be > 0 and finite, got {view_height}; it is the visible height in length units")
+        return _make(eye, target, up, view_height * 0.5, width, height, near, far, "orthographic")
+
+    @classmethod
+    def framing(
+        cls,
+        particles: Particles,
+        *,
+        direction: Any = (-0.45, -0.35, -1.0),
+        up: Any = (0.0, 1.0, 0.0),
+        fov_degrees: float = 45.0,
+        width: int = 512,
+        height: int = 512,
+        margin: float = 1.05,
+    ) -> Camera:
+        """Perspective camera that frames the particles: everything in view, near and far snug (host side).
+
+        Args:
+            particles: what to look at; an empty set is framed as the unit box.
+            direction: line of sight, from the eye to the middle of the particles.
+            up: as `look_at`.
+            fov_degrees: vertical field of view.
+            width, height: size in pixels.
+            margin: 1 fills the image to its edge, larger leaves a border.
+        """
+        lower, upper = particles.bounds()
+        if not (upper > lower).any():
+            lower, upper = lower - 0.5, upper + 0.5
+        middle = (lower + upper) / 2
+        forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+        axes = np.asarray(_axes(forward, np.asarray(up, np.float64), np))
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower - middle
+        local = corners @ axes.T
+        _require_fov(fov_degrees)
+        half = math.tan(math.radians(fov_degrees) / 2)
+        reach = np.maximum(np.abs(local[:, 0]) * height / width, np.abs(local[:, 1])) * margin / half
+        distance = float((reach - local[:, 2]).max())
+        near, far = distance + local[:, 2].min(), distance + local[:, 2].max()
+        eye = middle - forward * distance
+        near = max(float(near), 1e-3 * float(far))
+        return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
+
+    @property
+    def is_perspective(self) -> bool:
+        """Whether rays spread from the eye (static)."""
+        return self.projection == "perspective"
+
+    @property
+    def dtype(self) -> Any:
+        """float32 or float64."""
+        return self.eye.dtype
+
+    def to_view(self, position: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """World to view coordinates; the difference to the eye is taken first, so that nothing cancels later."""
+        offset = position - self.eye
+        rows = [offset[..., 0] * axis[0] + offset[..., 1] * axis[1] + offset[..., 2] * axis[2] for axis in self.axes]
+        return jnp.stack(rows, -1)
+
+    def depth(self, u: Float[Array, "..."], samples: int) -> Float[Array, "..."]:
+        """Depth s(u) of sample-space coordinate `u` in [0, samples]: geometric if perspective, else linear."""
+        part = u / samples
+        if self.is_perspective:
+            return self.near * jnp.exp(part * jnp.log(self.far / self.near))
+        return self.near + (self.far - self.near) * part
+
+    def column(self, c: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Lateral ray coordinate u of image-space abscissa `c` in [0, width]; pixel c has its ray at c + 1/2."""
+        return self.half_height * (self.width / self.height) * (2 * c / self.width - 1)
+
+    def row(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Vertical ray coordinate v of image-space ordinate `r` in [0, height], from the top; pixel r sits at r + 1/2."""
+        return self.half_height * (1 - 2 * r / self.height)
+
+    def describe(self) -> str:
+        """One line for metadata: projection, size, eye, axes, opening, near and far."""
+        eye, axes = np.asarray(self.eye).tolist(), np.asarray(self.axes).round(9).tolist()
+        opening = f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
+        size = f"{self.width}x{self.height}"
+        return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={float(self.near):.9g} far={float(self.far):.9g}"
+
+
+def _require_fov(fov_degrees: Any) -> None:
+    if not is_traced(fov_degrees) and not 0 < float(fov_degrees) < 180:
+        raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov_degrees}; it is the vertical field of view")
+
+
+def _axes(forward: Any, up: Any, xp: Any) -> Any:
+    """Rows right, true up, forward: right = normalise(forward x up), up = right x forward."""
+    right = xp.cross(forward, up)
+    right = right / xp.sqrt((right * right).sum())
+    return xp.stack([right, xp.cross(right, forward), forward])
+
+
+def _make(
+    eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str
+) -> Camera:
+    for name, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= LARGEST_SIDE:
+            raise ValueError(f"`{name}` must be an integer from 1 to {LARGEST_SIDE} pixels, got {size!r}")
+    parts = (eye, target, up, half, near, far)
+    xp: Any = jnp
+    if not is_traced(*parts):
+        xp = np
+        _check_view(eye, target, up, near, far, projection)
+        eye, target, up = (np.asarray(v, np.float64 if not hasattr(v, "dtype") else None) for v in (eye, target, up))
+    eye, target, up = (xp.asarray(v) for v in (eye, target, up))
+    wide = [v for v in (eye, target) if v.dtype == jnp.float64]
+    forward = (target - eye).astype(jnp.float64 if xp is np else jnp.result_type(target, jnp.float32))
+    forward = forward / xp.sqrt((forward * forward).sum())
+    axes = _axes(forward, up.astype(forward.dtype), xp)
+    dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
+    eye, axes, half, near, far = (jnp.asarray(v, dtype) for v in (eye, axes, half, near, far))
+    return Camera(eye, axes, half, near, far, int(width), int(height), projection)
+
+
+def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:
+    for name, vector in (("eye", eye), ("target", target), ("up", up)):
+        vector = np.asarray(vector, np.float64)
+        if vector.shape != (3,):
+            raise ValueError(f"`{name}` must have shape (3,), got {vector.shape}; give x, y and z")
+        require_finite(name, vector, "give a point in world space")
+    forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
+    length = np.linalg.norm(forward)
+    if length == 0:
+        raise ValueError(f"`target` must differ from `eye`, both are {np.asarray(eye).tolist()}; move one of them")
+    side = np.linalg.norm(np.cross(forward / length, np.asarray(up, np.float64)))
+    if not side > 1e-9 * np.linalg.norm(up):
+        raise ValueError(f"`up` = {np.asarray(up).tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)")
+    near, far = float(near), float(far)
+    if not (np.isfinite(near) and np.isfinite(far) and near < far):
+        raise ValueError(f"`near` must be less than `far`, both finite, got near = {near}, far = {far}; they are depths from the eye")
+    if projection == "perspective" and near <= 0:
+        raise ValueError(f"`near` must be > 0 for a perspective camera, got {near}; samples are spaced geometrically from it")
+    if np.float32(near) >= np.float32(far) and not jax.config.jax_enable_x64:
+        raise ValueError(f"`near` = {near} and `far` = {far} are the same number in float32; move them apart")
+
+
+jax.tree_util.register_dataclass(
+    Camera,
+    data_fields=["eye", "axes", "half_height", "near", "far"],
+    meta_fields=["width", "height", "projection"],
+)

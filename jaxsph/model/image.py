@@ -1,0 +1,77 @@
+"""Image: what a render gives, with the record of how it was made.
+
+Flow: cast -> [image] -> files, notebooks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+
+@dataclasses.dataclass(frozen=True)
+class Image:
+    """A rendered image. Row 0 is the top, column 0 the left; the background is black.
+
+    Attributes:
+        color: premultiplied RGB in [0, 1].
+        transmittance: what is left of the background's light, in [0, 1]; alpha is `1 - transmittance`.
+        depth: view depth where transmittance falls to 1/2, inf where it never does, length units.
+        error_bound: largest difference to the reference image that a pixel can have; 0 at full rate.
+        evaluations: particle-sample kernel evaluations spent on each pixel.
+        certified: whether `error_bound` is a proven bound.
+        faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
+        stats: `evaluations`, `evaluations_full`, `cells`, `pairs` and, from an eager render, `seconds`.
+        metadata: strings and numbers for the file header.
+    """
+
+    color: Float[Array, "height width 3"]
+    transmittance: Float[Array, "height width"]
+    depth: Float[Array, "height width"]
+    error_bound: Float[Array, "height width"]
+    evaluations: Float[Array, "height width"]
+    certified: Bool[Array, ""] | bool
+    faults: Int[Array, ""] | int
+    stats: dict[str, Any]
+    metadata: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def alpha(self) -> Float[Array, "height width"]:
+        """Opacity, `1 - transmittance`."""
+        return 1 - self.transmittance
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return int(self.color.shape[0]), int(self.color.shape[1])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write to `path`: `.exr` (all layers) or `.png` (colour over black). See `jaxsph.io.write_image`."""
+        from jaxsph.io import write_image
+
+        write_image(path, self)
+
+    def to_uint8(self) -> np.ndarray:
+        """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""
+        color = np.nan_to_num(np.asarray(self.color, np.float64), nan=0.0)
+        return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+    def _repr_png_(self) -> bytes:
+        from PIL import Image as Pillow
+
+        buffer = io.BytesIO()
+        Pillow.fromarray(self.to_uint8()).save(buffer, format="PNG")
+        return buffer.getvalue()
+
+
+jax.tree_util.register_dataclass(
+    Image,
+    data_fields=["color", "transmittance", "depth", "error_bound", "evaluations", "certified", "faults", "stats"],
+    meta_fields=["metadata"],
+)

@@ -1,0 +1,145 @@
+"""The particle set: a padded, masked pytree of positions, supports, quantities and volumes.
+
+Flow: files, scenes -> [particles] -> access -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model import kernels
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+
+
+@dataclasses.dataclass(frozen=True)
+class Particles:
+    """SPH particles that carry a quantity; make them with `from_arrays`.
+
+    The arrays are padded to a common capacity; `valid` marks the particles that exist. Values may be changed by
+    `dataclasses.replace` under jit without recompiling.
+
+    Attributes:
+        position: view-independent (world) coordinates, length units.
+        support: support radius H > 0 (the kernel is 0 at distance H), length units.
+        quantity: the carried quantity q, the input of the transfer function.
+        volume: V >= 0, any unit: only ratios between particles matter.
+        valid: which entries are particles; the rest is padding and contributes nothing.
+        kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+    """
+
+    position: Float[Array, "particles 3"]
+    support: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+    volume: Float[Array, " particles"]
+    valid: Bool[Array, " particles"]
+    kernel: str = "poly6"
+
+    @classmethod
+    def from_arrays(
+        cls,
+        position: Any,
+        support: Any,
+        quantity: Any,
+        volume: Any = 1.0,
+        kernel: str = "poly6",
+        *,
+        capacity: int | None = None,
+    ) -> Particles:
+        """Check and pack arrays of particles.
+
+        Args:
+            position: (N, 3), length units; N = 0 is an empty scene.
+            support: (N,) or a number: support radius H > 0, length units.
+            quantity: (N,) or a number.
+            volume: (N,) or a number, >= 0.
+            kernel: name of the smoothing kernel.
+            capacity: pad to this many entries (so that sets of different size share a compiled program); default N.
+
+        Returns:
+            Particles of dtype float64 if `position` is float64 and x64 is enabled, else float32. float16 and bfloat16
+            are promoted to float32.
+
+        Raises:
+            ValueError: wrong shapes, non-finite values, supports <= 0, volumes < 0, unknown kernel, capacity < N.
+        """
+        kernels.by_name(kernel)
+        arrays = {"position": position, "support": support, "quantity": quantity, "volume": volume}
+        arrays = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in arrays.items()}
+        for name, value in arrays.items():
+            require_real(name, value)
+        if arrays["position"].size == 0 and not isinstance(arrays["position"], jax.Array):
+            arrays["position"] = arrays["position"].reshape(0, 3)
+        require_shape("position", arrays["position"], (None, 3), "one row (x, y, z) a particle")
+        count = arrays["position"].shape[0]
+        for name in ("support", "quantity", "volume"):
+            if arrays[name].ndim == 0:
+                arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
+            require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
+        if not is_traced(*arrays.values()):
+            for name, value in arrays.items():
+                require_finite(name, value)
+            require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
+            require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
+        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
+        capacity = count if capacity is None else capacity
+        if capacity < count:
+            raise ValueError(f"`capacity` must be at least the number of particles ({count}), got {capacity}")
+        padding = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}
+        packed = {name: _padded(value, dtype, capacity, padding[name]) for name, value in arrays.items()}
+        if not is_traced(*arrays.values()) and count:
+            _require_representable(arrays, packed)
+        return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel)
+
+    @property
+    def capacity(self) -> int:
+        """Number of entries, padding included (static)."""
+        return int(self.support.shape[0])
+
+    @property
+    def num_particles(self) -> int:
+        """Number of particles that exist (host side)."""
+        return int(np.asarray(self.valid).sum())
+
+    @property
+    def dtype(self) -> Any:
+        """float32 or float64."""
+        return self.position.dtype
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around every support, (3,) and (3,), float64, length units (host side).
+
+        An empty set has the box of zeros.
+        """
+        valid = np.asarray(self.valid)
+        if not valid.any():
+            return np.zeros(3), np.zeros(3)
+        position = np.asarray(self.position, np.float64)[valid]
+        support = np.asarray(self.support, np.float64)[valid, None]
+        return (position - support).min(0), (position + support).max(0)
+
+
+def _padded(value: Any, dtype: Any, capacity: int, fill: float) -> Array:
+    xp = jnp if is_traced(value) else np
+    width = [(0, capacity - value.shape[0])] + [(0, 0)] * (value.ndim - 1)
+    return jnp.asarray(xp.pad(value, width, constant_values=fill), dtype)
+
+
+def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> None:
+    """Refuse numbers that the working precision cannot hold (a support that becomes 0, a quantity that becomes inf)."""
+    for name in given:
+        require_finite(name, packed[name], f"it overflows {packed[name].dtype}: rescale it, or use float64 under jax.enable_x64")
+    count = given["position"].shape[0]
+    require_positive(
+        "support", packed["support"][:count], f"it underflows {packed['support'].dtype}: rescale the scene or use float64"
+    )
+
+
+jax.tree_util.register_dataclass(
+    Particles, data_fields=["position", "support", "quantity", "volume", "valid"], meta_fields=["kernel"]
+)

@@ -1,0 +1,55 @@
+"""Host-side checks of user input: name the argument, the offending value and the remedy.
+
+Flow: user arrays -> [checks] -> model. Under a trace the values are unknown; then only shapes and dtypes are checked,
+and bad data becomes a fault bit (`jaxsph.numerics.faults`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether any leaf of `values` is an abstract tracer, so that its numbers cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
+
+
+def require_shape(name: str, value: Any, shape: tuple[int | None, ...], remedy: str) -> None:
+    """Raise `ValueError` unless `value.shape` matches `shape` (`None` matches any length)."""
+    got = tuple(np.shape(value))
+    fits = len(got) == len(shape) and all(want is None or want == have for want, have in zip(shape, got, strict=True))
+    if not fits:
+        want = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"`{name}` must have shape {want}, got {got}; {remedy}")
+
+
+def require_real(name: str, value: Any) -> None:
+    """Raise `ValueError` unless `value` is an array of real numbers."""
+    kind = np.dtype(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
+    if not (jax.dtypes.issubdtype(kind, np.floating) or jax.dtypes.issubdtype(kind, np.integer) or kind == np.bool_):
+        raise ValueError(f"`{name}` must hold real numbers, got dtype {kind}; convert it to float32 or float64")
+
+
+def require_finite(name: str, value: Any, remedy: str = "remove or repair these entries") -> None:
+    """Raise `ValueError` naming the first entry of `value` that is NaN or infinite."""
+    value = np.asarray(value)
+    bad = ~np.isfinite(value)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        entry = value[where] if where else value[()]
+        at = f"[{', '.join(map(str, where))}]" if where else ""
+        raise ValueError(f"`{name}` must be finite, but {int(bad.sum())} value(s) are not, first {name}{at} = {entry}; {remedy}")
+
+
+def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True) -> None:
+    """Raise `ValueError` naming the first entry of `value` that is not above zero (`strict`) or is below it."""
+    value = np.asarray(value)
+    bad = ~(value > 0) if strict else ~(value >= 0)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        entry = value[where] if where else value[()]
+        at = f"[{', '.join(map(str, where))}]" if where else ""
+        raise ValueError(f"`{name}` must be {'> 0' if strict else '>= 0'}, but {name}{at} = {entry}; {remedy}")

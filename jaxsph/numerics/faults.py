@@ -1,0 +1,39 @@
+"""Sticky fault bits: what went wrong with data that could only be seen under jit.
+
+A stage returns an `int32` word beside its result; words are OR-ed over stages and bands, and only the eager `render`
+turns them into an exception.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+NONE = 0
+TILE_OVERFLOW = 1
+LIST_OVERFLOW = 2
+BAD_PARTICLES = 4
+BAD_CAMERA = 8
+BAD_TRANSFER = 16
+
+MESSAGES = {
+    TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
+    LIST_OVERFLOW: "more (particle, bundle) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
+    BAD_PARTICLES: "a particle has a position, quantity or volume that is not finite, a support that is not > 0 and finite, "
+    "or a volume < 0; remove or repair these particles",
+    BAD_CAMERA: "the camera is not usable: eye and axes must be finite, the field of view > 0 and 0 < near < far (perspective) "
+    "or near < far (orthographic)",
+    BAD_TRANSFER: "the transfer function is not usable: values must ascend, colours lie in [0, 1] and extinction be >= 0 "
+    "and finite",
+}
+OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
+
+
+def raised(bit: int, when: Bool[Array, ""]) -> Int[Array, ""]:
+    """The fault word that holds `bit` where `when`."""
+    return jnp.where(when, jnp.int32(bit), jnp.int32(NONE))
+
+
+def describe(word: int) -> str:
+    """The messages of every bit set in `word`, joined."""
+    return "; ".join(text for bit, text in MESSAGES.items() if int(word) & bit)

@@ -1,0 +1,192 @@
+"""Host-side capacities: how much room a frame needs, rounded up so that similar frames share a compiled program.
+
+Flow: scene, camera, settings -> [plan] -> render.
+
+Counting is cheap (no sort): every particle's range of tiles and bundles is exact, so that the capacities made from it are
+never too small for the frame they were made for. A frame that outgrows a reused plan raises a fault.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxsph.access.footprint import pixel_ranges
+from jaxsph.access.lists import BUNDLE, TILE, ListPlan
+from jaxsph.access.ordering import order_particles
+from jaxsph.cast.points import CastPlan
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import is_traced
+
+STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
+MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
+LARGEST_CAPACITY = 1 << 30
+CELL_SAMPLES = (4, 8, 16)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Everything that fixes a shape: hashable, and shared by similar frames.
+
+    Attributes:
+        width, height: of the image, pixels.
+        samples: fine samples a ray.
+        num_particles: entries of the particle arrays, padding included.
+        num_classes: classes of support.
+        bands: horizontal bands that are rendered one after the other.
+        lists: sizes of the lists of one band.
+        cast: sizes of the march.
+        bytes: estimate of the working memory of one band, in bytes.
+    """
+
+    width: int
+    height: int
+    samples: int
+    num_particles: int
+    num_classes: int
+    bands: int
+    lists: ListPlan
+    cast: CastPlan
+    bytes: int
+
+    @property
+    def band_height(self) -> int:
+        """Pixel rows of a band."""
+        return self.lists.tile_rows * TILE
+
+    def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
+        """Raise `ValueError` where the plan is for other shapes than those given."""
+        given = {
+            "camera.width": (camera.width, self.width),
+            "camera.height": (camera.height, self.height),
+            "settings.samples": (settings.samples, self.samples),
+            "scene.particles.capacity": (scene.particles.capacity, self.num_particles),
+        }
+        for name, (have, planned) in given.items():
+            if have != planned:
+                raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
+
+
+def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell_samples: int | None = None) -> Plan:
+    """Measure the room that a frame needs (host side; values must be concrete).
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`.
+        cell_samples: samples of a cell along depth; by default chosen from how deep a support is in samples.
+
+    Raises:
+        ValueError: under a trace, or when even a band of one row of tiles exceeds `settings.memory_limit`.
+    """
+    settings = settings or Settings()
+    if is_traced(scene, camera):
+        raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    particles = scene.particles
+    tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
+    tiles, bundles, depth_extent = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
+    num_classes = _num_classes(particles)
+    cell_samples = cell_samples or _choose_cell_samples(float(depth_extent))
+    bands = 1
+    while True:
+        rows = _ceil(tile_rows, bands)
+        made = _for_bands(camera, settings, particles, rows, columns, tiles, bundles, num_classes, cell_samples)
+        fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
+        if fits or rows == 1:
+            break
+        bands = min(2 * bands, tile_rows)
+    if not fits:
+        raise ValueError(
+            f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs about {made.bytes} "
+            f"bytes; raise the limit, or lower the image width, the samples or the number of particles"
+        )
+    return made
+
+
+def _for_bands(
+    camera: Camera,
+    settings: Settings,
+    particles: Particles,
+    rows: int,
+    columns: int,
+    tiles: np.ndarray,
+    bundles: np.ndarray,
+    num_classes: int,
+    cell_samples: int,
+) -> Plan:
+    bands = _ceil(len(tiles), rows)
+    fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in (tiles, bundles)]
+    lists = ListPlan(rows, columns, *(round_up(max(count, 1)) for count in fullest))
+    slabs = _ceil(settings.samples, cell_samples)
+    chunk = max(16, min(2048 // cell_samples, 1 << (lists.num_bundles - 1).bit_length()))
+    cast = CastPlan(chunk, cell_samples)
+    number = np.dtype(particles.dtype).itemsize
+    memory = (
+        particles.capacity * (24 * number + 32)
+        + lists.tile_capacity * (12 * number + 48)
+        + lists.list_capacity * 8
+        + num_classes * slabs * lists.num_bundles * 40
+        + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
+        + cast.chunk * cell_samples * BUNDLE * BUNDLE * number * 16
+        + camera.width * camera.height * 8 * number
+    )
+    size = (camera.width, camera.height, settings.samples, particles.capacity)
+    return Plan(*size, num_classes, bands, lists, cast, int(memory))
+
+
+def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:
+    return np.pad(counts, (0, rows * bands - len(counts))).reshape(bands, rows).sum(1)
+
+
+def round_up(count: int) -> int:
+    """The next of 4, 5, 6, 7 times a power of two."""
+    step = max(1 << max((count - 1).bit_length() - 1, 0), 4) // STEPS_AN_OCTAVE
+    return _ceil(count, step) * step
+
+
+def _ceil(a: int, b: int) -> int:
+    return -(-a // b)
+
+
+def _num_classes(particles: Particles) -> int:
+    support = np.asarray(particles.support)[np.asarray(particles.valid)]
+    support = support[np.isfinite(support) & (support > 0)]
+    if support.size == 0:
+        return 1
+    octaves = math.log2(float(support.max()) / float(support.min()))
+    return min(1 + math.ceil(max(octaves - 0.01, 0)), MOST_CLASSES)
+
+
+def _choose_cell_samples(depth_extent: float) -> int:
+    """Deeper cells for deeper supports: a window is the cell's depth plus a support's diameter."""
+    for cell_samples in CELL_SAMPLES:
+        if depth_extent <= 6 * cell_samples:
+            return cell_samples
+    return CELL_SAMPLES[-1]
+
+
+@functools.partial(jax.jit, static_argnames=("samples", "tile_rows"))
+def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -> tuple[Array, Array, Array]:
+    """Pairs in each row of tiles (with tiles, and at most with bundles), and the median diameter of a support in samples."""
+    depths = camera.depth(jnp.arange(samples, dtype=camera.dtype) + 0.5, samples).astype(particles.dtype)
+    ordered = order_particles(particles, camera, depths, samples, 1)
+    left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
+    seen = (right >= left) & (bottom >= top)
+    tiles = jnp.zeros(tile_rows + 1, jnp.float32)
+    bundles = jnp.zeros(2 * tile_rows + 1, jnp.float32)
+    for size, counts in ((TILE, "tiles"), (BUNDLE, "bundles")):
+        columns = jnp.where(seen, right // size - left // size + 1, 0).astype(jnp.float32)
+        first, past = jnp.where(seen, top // size, 0), jnp.where(seen, bottom // size + 1, 0)
+        target = tiles if counts == "tiles" else bundles
+        target = jnp.cumsum(target.at[first].add(columns).at[past].add(-columns))
+        tiles, bundles = (target, bundles) if counts == "tiles" else (tiles, target)
+    index = jnp.arange(samples, dtype=depths.dtype)
+    extent = jnp.interp(ordered.z + ordered.reach, depths, index) - jnp.interp(ordered.z - ordered.reach, depths, index)
+    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), jnp.nanmedian(jnp.where(seen, extent, jnp.nan))

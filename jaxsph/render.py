@@ -1,0 +1,259 @@
+"""The verb: particles in, image out.
+
+Flow: order_particles -> build_lists -> find_cells -> cast_points -> Image, band by band.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxsph.access.cells import Cells, find_cells
+from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
+from jaxsph.access.ordering import Ordered, order_particles
+from jaxsph.cast.points import Rays, cast_points
+from jaxsph.model.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics import faults
+from jaxsph.numerics.checks import is_traced
+from jaxsph.plan import Plan
+from jaxsph.plan import plan as make_plan
+
+Progress = Callable[[int, int], None]
+
+
+class CapacityError(ValueError):
+    """A given plan has no room for this frame: make a new one with `jaxsph.plan`."""
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    settings: Settings | None = None,
+    *,
+    plan: Plan | None = None,
+    progress: Progress | None = None,
+) -> Image:
+    """Render a scene.
+
+    Eagerly, capacities are planned for the frame, stages are timed apart, and faults raise. Under `jax.jit` or `jax.vmap` the
+    function is pure, needs a `plan`, and reports faults in `image.faults`.
+
+    Args:
+        scene: particles and transfer function.
+        camera: where from, and how large the image is.
+        settings: samples, memory limit; default `Settings()`.
+        plan: capacities from `jaxsph.plan`, for this scene or a similar one.
+        progress: eager only; called as `progress(done, total)` after every band.
+
+    Returns:
+        Image with dtype of the particles.
+
+    Raises:
+        ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace.
+        CapacityError: eager, when a given `plan` is too small for this frame.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
+    """
+    settings = settings or Settings()
+    if is_traced(scene, camera):
+        if plan is None:
+            raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
+        plan.check(scene, camera, settings)
+        return _render_traced(scene, camera, plan)
+    return _render_eager(scene, camera, settings, plan, progress)
+
+
+def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, progress: Progress | None) -> Image:
+    clock = _Clock()
+    planned = plan is None
+    plan = make_plan(scene, camera, settings) if plan is None else plan
+    plan.check(scene, camera, settings)
+    clock.mark("plan")
+    ordered = clock.run("grid", _order, (scene.particles, camera), plan=plan)
+    bands, words = [], [_input_faults(scene, camera) | ordered.faults]
+    cells_found = pairs = 0
+    for band in range(plan.bands):
+        first_row = jnp.int32(band * plan.band_height)
+        lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
+        band_rays = clock.run(
+            "cast", _cast, (ordered, lists, cells, camera, scene.transfer, first_row), plan=plan, kernel=scene.particles.kernel
+        )
+        words.append(lists.faults)
+        cells_found += int((cells.count > 0).sum())
+        pairs += int(lists.start[-1])
+        bands.append(_unbundle(band_rays, plan))
+        if progress is not None:
+            progress(band + 1, plan.bands)
+    word = int(functools.reduce(lambda a, b: a | b, words))
+    _raise(word, planned)
+    image = _assemble(_stack(bands), camera, plan, jnp.int32(word))
+    clock.mark("image")
+    total = int(np.asarray(image.evaluations, np.float64).sum())
+    stats = {"evaluations": total, "evaluations_full": total, "cells": cells_found, "pairs": pairs, "seconds": clock.seconds}
+    return Image(
+        image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, True, word, stats, _metadata(camera)
+    )
+
+
+def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
+    ordered = _order(scene.particles, camera, plan=plan)
+
+    def one_band(band: Int[Array, ""]) -> tuple[Any, ...]:
+        first_row = band * plan.band_height
+        lists, cells = _grid(ordered, camera, first_row, plan=plan)
+        rays = _cast(ordered, lists, cells, camera, scene.transfer, first_row, plan=plan, kernel=scene.particles.kernel)
+        return _unbundle(rays, plan), lists.faults, (cells.count > 0).sum(), lists.start[-1]
+
+    bands = jnp.arange(plan.bands, dtype=jnp.int32)
+    results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
+    layers, words, cells_found, pairs = results
+    word = _input_faults(scene, camera) | ordered.faults | functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
+    image = _assemble(layers, camera, plan, word)
+    total = image.evaluations.sum()
+    stats = {"evaluations": total, "evaluations_full": total, "cells": cells_found.sum(), "pairs": pairs.sum()}
+    certified = jnp.asarray(True)
+    return Image(
+        image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, certified, word, stats
+    )
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
+    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.cell_samples, plan.num_classes)
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> tuple[BundleLists, Cells]:
+    lists = build_lists(ordered, camera, _depths(camera, ordered.x, plan)[0], plan.lists, first_row)
+    return lists, find_cells(ordered, lists)
+
+
+@functools.partial(jax.jit, static_argnames=("plan", "kernel"))
+def _cast(
+    ordered: Ordered,
+    lists: BundleLists,
+    cells: Cells,
+    camera: Camera,
+    transfer: TransferFunction,
+    first_row: Int[Array, ""],
+    *,
+    plan: Plan,
+    kernel: str,
+) -> Rays:
+    depths, edges = _depths(camera, ordered.x, plan)
+    origins = bundle_origins(plan.lists, first_row)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
+    return cast_points(ordered, lists, cells, origins, camera, transfer, depths, edges, kernel, plan.cast)
+
+
+def _depths(camera: Camera, like: Any, plan: Plan) -> tuple[Array, Array]:
+    """Depths of the samples and of the borders between them."""
+    count = jnp.arange(plan.samples + 1, dtype=like.dtype)
+    return tuple(camera.depth(u, plan.samples).astype(like.dtype) for u in (count[:-1] + 0.5, count))
+
+
+def _unbundle(rays: Rays, plan: Plan) -> tuple[Array, ...]:
+    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations (h, w)."""
+    rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
+
+    def lay_out(value: Array) -> Array:
+        value = value.reshape(rows, columns, 2, 2, BUNDLE, BUNDLE, *value.shape[3:])
+        value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
+        return value.reshape(rows * 2 * BUNDLE, columns * 2 * BUNDLE, *value.shape[6:])
+
+    evaluations = jnp.broadcast_to(rays.evaluations[:, None, None], rays.transmittance.shape)
+    return tuple(lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, evaluations))
+
+
+def _stack(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:
+    return tuple(jnp.stack(layers) for layers in zip(*bands, strict=True))
+
+
+def _assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array) -> Image:
+    """Join the bands, cut off what lies beyond the image."""
+    joined = [layer.reshape(-1, *layer.shape[2:])[: camera.height, : camera.width] for layer in layers]
+    color, transmittance, depth, evaluations = joined
+    return Image(color, transmittance, depth, jnp.zeros_like(transmittance), evaluations, True, word, {})
+
+
+@jax.jit
+def _input_faults(scene: Scene, camera: Camera) -> Int[Array, ""]:
+    """Fault bits of camera and transfer function, whose numbers may have been changed under jit."""
+    numbers = jnp.concatenate([camera.eye, camera.axes.ravel(), jnp.stack([camera.half_height, camera.near, camera.far])])
+    usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
+    if camera.is_perspective:
+        usable &= camera.near > 0
+    transfer = scene.transfer
+    shown = (transfer.values[1:] >= transfer.values[:-1]).all() & jnp.isfinite(transfer.values).all()
+    shown &= ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
+    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all()
+    return faults.raised(faults.BAD_CAMERA, ~usable) | faults.raised(faults.BAD_TRANSFER, ~shown)
+
+
+def _raise(word: int, planned: bool) -> None:
+    if word & faults.OVERFLOWS and not planned:
+        raise CapacityError(f"`plan` is too small for this frame: {faults.describe(word)}")
+    if word:
+        raise ValueError(f"this frame cannot be rendered: {faults.describe(word)}")
+
+
+def _metadata(camera: Camera) -> tuple[tuple[str, Any], ...]:
+    from jaxsph import __version__
+
+    return (
+        ("jaxsph.version", __version__),
+        ("jaxsph.tolerance", "none"),
+        ("jaxsph.estimator", "none"),
+        ("jaxsph.certified", 1.0),
+        ("jaxsph.camera", camera.describe()),
+    )
+
+
+class _Clock:
+    """Seconds by stage, with compile time apart."""
+
+    def __init__(self) -> None:
+        self.seconds = {"plan": 0.0, "compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0, "image": 0.0}
+        self._last = time.perf_counter()
+
+    def mark(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] += now - self._last
+        self._last = now
+
+    def run(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """Compile `function` for `arguments` if need be, run it, and book both."""
+        program = _compiled(function, arguments, static)
+        self.mark("compile")
+        result = jax.block_until_ready(program(*arguments))
+        self.mark(stage)
+        return result
+
+
+_PROGRAMS: dict[Hashable, Any] = {}
+MOST_PROGRAMS = 64  # compiled stages that are kept; the oldest goes first
+
+
+def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type, str(leaf.sharding)) for leaf in leaves)
+    key = (function, tuple(static.items()), structure, shapes, jax.config.jax_enable_x64)
+    if key not in _PROGRAMS:
+        while len(_PROGRAMS) >= MOST_PROGRAMS:
+            del _PROGRAMS[next(iter(_PROGRAMS))]
+        _PROGRAMS[key] = function.lower(*arguments, **static).compile()
+    return _PROGRAMS[key]
