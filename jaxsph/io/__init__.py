@@ -1,0 +1,130 @@
+"""Read particles, write and read images. One format a file; optional libraries are imported when needed.
+
+Flow: file -> [read_table] -> ParticleTable -> [particles_from_table] -> Particles ... Image -> [write_image] -> file.
+
+A ParticleTable holds what the file holds; Particles carry one quantity, with supports and volumes settled. The report
+of `particles_from_table` says how they were settled.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.io.assemble import Report, particles_from_table
+from jaxsph.io.damage import DataError
+from jaxsph.io.formats import FORMATS, Format, find_format, read_with
+from jaxsph.io.quantities import available_quantities
+from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
+from jaxsph.io.table import ParticleTable
+from jaxsph.model.image import Image
+from jaxsph.model.particles import Particles
+
+__all__ = [
+    "FORMATS",
+    "DataError",
+    "Format",
+    "ParticleTable",
+    "Report",
+    "available_quantities",
+    "kernel_sum",
+    "nearest_neighbour_supports",
+    "particles_from_table",
+    "read_image",
+    "read_particles",
+    "read_table",
+    "write_image",
+]
+
+
+def read_table(path: str | os.PathLike[str], *, part_type: int | None = None, progress: bool = False) -> ParticleTable:
+    """Read a particle file as it is: positions, columns, and supports and volumes where the format defines them.
+
+    The format is found by content, else by suffix: `.npz`, `.hdf5` `.h5` (Gadget, SWIFT, GIZMO, AREPO, Phantom,
+    points), `.vtk`, `.vtu`, `.vtp`, `.ply`, `.bgeo`, Gadget binary, `.csv` `.txt` `.xyz` `.dat`.
+
+    Args:
+        path: the file.
+        part_type: for formats with particle types (Gadget: 0 gas, 1 dark matter, ...; Phantom: 1 gas), which one to
+            read; `None` means gas, or the first other type there is.
+        progress: as for `read_particles`; reading alone shows no bar.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: unknown format, a damaged file, positions that are not finite, no such particle type.
+        ImportError: a library that the format needs is not installed; the message says how to install it.
+    """
+    file = Path(path)
+    form = find_format(file)
+    return read_with(form, file, part_type)
+
+
+def read_particles(
+    path: str | os.PathLike[str],
+    quantity: str | None = None,
+    support: float | Float[np.ndarray, " particles"] | None = None,
+    *,
+    kernel: str = "poly6",
+    part_type: int | None = None,
+    progress: bool = False,
+) -> Particles:
+    """Read a particle file, ready to render.
+
+    Args:
+        path: the file; see `read_table` for formats.
+        quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, or `log10:` before any of
+            these; `None` picks the first telling one of a concentration, temperature, internal energy, density, speed.
+        support: support radius in the file's length unit; `None` means the file's own, else the distance to the 32nd
+            neighbour.
+        kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+        part_type: which type of particles to read, see `read_table`.
+        progress: show progress bars; on a terminal large sets show them anyway.
+
+    Returns:
+        Particles with quantity, support and volume; `particles_from_table` also tells how they were found.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: see `read_table` and `particles_from_table`.
+        ImportError: a library that the format needs is not installed; the message says how to install it.
+    """
+    table = read_table(path, part_type=part_type, progress=progress)
+    return particles_from_table(table, quantity, support, kernel, progress=progress)[0]
+
+
+def write_image(path: str | os.PathLike[str], image: Image) -> None:
+    """Write `image` to `path`, whole or not at all: `.exr` (every layer) or `.png` (8 bit colours over black).
+
+    Raises:
+        ValueError: another suffix, or a place that cannot be written to.
+    """
+    file = Path(path)
+    _image_format(file).write(file, image)
+
+
+def read_image(path: str | os.PathLike[str]) -> Image:
+    """Read an image that `write_image` wrote. Layers that the file does not hold are NaN.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix, or a damaged file.
+    """
+    file = Path(path)
+    form = _image_format(file)
+    if not file.exists():
+        raise FileNotFoundError(f"{file}: there is no such file")
+    image: Image = form.read(file)
+    return image
+
+
+def _image_format(path: Path) -> ModuleType:
+    from jaxsph.io import exr, png
+
+    known = {".exr": exr, ".png": png}
+    if path.suffix.lower() not in known:
+        raise ValueError(f"{path}: images are written and read as {' or '.join(known)}, not as {path.suffix!r}")
+    return known[path.suffix.lower()]

@@ -1,0 +1,205 @@
+"""From a table to particles: settle quantity, supports and volumes, and report what was settled.
+
+Flow: ParticleTable -> [assemble] -> Particles, Report.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.model.particles import Particles
+
+from .damage import DataError
+from .quantities import ROLES, choose_quantity
+from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
+from .table import ParticleTable
+
+ROUNDING_NOTED = 1e-3
+"""Rounding of positions to float32, in units of the smallest support, from which it is worth a note."""
+ROUNDING_REFUSED = 0.25
+"""The same in units of the median support, from which a picture would show the rounding instead of the particles."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What was read and how it was understood; `str(report)` is for people.
+
+    Attributes:
+        source: file format.
+        path: the file, or an empty string.
+        num_particles: number of particles.
+        quantity: name of the quantity.
+        quantity_range: its smallest and largest value; NaN for an empty set.
+        support: one sentence on where the supports come from.
+        support_range: smallest and largest support radius, length units; NaN for an empty set.
+        volume: one sentence on where the volumes come from.
+        notes: further sentences: what was left out, periodic boxes, rounding.
+    """
+
+    source: str
+    path: str
+    num_particles: int
+    quantity: str
+    quantity_range: tuple[float, float]
+    support: str
+    support_range: tuple[float, float]
+    volume: str
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.path or 'particles'}: {self.num_particles} particles ({self.source})",
+            f"quantity  {self.quantity}: {self.quantity_range[0]:.6g} .. {self.quantity_range[1]:.6g}",
+            f"support   {self.support_range[0]:.6g} .. {self.support_range[1]:.6g}: {self.support}",
+            f"volume    {self.volume}",
+        ]
+        return "\n".join([*lines, *(f"note      {note}" for note in self.notes)])
+
+
+def particles_from_table(
+    table: ParticleTable,
+    quantity: str | None = None,
+    support: float | Float[np.ndarray, " particles"] | None = None,
+    kernel: str = "poly6",
+    *,
+    progress: bool = False,
+) -> tuple[Particles, Report]:
+    r"""Particles that carry one quantity of a table.
+
+    Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
+    those of the table, else mass over density, else $1 / \sum_j W(|x_i - x_j|, H_i)$. Where supports vary, a stored
+    density is the sum over the particle's own support.
+
+    Args:
+        table: what was read.
+        quantity: name of a quantity (`jaxsph.io.quantities`), or `None` for the most telling one.
+        support: one support radius, or one a particle, in the table's length unit; overrides the table's.
+        kernel: name of a kernel, for the particles and for kernel sums.
+        progress: show progress bars; on a terminal large sets show them anyway.
+
+    Returns:
+        The particles, and the report on what was settled. Particles are float32 unless the positions are float64 and
+        x64 is enabled in JAX.
+
+    Raises:
+        ValueError: an unknown quantity; values that are not finite; supports that are not positive; positions whose
+            float32 rounding exceeds a quarter of a support.
+    """
+    try:
+        return _assemble(table, quantity, support, kernel, progress)
+    except DataError as error:
+        raise DataError(f"{table.path}: {error}" if table.path else str(error)) from error
+
+
+def _assemble(
+    table: ParticleTable, quantity: str | None, support: float | np.ndarray | None, kernel: str, progress: bool
+) -> tuple[Particles, Report]:
+    supports, support_origin = _supports(table, support, progress)
+    notes = [sentence for sentence in table.conventions if not sentence.startswith("support =")]
+    mass_name = table.named(*ROLES["mass"])
+    mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
+    number_density = functools.cache(lambda: kernel_sum(table.position, supports, kernel=kernel, progress=progress))
+
+    def density() -> np.ndarray:
+        if mass is None:
+            return number_density()
+        if len(mass) and mass.min() == mass.max():
+            return mass * number_density()
+        return kernel_sum(table.position, supports, mass, kernel=kernel, progress=progress)
+
+    values, name = choose_quantity(table, quantity, density=density)
+    stored_density = table.named(*ROLES["density"])
+    if table.volume is not None:
+        volumes, volume_origin = table.volume.astype(np.float64), "as the file has it"
+    elif mass is not None and stored_density is not None and _positive(mass, table.columns[stored_density]):
+        volumes = mass / table.columns[stored_density].astype(np.float64)
+        volume_origin = f"{mass_name} / {stored_density}"
+        if len(supports) and supports.min() < supports.max():
+            volume_origin += " (the stored density is the sum over the particle's own support)"
+    else:
+        volumes, volume_origin = 1 / number_density(), "1 / sum of kernels within the particle's own support"
+    if name.endswith("density") and stored_density is None:
+        notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
+    rounding = _check_rounding(table.position, supports)
+    if rounding:
+        notes.append(rounding)
+    dtype = table.position.dtype
+    with np.errstate(over="ignore"):
+        particles = Particles.from_arrays(
+            table.position, supports.astype(dtype), values.astype(dtype), _scaled(volumes).astype(dtype), kernel
+        )
+    report = Report(
+        source=table.source,
+        path=table.path,
+        num_particles=len(table),
+        quantity=name,
+        quantity_range=_range(values),
+        support=support_origin,
+        support_range=_range(supports),
+        volume=volume_origin,
+        notes=tuple(notes),
+    )
+    return particles, report
+
+
+def _supports(table: ParticleTable, support: float | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
+    if support is not None:
+        given = np.asarray(support, np.float64)
+        if given.ndim and given.shape != (len(table),):
+            raise DataError(f"`support` must be a number or have shape ({len(table)},), got shape {given.shape}")
+        bad = ~(np.isfinite(given) & (given > 0))
+        if bad.any():
+            raise DataError(f"`support` must be finite and > 0, got {given[bad].flat[0]}; give a radius")
+        return np.broadcast_to(given, (len(table),)), "given by the caller"
+    if table.support is not None:
+        sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
+        return table.support.astype(np.float64), sentence
+    origin = f"distance to neighbour {NEIGHBOURS}"
+    if len(table) == 1:
+        origin = "1, as a single particle has no neighbours"
+    elif 0 < len(table) <= NEIGHBOURS:
+        origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
+    return nearest_neighbour_supports(table.position, progress=progress), origin
+
+
+def _positive(*columns: np.ndarray) -> bool:
+    return all(column.ndim == 1 and bool((np.isfinite(column) & (column > 0)).all()) for column in columns)
+
+
+def _scaled(volumes: np.ndarray) -> np.ndarray:
+    """Volumes over their median where float32 could not hold them: only their ratios matter."""
+    limits = np.finfo(np.float32)
+    if len(volumes) == 0 or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny)):
+        return volumes
+    return volumes / np.median(volumes)
+
+
+def _check_rounding(position: np.ndarray, support: np.ndarray) -> str | None:
+    """A note on what float32 does to the positions; `ValueError` where it would destroy them."""
+    if len(position) == 0:
+        return None
+    rounding = float(np.abs(position).max()) * float(np.finfo(np.float32).eps) / 2
+    typical = float(np.median(support))
+    if rounding > ROUNDING_REFUSED * typical and not _x64(position):
+        raise DataError(
+            f"positions reach {np.abs(position).max():.6g} with supports of {typical:.6g}: float32 rounds them by "
+            f"{rounding / typical:.2g} supports; subtract a common offset from the positions, or use float64 under "
+            f"jax.enable_x64"
+        )
+    if rounding > ROUNDING_NOTED * float(support.min()) and not _x64(position):
+        return f"float32 rounds positions by up to {rounding / float(support.min()):.2g} of the smallest support"
+    return None
+
+
+def _x64(position: np.ndarray) -> bool:
+    import jax
+
+    return position.dtype == np.float64 and jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    return (float(values.min()), float(values.max())) if len(values) else (float("nan"), float("nan"))

@@ -1,0 +1,130 @@
+"""OpenEXR images with every layer of a render.
+
+| channel | meaning |
+|---|---|
+| `R` `G` `B` | colour, premultiplied, over black; linear numbers as rendered |
+| `A` | `1 - transmittance` |
+| `Z` | view depth where transmittance falls to 1/2, inf where it never does |
+| `error.bound` | largest difference to the reference image that a pixel can have |
+| `work.evaluations` | kernel evaluations spent on the pixel |
+
+All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
+`jaxsph.version` and `certified` (`true` or `false`).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.model.image import Image
+
+from .damage import DataError, explained
+from .optional import require
+from .replace import written_whole
+
+SOURCE = "OpenEXR"
+VERSION_KEY = "jaxsph.version"
+RESERVED = (
+    "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "pixelAspectRatio",
+    "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
+)  # fmt: skip
+WORDS = {"true": True, "false": False, "none": None}
+
+
+def write(path: Path, image: Image) -> None:
+    """Write every layer and the metadata of `image`; whole or not at all.
+
+    Raises:
+        ValueError: the path cannot be written to, or a metadata name is one that OpenEXR uses itself.
+        ImportError: OpenEXR is not installed.
+    """
+    openexr = require("OpenEXR", "writing EXR images")
+    color = np.asarray(image.color, np.float32)
+    layers = {
+        **{name: color[..., i] for i, name in enumerate("RGB")},
+        "A": 1 - np.asarray(image.transmittance, np.float32),
+        "Z": image.depth,
+        "error.bound": image.error_bound,
+        "work.evaluations": image.evaluations,
+    }
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **_attributes(image)}
+    with written_whole(path) as temporary:
+        try:
+            openexr.File(header, channels).write(str(temporary))
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"cannot write {path}: {error}") from error
+
+
+def read(path: Path) -> Image:
+    """Read an image that `write` wrote, or any OpenEXR image with `R`, `G` and `B`.
+
+    Layers that the file lacks are NaN. `stats` is empty: the sums of a render are not in the file.
+
+    Raises:
+        ValueError: damaged, or without colour.
+        ImportError: OpenEXR is not installed.
+    """
+    openexr = require("OpenEXR", "reading EXR images")
+    with explained(path, SOURCE):
+        if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
+            raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
+        file = openexr.File(str(path), separate_channels=True)
+        layers = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+        header = dict(file.header())
+        missing = [name for name in "RGB" if name not in layers]
+        if missing:
+            raise DataError(f"has no channel {' '.join(missing)}, only {' '.join(layers)}; a colour image is expected")
+        unknown = np.full_like(layers["R"], np.nan)
+        metadata = {name: _value(value) for name, value in header.items() if _is_metadata(name, value)}
+        return Image(
+            color=jnp.asarray(np.stack([layers[name] for name in "RGB"], axis=-1)),
+            transmittance=jnp.asarray(1 - layers.get("A", unknown)),
+            depth=jnp.asarray(layers.get("Z", unknown)),
+            error_bound=jnp.asarray(layers.get("error.bound", unknown)),
+            evaluations=jnp.asarray(layers.get("work.evaluations", unknown)),
+            certified=metadata.get("certified") is True,
+            faults=int(metadata.get("faults") or 0),
+            stats={},
+            metadata=tuple(metadata.items()),
+        )
+
+
+def _attributes(image: Image) -> dict[str, Any]:
+    """The metadata of `image` as EXR attributes."""
+    attributes = {str(name): _attribute(value) for name, value in dict(image.metadata).items()}
+    clash = [name for name in attributes if name in RESERVED]
+    if clash:
+        raise ValueError(f"`metadata` must not use the name {clash[0]!r}, which OpenEXR uses itself; rename it")
+    if VERSION_KEY not in attributes:
+        package = sys.modules[__name__.partition(".")[0]]  # looked up, as this room does not import the house
+        attributes[VERSION_KEY] = package.__version__
+    attributes.setdefault("certified", _attribute(bool(image.certified)))
+    attributes.setdefault("faults", int(image.faults))
+    return attributes
+
+
+def _attribute(value: Any) -> str | int | float:
+    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+        value = value.item()
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int) and abs(value) < 2**31:
+        return value
+    return float(value) if isinstance(value, int | float) else str(value)
+
+
+def _is_metadata(name: str, value: Any) -> bool:
+    return name not in RESERVED and isinstance(value, str | int | float)
+
+
+def _value(value: str | int | float) -> str | int | float | bool | None:
+    """An attribute as it was before it was written: EXR holds single precision, so the shortest decimal is meant."""
+    if isinstance(value, str):
+        return WORDS.get(value, value)
+    return float(str(np.float32(value))) if isinstance(value, float) else value

@@ -1,0 +1,106 @@
+"""Which reader reads a file: what its first bytes say, else its suffix.
+
+Flow: path -> [formats] -> reader -> ParticleTable.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .damage import DataError
+from .gadget_binary import looks_like
+from .table import ParticleTable
+
+SNIFFED_BYTES = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A particle file format.
+
+    Attributes:
+        name: what users call it.
+        suffixes: file name endings, in lower case.
+        module: the module of this package with its `read`.
+        sniff: whether a file with these first bytes is of this format; `None` where content does not tell.
+        typed: whether its `read` takes `part_type`.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    module: str
+    sniff: Callable[[bytes], bool] | None
+    typed: bool = False
+
+
+def _is_bgeo(start: bytes) -> bool:
+    if start[:2] == b"\x1f\x8b":
+        try:
+            start = _gzip_start(start)
+        except zlib.error:
+            return False
+    return start[:4] == b"Bgeo"
+
+
+def _gzip_start(start: bytes) -> bytes:
+    """The first bytes of gzipped data of which only the first bytes are given."""
+    return zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, 16)
+
+
+FORMATS = (
+    Format("NumPy archive", (".npz",), "npz", lambda start: start[:4] in (b"PK\x03\x04", b"PK\x05\x06")),
+    Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom or points", (".hdf5", ".h5", ".hdf"), "hdf5",
+           lambda start: start[:8] == b"\x89HDF\r\n\x1a\n", typed=True),
+    Format("legacy VTK", (".vtk",), "vtk", lambda start: start.startswith(b"# vtk DataFile")),
+    Format("VTK XML", (".vtu", ".vtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
+    Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
+    Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
+    Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
+    Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
+)  # fmt: skip
+
+
+def find_format(path: Path) -> Format:
+    """The format of the file at `path`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is a folder, or neither its content nor its suffix is known; the message lists those that are.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; give the name of a file in it")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    with path.open("rb") as file:
+        start = file.read(SNIFFED_BYTES)
+    by_content = next((form for form in FORMATS if form.sniff is not None and form.sniff(start)), None)
+    by_name = next((form for form in FORMATS if path.name.lower().endswith(form.suffixes)), None)
+    found = by_content or by_name
+    if found is None:
+        raise DataError(
+            f"{path}: the format is known neither by content nor by the suffix {path.suffix!r}; "
+            f"known are {known_suffixes()}"
+        )
+    return found
+
+
+def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
+    """Read `path` as `form`; `ValueError` when a format without particle types is asked for one."""
+    reader: Any = importlib.import_module(f".{form.module}", __package__)
+    if form.typed:
+        table = reader.read(path, part_type=part_type)
+    elif part_type is not None:
+        raise DataError(f"{path}: {form.name} files have no particle types; leave out `part_type` (got {part_type})")
+    else:
+        table = reader.read(path)
+    return dataclasses.replace(table, path=str(path))
+
+
+def known_suffixes() -> str:
+    """All suffixes with their formats, for messages."""
+    return "; ".join(f"{' '.join(form.suffixes)} ({form.name})" for form in FORMATS)

@@ -1,0 +1,165 @@
+r"""Gadget binary snapshots, format 1 and 2, of either byte order. One type of particles is read.
+
+A snapshot is a sequence of Fortran records: the length of the data as uint32, the data, the length again. Format 2 puts
+a record of 8 bytes with a name before each block; format 1 relies on the order POS VEL ID MASS U RHO (NE NH) HSML.
+The support is HSML itself (Gadget convention). Units are left as stored; a periodic box is noted, and not wrapped.
+Source: Springel, User guide for GADGET-2, section 6.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from .damage import DataError, explained
+from .gadget_hdf5 import PERIODIC_NOTE
+from .table import ParticleTable
+
+SOURCE = "Gadget binary"
+Order = Literal["<", ">"]
+HEADER_BYTES = 256
+NUM_TYPES = 6
+HEADER = [
+    ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
+    ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
+]  # fmt: skip
+GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
+COLUMN_NAMES = {
+    "VEL": "velocity", "ID": "id", "MASS": "mass", "U": "internal_energy", "RHO": "density", "POT": "potential",
+}  # fmt: skip
+
+
+def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+    """Read the particles of one type; without `part_type`, gas (0) or the first type there is.
+
+    Raises:
+        ValueError: damaged, cut short, blocks of sizes that fit no number of particles, or no such type.
+    """
+    with explained(path, SOURCE):
+        content = np.fromfile(path, dtype=np.uint8)
+        order = _byte_order(content)
+        blocks = _blocks(content, order)
+        header = _header(blocks.pop("HEAD"), order)
+        counts = header["count"].astype(np.int64)
+        chosen = _choose(counts, part_type)
+        said = [f"particles of type {chosen}"]
+        columns: dict[str, np.ndarray] = {}
+        for name, raw in blocks.items():
+            values = _block(name, raw, counts, header["mass"], chosen, order)
+            if isinstance(values, str):
+                said.append(values)
+            elif values is not None:
+                columns[COLUMN_NAMES.get(name, name)] = values
+        if "POS" not in columns:
+            raise DataError(f"has no block POS among {', '.join(blocks)}; write the snapshot again with positions")
+        if "mass" not in columns and header["mass"][chosen] > 0:
+            columns["mass"] = np.full(counts[chosen], header["mass"][chosen])
+            said.append(f"mass = {header['mass'][chosen]:g} for all (mass table in the header)")
+        if header["files"] > 1:
+            said.append(f"this is one of {header['files']} files of the snapshot; only its particles are read")
+        support = columns.pop("HSML", None)
+        if support is not None:
+            said.append("support = HSML (Gadget convention: the kernel ends there)")
+        edge = float(header["box"])
+        box_size = (edge, edge, edge) if edge > 0 else None
+        if box_size:
+            said.append(f"periodic box of {edge:g}: {PERIODIC_NOTE}")
+        return ParticleTable(
+            columns.pop("POS"), columns, support, box_size=box_size, source=SOURCE, conventions=tuple(said)
+        )
+
+
+def looks_like(start: bytes) -> bool:
+    """Whether a file that begins with `start` begins with a Gadget record."""
+    return start[:4] in (np.array(length, order).tobytes() for length in (8, HEADER_BYTES) for order in ("<u4", ">u4"))
+
+
+def _byte_order(content: np.ndarray) -> Order:
+    orders: tuple[Order, ...] = ("<", ">")
+    for order in orders:
+        if len(content) >= 4 and content[:4].view(f"{order}u4")[0] in (8, HEADER_BYTES):
+            return order
+    raise DataError("does not begin with a Gadget record of 8 (format 2) or 256 bytes (format 1); it is another format")
+
+
+def _records(content: np.ndarray, order: Order) -> list[np.ndarray]:
+    records, at = [], 0
+    while at < len(content):
+        length = int(content[at : at + 4].view(f"{order}u4")[0]) if at + 4 <= len(content) else 0
+        stop = at + 4 + length
+        if stop + 4 > len(content):
+            raise DataError(f"is cut short: a block at byte {at} is not complete; copy it again")
+        if content[stop : stop + 4].copy().view(f"{order}u4")[0] != length:
+            raise DataError(f"is damaged: the block at byte {at} begins with length {length} and ends with another one")
+        records.append(content[at + 4 : stop])
+        at = stop + 4
+    return records
+
+
+def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
+    """Blocks by name, `HEAD` first."""
+    records = _records(content, order)
+    if len(records[0]) == 8:
+        names = [record[:4].tobytes().decode("ascii", errors="replace").strip() for record in records[0::2]]
+        if any(len(record) != 8 for record in records[0::2]) or len(records) % 2:
+            raise DataError("is damaged: its block names (format 2) are not where they must be; copy it again")
+        blocks = dict(zip(names, records[1::2], strict=True))
+    else:
+        header = _header(records[0], order)
+        names = ["HEAD", "POS", "VEL", "ID"]
+        names += ["MASS"] if ((header["count"] > 0) & (header["mass"] == 0)).any() else []
+        names += ["U", "RHO", *(["NE", "NH"] if header["cooling"] else []), "HSML"] if header["count"][0] > 0 else []
+        blocks = dict(zip(names, records, strict=False))  # what follows HSML differs between codes, and is not read
+        if len(blocks) < 4:
+            raise DataError("is cut short: format 1 has at least POS, VEL and ID after its header; copy it again")
+    if len(blocks.get("HEAD", ())) != HEADER_BYTES:
+        raise DataError("has no header of 256 bytes as its first block, so it is damaged or another format")
+    return blocks
+
+
+def _header(record: np.ndarray, order: Order) -> np.void:
+    dtype = np.dtype(HEADER).newbyteorder(order)
+    return record[: dtype.itemsize].view(dtype)[0]
+
+
+def _choose(counts: np.ndarray, part_type: int | None) -> int:
+    present = np.flatnonzero(counts).tolist()
+    if part_type is None:
+        return present[0] if present else 0
+    if part_type not in present:
+        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, present))}")
+    return part_type
+
+
+def _block(
+    name: str, raw: np.ndarray, counts: np.ndarray, masses: np.ndarray, chosen: int, order: Order
+) -> np.ndarray | str | None:
+    """The rows of the chosen type, `None` where there are none, or a sentence where the block is not understood."""
+    everyone, gas = np.ones(NUM_TYPES, bool), np.arange(NUM_TYPES) == 0
+    known = True
+    if name in ("POS", "VEL", "ACCE"):
+        candidates = [(everyone, 3)]
+    elif name in ("ID", "POT", "TSTP"):
+        candidates = [(everyone, 1)]
+    elif name == "MASS":
+        candidates = [((counts > 0) & (masses == 0), 1)]
+    elif name in GAS_BLOCKS:
+        candidates = [(gas, 1)]
+    else:
+        known = False
+        candidates = [(gas, 1), (gas, 3), (everyone, 1), (everyone, 3)]
+    for types, width in candidates:
+        rows = int(counts[types].sum())
+        for size in (4, 8) if known else (4,):
+            if rows * width * size == len(raw):
+                if not types[chosen]:
+                    return None
+                values = raw.copy().view(f"{order}{'u' if name == 'ID' else 'f'}{size}")
+                start = int(counts[:chosen][types[:chosen]].sum())
+                picked = values.reshape(rows, width)[start : start + int(counts[chosen])]
+                return picked if width > 1 else picked[:, 0]
+    if known:
+        raise DataError(f"has a block {name} of {len(raw)} bytes, which fits no number of its particles; copy it again")
+    return f"left out block {name}: its {len(raw)} bytes fit no number of particles"

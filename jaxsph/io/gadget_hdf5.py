@@ -1,0 +1,136 @@
+r"""Gadget-style HDF5 snapshots: GADGET-2/3/4, GIZMO, AREPO and SWIFT. One type of particles is read.
+
+What `SmoothingLength` means depends on the code:
+
+| code | support radius $H$ |
+|---|---|
+| GADGET, GIZMO | `SmoothingLength` itself |
+| SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel named in `HydroScheme` |
+
+Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
+`Masses`, or from `MassTable` in the header. A periodic box is noted, and not wrapped.
+Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from .damage import DataError
+from .table import ParticleTable, plain
+
+SOURCE = "Gadget HDF5"
+SWIFT_SOURCE = "SWIFT HDF5"
+SWIFT_GAMMA = {
+    "Cubic spline (M4)": 1.825742,
+    "Quartic spline (M5)": 2.018932,
+    "Quintic spline (M6)": 2.195775,
+    "Wendland C2": 1.936492,
+    "Wendland C4": 2.207940,
+    "Wendland C6": 2.449490,
+}
+"""Support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
+SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
+PERIODIC_NOTE = "particles are not repeated across its faces"
+
+
+def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
+    """The particles of one type of an open `h5py.File`.
+
+    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`.
+
+    Raises:
+        ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
+    """
+    chosen, group = _choose(file, part_type)
+    position = group["Coordinates"][()]
+    count = len(position)
+    said = [f"particles of PartType{chosen}"]
+    swift = _is_swift(file)
+    columns, dropped = {}, []
+    for name, dataset in group.items():
+        if name == "Coordinates" or not hasattr(dataset, "shape") or dataset.ndim not in (1, 2):
+            continue
+        if dataset.dtype.kind not in "fiub":
+            dropped.append(name)
+        elif dataset.shape[0] != count:
+            raise DataError(f"PartType{chosen}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
+        else:
+            columns[name] = dataset[()]
+    if dropped:
+        said.append(f"left out {', '.join(dropped)}: not numbers")
+    header = file["Header"].attrs if "Header" in file else {}
+    if not any(plain(name) in ("mass", "masses") for name in columns):
+        mass = _table_mass(header, chosen)
+        if mass:
+            columns["Masses"] = np.full(count, mass)
+            said.append(f"mass = {mass:g} for all (MassTable in the header)")
+    files = int(np.ravel(header.get("NumFilesPerSnapshot", 1))[0])
+    if files > 1:
+        said.append(f"this is one of {files} files of the snapshot; only its particles are read")
+    smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
+    support = None
+    if smoothing is not None:
+        support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
+        said.append(sentence)
+    box_size = _box(header)
+    if box_size is not None:
+        said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
+    return ParticleTable(
+        position, columns, support, None, box_size, SWIFT_SOURCE if swift else SOURCE, conventions=tuple(said)
+    )
+
+
+def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:
+    found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
+    usable = sorted(number for number, group in found.items() if "Coordinates" in group)
+    if not usable:
+        raise DataError("has particle types, but none with Coordinates; write the snapshot again with positions")
+    if part_type is None:
+        part_type = usable[0]
+    if part_type not in usable:
+        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, usable))}")
+    return part_type, found[part_type]
+
+
+def _is_swift(file: Any) -> bool:
+    """SWIFT signs its snapshots in the header, and in the group `Code`."""
+    return any("SWIFT" in text(file[group].attrs.get("Code", "")) for group in ("Header", "Code") if group in file)
+
+
+def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
+    if not swift:
+        return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
+    attributes = file["HydroScheme"].attrs if "HydroScheme" in file else {}
+    kernel = text(attributes.get("Kernel function", ""))
+    if kernel not in SWIFT_GAMMA:
+        raise DataError(
+            f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`); the support radius is known "
+            f"for {', '.join(SWIFT_GAMMA)}"
+        )
+    gamma = SWIFT_GAMMA[kernel]
+    return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {kernel} kernel)"
+
+
+def _table_mass(header: Any, chosen: int) -> float:
+    masses = np.ravel(header.get("MassTable", ()))
+    return float(masses[chosen]) if chosen < len(masses) else 0.0
+
+
+def _box(header: Any) -> tuple[float, float, float] | None:
+    edges = np.ravel(header.get("BoxSize", 0.0)).astype(np.float64)
+    if len(edges) not in (1, 3) or not (edges > 0).all():
+        return None
+    x, y, z = np.broadcast_to(edges, 3).tolist()
+    return x, y, z
+
+
+def text(value: Any) -> str:
+    """An HDF5 attribute as a string, whether it is stored as one, as bytes, or as an array of one of them."""
+    first = np.ravel(np.asarray(value, dtype=object))
+    if len(first) == 0:
+        return ""
+    return first[0].decode("utf-8", errors="replace") if isinstance(first[0], bytes) else str(first[0])

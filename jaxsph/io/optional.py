@@ -1,0 +1,19 @@
+"""Import an optional library at the moment it is needed, or say how to install it."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+
+def require(module: str, purpose: str) -> Any:
+    """The module called `module`.
+
+    Raises:
+        ImportError: when it is not installed; the message names `purpose` and the extra that brings the library.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        library = module.partition(".")[0]
+        raise ImportError(f'{purpose} needs the library `{library}`: pip install "jaxsph[io]"') from error

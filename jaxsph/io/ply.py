@@ -1,0 +1,75 @@
+"""PLY point sets, ASCII and binary of both byte orders: the `vertex` element; faces are not read.
+
+Source: G. Turk, The PLY Polygon File Format, 1994.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .damage import UNENDED_NOTE, DataError, explained
+from .table import ParticleTable, table_from_columns
+from .vectors import gather_vectors
+
+SOURCE = "PLY"
+TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read(path: Path) -> ParticleTable:
+    """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns."""
+    with explained(path, SOURCE):
+        content = path.read_bytes()
+        encoding, count, record, start = _header(content)
+        if encoding == "ascii":
+            rows = content[start:].split(b"\n")[:count]
+            if len(rows) < count or (count and not rows[-1].strip()):
+                raise DataError(f"is cut short: {count} vertices are announced, fewer are there; copy it again")
+            names = record.names or ()
+            values = np.loadtxt([row.decode("ascii") for row in rows], ndmin=2) if count else np.zeros((0, len(names)))
+            if values.shape[1] != len(names):
+                raise DataError(f"has {values.shape[1]} numbers a vertex, but {len(names)} properties are announced")
+            fields = {name: values[:, i].astype(record[name]) for i, name in enumerate(names)}
+        else:
+            available = (len(content) - start) // record.itemsize
+            if available < count:
+                raise DataError(f"is cut short: {count} vertices are announced, {available} are there; copy it again")
+            points = np.frombuffer(content, record, count, start)
+            fields = {name: np.ascontiguousarray(points[name]) for name in record.names or ()}
+        position, columns = gather_vectors(fields)
+        said = [UNENDED_NOTE] if encoding == "ascii" and not content.endswith(b"\n") else []
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _header(content: bytes) -> tuple[str, int, np.dtype, int]:
+    """Encoding, number of vertices, the record of one vertex, and the offset of the first."""
+    if not content.startswith(b"ply"):
+        raise DataError("does not begin with `ply`, so it is no PLY file")
+    end = content.find(b"end_header")
+    start = content.find(b"\n", end) + 1
+    if end < 0 or start == 0:
+        raise DataError("is cut short: its header does not end; copy it again")
+    lines = [line.split() for line in content[:end].decode("ascii", errors="replace").splitlines()]
+    formats = [words[1] for words in lines if words[:1] == ["format"]]
+    if not formats or formats[0] not in BYTE_ORDERS:
+        raise DataError(f"has the PLY format {formats}, expected one of {', '.join(BYTE_ORDERS)}")
+    elements = [index for index, words in enumerate(lines) if words[:1] == ["element"]]
+    if not elements or lines[elements[0]][1] != "vertex":
+        raise DataError("does not have `vertex` as its first element; only points are read: save the vertices alone")
+    stop = elements[1] if len(elements) > 1 else len(lines)
+    properties = [words[1:] for words in lines[elements[0] : stop] if words[:1] == ["property"]]
+    if any(words[0] not in TYPES for words in properties):
+        raise DataError("has vertex properties that are lists or of unknown type; save the vertices without them")
+    order = BYTE_ORDERS[formats[0]]
+    record = np.dtype([(name, order + TYPES[kind]) for kind, name in properties])
+    count = int(lines[elements[0]][2])
+    if count < 0:
+        raise DataError(f"announces {count} vertices, so its header is damaged")
+    return formats[0], count, record, start

@@ -1,0 +1,46 @@
+"""PNG images: 8 bit RGB of the colours over black, for looking at.
+
+Colours come from a transfer function, which is made by eye on a display, so they are display-referred: they are written
+as they are, clipped to [0, 1] and rounded to the nearest of 256 steps, with no further encoding. Layers other than
+colour are left out; write EXR to keep them. The metadata goes into text chunks.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.model.image import Image
+
+from .damage import explained
+from .optional import require
+from .replace import written_whole
+
+SOURCE = "PNG"
+
+
+def write(path: Path, image: Image) -> None:
+    """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to."""
+    pillow = require("PIL.Image", "writing PNG images")
+    chunks = require("PIL.PngImagePlugin", "writing PNG images").PngInfo()
+    for name, value in dict(image.metadata).items():
+        chunks.add_text(str(name), str(value))
+    with written_whole(path) as temporary:
+        pillow.fromarray(image.to_uint8()).save(temporary, format="PNG", pnginfo=chunks)
+
+
+def read(path: Path) -> Image:
+    """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file, and NaN.
+
+    Raises:
+        ValueError: damaged or another format.
+    """
+    pillow = require("PIL.Image", "reading PNG images")
+    with explained(path, SOURCE):
+        with pillow.open(path, formats=["PNG"]) as opened:
+            color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
+            metadata = tuple(getattr(opened, "text", {}).items())
+        unknown = jnp.full(color.shape[:2], jnp.nan, jnp.float32)
+        return Image(jnp.asarray(color), unknown, unknown, unknown, unknown, False, 0, {}, metadata)

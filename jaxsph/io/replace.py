@@ -1,0 +1,47 @@
+"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def written_whole(path: str | Path) -> Iterator[Path]:
+    """Give the block a temporary path beside `path`, of the same suffix; rename it to `path` when the block succeeds.
+
+    When the block fails, the temporary file is removed and what stood at `path` before still stands there.
+
+    Raises:
+        ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    if not path.parent.is_dir():
+        raise ValueError(f"cannot write {path}: the folder {path.parent} does not exist; make it first")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"cannot write {path}: {reason}; choose another place") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)  # the mask can only be read by setting it
+    os.umask(mask)
+    return mask

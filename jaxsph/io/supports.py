@@ -1,0 +1,145 @@
+r"""Support radii from nearest neighbours, and kernel sums for volumes and densities, on the host.
+
+Flow: ParticleTable -> [supports] -> Particles.
+
+Many files hold points and nothing more. A support radius that reaches a fixed number of neighbours, and the volume
+$V_i = 1 / \sum_j W(|x_i - x_j|, H_i)$ that goes with it, turn such a set into an SPH field.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from jaxsph.model import kernels
+
+NEIGHBOURS = 32
+"""Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
+
+PAIR_BUDGET = 2**22
+"""Pairs looked at in one go: about 100 MB of distances, indices and weights."""
+
+SHOW_PROGRESS_FROM = 100_000
+"""Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
+
+
+def nearest_neighbour_supports(
+    position: Float[np.ndarray, "particles 3"], neighbours: int = NEIGHBOURS, *, progress: bool = False
+) -> Float[np.ndarray, " particles"]:
+    r"""Distance to the `neighbours`-th nearest other particle.
+
+    With only $m <$ `neighbours` others, the distance $d$ to the farthest is scaled as in a uniform set,
+    $H = d \, (k / m)^{1/3}$. Coincident particles count as one place where the distance would be 0 otherwise. Where
+    there is only one place, no length is known and every support is 1.
+
+    Args:
+        position: (N, 3), any length unit; distances are computed in float64. Periodic boxes are not wrapped.
+        neighbours: $k \ge 1$.
+        progress: show a progress bar; on a terminal large sets show one anyway.
+
+    Returns:
+        (N,) float64 supports, positive, in the unit of `position`.
+
+    Raises:
+        ValueError: `neighbours < 1`.
+    """
+    if neighbours < 1:
+        raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
+    position = np.asarray(position, dtype=np.float64)
+    count = len(position)
+    if count == 0:
+        return np.zeros(0)
+    reach = min(neighbours, count - 1)
+    if reach == 0:
+        return np.ones(count)
+    tree = KDTree(position)
+    support = np.empty(count)
+    for rows in _slices(np.full(count, reach + 1), progress, "supports"):
+        distance, _ = tree.query(position[rows], k=reach + 1, workers=-1)  # the first is the particle itself
+        support[rows] = distance[:, -1]
+    support *= (neighbours / reach) ** (1 / 3)
+    crowded = support == 0
+    if crowded.any():
+        places = np.unique(position, axis=0)
+        if len(places) == 1:
+            return np.ones(count)
+        reach = min(neighbours, len(places) - 1)
+        distance, _ = KDTree(places).query(position[crowded], k=reach + 1, workers=-1)
+        support[crowded] = distance[:, -1] * (neighbours / reach) ** (1 / 3)
+    return support
+
+
+def kernel_sum(
+    position: Float[np.ndarray, "particles 3"],
+    support: Float[np.ndarray, " particles"],
+    weight: Float[np.ndarray, " particles"] | None = None,
+    *,
+    kernel: str = "poly6",
+    progress: bool = False,
+) -> Float[np.ndarray, " particles"]:
+    r"""The gather sum $\sum_j w_j W(|x_i - x_j|, H_i)$ at every particle, itself included.
+
+    With masses as weights this is the SPH density, as codes with varying supports define and store it (each particle
+    uses its own $H_i$); without weights it is the number density, whose inverse is a volume.
+
+    Args:
+        position: (N, 3); distances are computed in float64. Periodic boxes are not wrapped.
+        support: (N,) support radii $H > 0$, same unit as `position`.
+        weight: (N,) weights $w$; `None` means 1.
+        kernel: name of a kernel of `jaxsph.model.kernels`.
+        progress: show a progress bar; on a terminal large sets show one anyway.
+
+    Returns:
+        (N,) float64 sums, positive where weights are, in units of `weight` over a volume.
+    """
+    chosen = kernels.by_name(kernel)
+    position = np.asarray(position, dtype=np.float64)
+    support = np.asarray(support, dtype=np.float64)
+    total = np.zeros(len(position))
+    if len(position) == 0:
+        return total
+    padded_weight = np.append(np.ones(len(position)) if weight is None else np.asarray(weight, np.float64), 0.0)
+    tree = KDTree(position)
+    reached = tree.query_ball_point(position, support, return_length=True, workers=-1)
+    order = np.argsort(reached, kind="stable")  # alike counts together, so that a block has little padding
+    for block in _slices(reached[order], progress, "kernel sums"):
+        rows = order[block]
+        most, farthest = max(2, int(reached[rows].max())), float(support[rows].max())  # k = 1 would drop an axis
+        distance, neighbour = tree.query(position[rows], k=most, distance_upper_bound=farthest, workers=-1)
+        q = distance / support[rows, None]
+        q[~np.isfinite(q)] = 1.0
+        shape = chosen.shape((1 - q) * (1 + q), np)
+        total[rows] = (shape * padded_weight[neighbour]).sum(axis=1)
+    return chosen.norm * total / support**3
+
+
+def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:
+    """Consecutive blocks of rows whose largest entry of ascending `pairs`, times their number, fits `PAIR_BUDGET`."""
+    bar = _progress_bar(len(pairs), progress, what)
+    start = 0
+    while start < len(pairs):
+        stop = min(len(pairs), start + max(1, PAIR_BUDGET // int(pairs[start])))
+        while stop - start > 1 and (stop - start) * int(pairs[stop - 1]) > PAIR_BUDGET:
+            stop = start + max(1, (stop - start) // 2)
+        yield slice(start, stop)
+        if bar is not None:
+            bar.update(stop - start)
+        start = stop
+    if bar is not None:
+        bar.close()
+
+
+def _progress_bar(count: int, asked: bool, what: str) -> Any:
+    """A tqdm bar when it is asked for, or when the wait is worth one and a person watches; else `None`."""
+    if not asked and (count < SHOW_PROGRESS_FROM or not sys.stderr.isatty()):
+        return None
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return None  # a bar is a comfort, not a need
+    return tqdm(total=count, desc=what, unit=" particles", unit_scale=True, leave=False)

@@ -1,0 +1,162 @@
+"""Particles as a file holds them: host side arrays under the names the file gave them.
+
+Flow: file -> reader -> [ParticleTable] -> quantity, supports, volumes -> Particles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from .damage import DataError
+
+SUPPORT_NAMES = ("support", "support_radius")
+VOLUME_NAMES = ("volume",)
+SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
+
+
+def plain(name: str) -> str:
+    """`name` in lower case with letters and digits only, so that `Points:0` and `points_0` compare equal."""
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ParticleTable:
+    """What a particle file holds, in NumPy arrays of native byte order.
+
+    Attributes:
+        position: (N, 3), float32 or float64 as stored, in the file's length unit; nothing is subtracted.
+        columns: the other data by the name the file gives them: (N,) scalars or (N, k) vectors. They may hold NaN.
+        support: (N,) support radius $H > 0$ where the file defines one, or `None`. Length units of `position`.
+        volume: (N,) particle volume $V > 0$ where the file defines one, or `None`.
+        box_size: edge lengths of a periodic box, or `None`. Particles are not repeated across its faces.
+        source: name of the file format.
+        path: the file, for messages; empty when the table was made in memory.
+        conventions: sentences which say how supports and volumes were got, and what was left out.
+
+    Raises:
+        ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
+            supports or volumes that are not finite and positive. Empty sets are allowed.
+    """
+
+    position: Float[np.ndarray, "particles 3"]
+    columns: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    support: Float[np.ndarray, " particles"] | None = None
+    volume: Float[np.ndarray, " particles"] | None = None
+    box_size: tuple[float, float, float] | None = None
+    source: str = "memory"
+    path: str = ""
+    conventions: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        position = native(np.asarray(self.position))
+        if position.ndim != 2 or position.shape[1] != 3:
+            raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
+        if position.dtype not in (np.float32, np.float64):
+            position = position.astype(np.float64)
+        _refuse_non_finite(position)
+        columns = {str(name): _column(str(name), column, len(position)) for name, column in self.columns.items()}
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "columns", columns)
+        for name in ("support", "volume"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, _positive(name, value, len(position)))
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @property
+    def scalars(self) -> tuple[str, ...]:
+        """Names of the (N,) columns."""
+        return tuple(name for name, column in self.columns.items() if column.ndim == 1)
+
+    @property
+    def vectors(self) -> tuple[str, ...]:
+        """Names of the (N, k) columns."""
+        return tuple(name for name, column in self.columns.items() if column.ndim == 2)
+
+    def named(self, *names: str) -> str | None:
+        """The first column whose name is one of `names` but for case and punctuation, or `None`."""
+        wanted = [plain(name) for name in names]
+        found = [name for want in wanted for name in self.columns if plain(name) == want]
+        return found[0] if found else None
+
+
+def table_from_columns(
+    position: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    *,
+    source: str,
+    conventions: Sequence[str] = (),
+) -> ParticleTable:
+    """A table of a general-purpose format, where the meaning of a column is only in its name.
+
+    `support` or `support_radius` is the support radius and `volume` the volume. A smoothing length (`h`, ...) is kept
+    as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that wrote it.
+    """
+    said = list(conventions)
+    rest = dict(columns)
+    special: dict[str, np.ndarray] = {}
+    for role, names in (("support", SUPPORT_NAMES), ("volume", VOLUME_NAMES)):
+        stored = next((name for name in rest if plain(name) in map(plain, names)), None)
+        if stored is not None and np.ndim(rest[stored]) == 1:
+            special[role] = rest.pop(stored)
+            said.append(f"{role} = column `{stored}`")
+    smoothing = next((name for name in rest if plain(name) in map(plain, SMOOTHING_NAMES)), None)
+    if smoothing is not None and "support" not in special:
+        said.append(
+            f"column `{smoothing}` looks like a smoothing length and is not used: the factor from it to the support "
+            f"radius differs between codes; pass `support=` to set supports yourself"
+        )
+    return ParticleTable(
+        position, rest, special.get("support"), special.get("volume"), source=source, conventions=tuple(said)
+    )
+
+
+def native(array: np.ndarray) -> np.ndarray:
+    """`array` in the byte order of this machine."""
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+
+
+def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:
+    column = native(np.asarray(column))
+    if column.ndim == 2 and column.shape[1] == 1:
+        column = column[:, 0]
+    if column.ndim not in (1, 2) or len(column) != count:
+        raise DataError(
+            f"column `{name}` has shape {column.shape}, but there are {count} particles; "
+            f"a column must be (N,) or (N, k): leave it out, or write the file again"
+        )
+    if column.dtype.kind not in "fiub":
+        raise DataError(f"column `{name}` must hold numbers, got dtype {column.dtype}; leave it out")
+    return column
+
+
+def _positive(name: str, value: np.ndarray, count: int) -> np.ndarray:
+    value = _column(name, value, count)
+    if value.ndim != 1:
+        raise DataError(f"`{name}` must have shape ({count},), got {value.shape}; give one number a particle")
+    if value.dtype not in (np.float32, np.float64):
+        value = value.astype(np.float64)
+    bad = ~(np.isfinite(value) & (value > 0))
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise DataError(
+            f"`{name}` must be finite and positive, but {int(bad.sum())} of {count} values are not, "
+            f"the first at index {first}: {value[first]}; remove these particles or pass `{name}=` yourself"
+        )
+    return value
+
+
+def _refuse_non_finite(position: np.ndarray) -> None:
+    bad = ~np.isfinite(position).all(axis=1)
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise DataError(
+            f"positions must be finite, but {int(bad.sum())} of {len(position)} are not, the first at index {first}: "
+            f"{position[first].tolist()}; remove these particles, or write the file again"
+        )

@@ -1,0 +1,127 @@
+"""Text tables: CSV (`,` `;` or tab), columns parted by spaces, and XYZ, with or without names.
+
+Names come from a first line of words, or from a `#` comment right above the numbers; without names the first three
+columns are x, y, z. An XYZ file begins with the number of particles and a comment, and each line with the name of an
+element; extended XYZ names its columns in the comment (`Properties=species:S:1:pos:R:3:...`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .damage import UNENDED_NOTE, DataError, explained
+from .table import ParticleTable, table_from_columns
+from .vectors import gather_vectors
+
+SOURCE = "text table"
+DELIMITERS = (",", ";", "\t")
+
+
+def read(path: Path) -> ParticleTable:
+    """Read a table of numbers; columns of words are left out.
+
+    Raises:
+        ValueError: not text, empty, rows of different length, words among numbers, fewer than three columns, or an XYZ
+            file with another number of rows than it announces.
+    """
+    with explained(path, SOURCE):
+        content = path.read_bytes()
+        if b"\0" in content:
+            raise DataError("is not text: it holds zero bytes; check its format, or rename it to its proper suffix")
+        text = content.decode("utf-8-sig")
+        lines = text.splitlines()
+        if not text.strip():
+            raise DataError("is empty; an empty set of particles needs a line of column names")
+        ended = text.endswith(("\n", "\r"))
+        names, rows, delimiter = _names(lines)
+        if not rows and not ended:
+            raise DataError("is cut short: its first line has no end; copy it again")
+        said = [] if ended else [UNENDED_NOTE]
+        fields, left_out = _fields(rows, names, delimiter)
+        if left_out:
+            said.append(f"left out {', '.join(left_out)}: not numbers")
+        position, columns = gather_vectors(fields)
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
+    """Column names if there are any, the rows of data, and the delimiter (`None` for spaces)."""
+    if lines[0].strip().isdigit():
+        count, comment = int(lines[0]), "".join(lines[1:2])
+        rows = [line for line in lines[2:] if line.strip()]
+        if len(rows) != count:
+            raise DataError(f"announces {count} particles, but {len(rows)} lines follow; it is cut short or damaged")
+        return _extended_names(comment), rows, None
+    rows = [line for line in lines if line.strip()]
+    comments = 0
+    while comments < len(rows) and rows[comments].lstrip().startswith("#"):
+        comments += 1
+    data = [row for row in rows[comments:] if not row.lstrip().startswith("#")]
+    if not data:
+        last = rows[comments - 1].lstrip("# ") if comments else ""
+        delimiter = _delimiter(last)
+        return (_split(last, delimiter) if last else ["x", "y", "z"]), [], delimiter
+    delimiter = _delimiter(data[0])
+    first = _split(data[0], delimiter)
+    if not any(_is_number(word) for word in first):
+        return first, data[1:], delimiter
+    above = rows[comments - 1].lstrip("# ") if comments else ""
+    named = _split(above, delimiter if delimiter and delimiter in above else None)
+    fits = len(named) == len(first) and not any(map(_is_number, named))
+    return (named if fits else None), data, delimiter
+
+
+def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of numbers by name, and the names of the columns that hold words."""
+    if not rows:
+        return {name: np.zeros(0) for name in names or ("x", "y", "z")}, []
+    first = _split(rows[0], delimiter)
+    numeric = [index for index, word in enumerate(first) if _is_number(word)]
+    if names is None:
+        labels = ["x", "y", "z"] + [f"column{index}" for index in range(4, len(numeric) + 1)]
+        names = [f"column{index + 1}" for index in range(len(first))]
+        for index, label in zip(numeric, labels, strict=False):
+            names[index] = label
+    if len(names) != len(first):
+        raise DataError(f"names {len(names)} columns, but its first row has {len(first)}; name each column once")
+    if len(set(names)) != len(names):
+        raise DataError(f"has columns of the same name among {', '.join(names)}; name each column once")
+    widths = {len(_split(row, delimiter)) for row in rows}
+    if len(widths) > 1:
+        raise DataError(f"has rows of {' and '.join(map(str, sorted(widths)))} columns; all must have the same number")
+    clean = [row.replace('"', "") for row in rows] if '"' in rows[0] else rows
+    values = np.loadtxt(clean, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None)
+    fields = {names[index]: values[:, column] for column, index in enumerate(numeric)}
+    return fields, [name for index, name in enumerate(names) if index not in numeric]
+
+
+def _extended_names(comment: str) -> list[str] | None:
+    """Column names from an extended XYZ comment."""
+    match = re.search(r"Properties=([\w:]+)", comment)
+    if match is None:
+        return None
+    parts = match[1].split(":")
+    names = []
+    for name, _, width in zip(parts[0::3], parts[1::3], parts[2::3], strict=True):
+        suffixes = [""] if width == "1" else [f"_{c}" for c in ("xyz" if width == "3" else map(str, range(int(width))))]
+        names += [name + suffix for suffix in suffixes]
+    return names
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in DELIMITERS if mark in line), None)
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    return [word.strip().strip('"').strip() for word in line.split(delimiter)]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,151 @@
+"""VTK XML point sets: unstructured grids (`.vtu`) and polydata (`.vtp`); points and point data, cells are not read.
+
+Data may be ASCII, base64 or appended (raw or base64), plain or compressed by zlib or LZMA, of both byte orders, in any
+number of pieces. Point sets without a single cell are common among particle codes, and are read like others.
+Source: VTK File Formats, Kitware, "XML File Formats"; the layout of blocks after vtkXMLDataParser.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import lzma
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from .damage import DataError, explained
+from .table import ParticleTable, table_from_columns
+
+SOURCE = "VTK XML"
+DATASETS = ("UnstructuredGrid", "PolyData")
+TYPES = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
+    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+COMPRESSORS: dict[str | None, Callable[[bytes], bytes] | None] = {
+    None: None,
+    "vtkZLibDataCompressor": zlib.decompress,
+    "vtkLZMADataCompressor": lzma.decompress,
+}
+
+
+def read(path: Path) -> ParticleTable:
+    """Read points and point data of all pieces; columns of words are left out, and said so.
+
+    Raises:
+        ValueError: damaged, cut short, another type of data set, or a compressor that is not known.
+    """
+    with explained(path, SOURCE):
+        content = path.read_bytes()
+        head, mark, tail = content.partition(b"<AppendedData")
+        root = ElementTree.fromstring(head + b"</VTKFile>" if mark else content)
+        kind = root.get("type", "unknown")
+        if root.tag != "VTKFile" or kind not in DATASETS:
+            raise DataError(f"is XML of type {kind}; save it as {' or '.join(DATASETS)} (.vtu, .vtp)")
+        decoder = _Decoder(root, tail)
+        pieces = [_piece(piece, decoder) for piece in root.iter("Piece")]
+        if not pieces:
+            raise DataError("has no Piece, so it is cut short or damaged; copy it again")
+        columns = {
+            name: np.concatenate([columns[name] for _, columns in pieces])
+            for name in pieces[0][1]
+            if all(name in columns for _, columns in pieces)
+        }
+        partial = {name for _, columns in pieces for name in columns} - set(columns)
+        said = [f"left out {', '.join(sorted(partial))}: not in every piece"] if partial else []
+        if decoder.words:
+            said.append(f"left out {', '.join(dict.fromkeys(decoder.words))}: not numbers")
+        position = np.concatenate([position for position, _ in pieces])
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _piece(piece: ElementTree.Element, decoder: _Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    count = int(piece.get("NumberOfPoints", "0"))
+    if count < 0:
+        raise DataError(f"announces {count} points, so it is damaged; copy it again")
+    points = piece.find("Points/DataArray")
+    if points is None and count:
+        raise DataError("has a Piece without Points, so it is cut short or damaged; copy it again")
+    position = np.zeros((0, 3)) if points is None else decoder.array(points, count, 3)
+    if position is None or position.shape != (count, 3):
+        raise DataError("has points that are not three numbers each; write it again")
+    columns = {}
+    for array in piece.iterfind("PointData/DataArray"):
+        values = decoder.array(array, count, 1)
+        if values is not None:
+            columns[array.get("Name", "unnamed")] = values
+    return position, columns
+
+
+class _Decoder:
+    """What all data arrays of a file share: byte order, compression, and the appended data."""
+
+    def __init__(self, root: ElementTree.Element, tail: bytes) -> None:
+        order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
+        self.order = order
+        self.length = np.dtype(order + TYPES[root.get("header_type", "UInt32")])
+        compressor = root.get("compressor") or None
+        if compressor not in COMPRESSORS:
+            raise DataError(f"is compressed by {compressor}, which is not supported; save it with zlib")
+        self.decompress = COMPRESSORS[compressor]
+        tag, _, self.appended = tail.partition(b"_")
+        self.appended_is_text = b"base64" in tag
+        self.words: list[str] = []
+
+    def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:
+        """(count, width) numbers of one `DataArray`, or `None` where it holds words."""
+        name, kind = element.get("Name", "points"), element.get("type", "")
+        if kind not in TYPES:
+            self.words.append(name)
+            return None
+        width = int(element.get("NumberOfComponents") or default_width)
+        dtype = np.dtype(self.order + TYPES[kind])
+        values = self._values(element, dtype) if count else np.zeros(0, dtype)
+        if width < 1 or len(values) != count * width:
+            raise DataError(
+                f"has {len(values)} numbers of `{name}`, but {count} points of {width} components each; "
+                f"it is cut short or damaged: copy it again"
+            )
+        return values.reshape(count, width)
+
+    def _values(self, element: ElementTree.Element, dtype: np.dtype) -> np.ndarray:
+        encoding, text = element.get("format", "ascii"), element.text or ""
+        if encoding == "ascii":
+            return np.array(text.split()).astype(dtype)
+        if encoding == "binary":
+            return np.frombuffer(self._decode("".join(text.split()).encode("ascii"), True), dtype)
+        if encoding == "appended":
+            offset = int(element.get("offset", "0"))
+            return np.frombuffer(self._decode(self.appended[offset:], self.appended_is_text), dtype)
+        raise DataError(f"has data of format {encoding!r}; known are ascii, binary and appended")
+
+    def _decode(self, data: bytes, is_text: bool) -> bytes:
+        """The bytes of one array: a header of lengths, then the data, in blocks if compressed."""
+        size = self.length.itemsize
+        first = int(np.frombuffer(_take(data, 0, size, is_text), self.length)[0])
+        if self.decompress is None:
+            if is_text and b"=" in data[: _span(size, True)]:  # padding inside: the header was encoded alone
+                return _take(data, _span(size, True), first, True)
+            return _take(data, 0, size + first, is_text)[size:]
+        header_size = (3 + first) * size
+        sizes = np.frombuffer(_take(data, 0, header_size, is_text), self.length)[3:].tolist()
+        packed = _take(data, _span(header_size, is_text), sum(sizes), is_text)
+        ends = np.cumsum([0, *sizes]).tolist()
+        return b"".join(self.decompress(packed[a:b]) for a, b in itertools.pairwise(ends))
+
+
+def _span(size: int, is_text: bool) -> int:
+    """How many bytes of the file hold `size` bytes of data."""
+    return 4 * -(-size // 3) if is_text else size
+
+
+def _take(data: bytes, start: int, size: int, is_text: bool) -> bytes:
+    """`size` bytes of data that begin at `start` in the file."""
+    stored = data[start : start + _span(size, is_text)]
+    if len(stored) < _span(size, is_text):
+        raise DataError("is cut short inside its data; copy it again")
+    return base64.b64decode(stored, validate=True)[:size] if is_text else stored

@@ -1,0 +1,127 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+from jaxsph.io.table import ParticleTable
+
+position = np.random.default_rng(0).random((50, 3))
+density = np.linspace(1, 2, 50)
+
+
+def test_the_tables_support_and_volume_are_used_where_it_has_them():
+    table = ParticleTable(
+        position, {"a": density}, support=np.full(50, 0.5), volume=np.full(50, 0.25), conventions=("support = s",)
+    )
+    particles, report = io.particles_from_table(table)
+    np.testing.assert_array_equal(particles.support, np.full(50, 0.5, np.float32))
+    np.testing.assert_array_equal(particles.volume, np.full(50, 0.25, np.float32))
+    assert report.support == "support = s" and report.support_range == (0.5, 0.5)
+
+
+def test_a_given_support_overrides_the_tables():
+    table = ParticleTable(position, support=np.full(50, 0.5), conventions=("support = s",))
+    particles, report = io.particles_from_table(table, "x", 0.125)
+    np.testing.assert_array_equal(particles.support, np.full(50, 0.125, np.float32))
+    assert report.support == "given by the caller" and "support = s" not in report.notes
+
+
+@pytest.mark.parametrize("bad", [0, -1, np.nan, np.inf])
+def test_a_given_support_must_be_positive(bad):
+    with pytest.raises(ValueError, match="`support` must be finite and > 0"):
+        io.particles_from_table(ParticleTable(position), "x", bad)
+
+
+def test_a_given_support_may_differ_between_particles_but_not_in_number():
+    particles, _ = io.particles_from_table(ParticleTable(position), "x", density)
+    np.testing.assert_allclose(particles.support, density, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"shape \(50,\), got shape \(3,\)"):
+        io.particles_from_table(ParticleTable(position), "x", np.ones(3))
+
+
+def test_without_support_the_nearest_neighbours_give_it():
+    particles, report = io.particles_from_table(ParticleTable(position), "x")
+    np.testing.assert_allclose(particles.support, io.nearest_neighbour_supports(position), rtol=1e-6)
+    assert report.support == "distance to neighbour 32"
+
+
+def test_the_volume_is_mass_over_density_where_both_are_there():
+    particles, report = io.particles_from_table(
+        ParticleTable(position, {"Masses": 3 * density, "rho": density}), "x", 0.5
+    )
+    np.testing.assert_allclose(particles.volume, 3, rtol=1e-6)
+    assert report.volume == "Masses / rho"
+
+
+def test_the_volume_is_the_inverse_kernel_sum_where_density_is_missing_or_not_positive():
+    for columns in ({}, {"mass": density}, {"mass": density, "density": np.append(density[1:], 0)}):
+        particles, report = io.particles_from_table(ParticleTable(position, columns), "x", 0.5, "cubic_spline")
+        expected = 1 / io.kernel_sum(position, np.full(50, 0.5), kernel="cubic_spline")
+        np.testing.assert_allclose(particles.volume, expected, rtol=1e-5)
+        assert report.volume.startswith("1 / sum of kernels")
+
+
+def test_a_summed_density_weighs_with_the_masses():
+    table = ParticleTable(position, {"mass": density})
+    particles, report = io.particles_from_table(table, "density", 0.5)
+    np.testing.assert_allclose(particles.quantity, io.kernel_sum(position, np.full(50, 0.5), density), rtol=1e-6)
+    assert "density = sum of kernels times mass" in report.notes
+
+
+def test_errors_name_the_file(samples, tmp_path):
+    samples.write_csv(tmp_path / "a.csv", samples.particles())
+    with pytest.raises(ValueError, match=r"a\.csv: there is no quantity 'spin'"):
+        io.read_particles(tmp_path / "a.csv", "spin")
+
+
+def test_read_particles_passes_every_choice_on(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
+    particles = io.read_particles(
+        str(tmp_path / "a.gadget"), quantity="z", support=0.25, kernel="wendland_c2", part_type=1
+    )
+    assert particles.num_particles == 3 and particles.kernel == "wendland_c2"
+    np.testing.assert_array_equal(particles.support, [0.25] * 3)
+
+
+def test_positions_that_float32_would_destroy_are_refused_and_a_remedy_given():
+    with pytest.raises(ValueError, match=r"positions reach 1e\+10.*subtract a common offset"):
+        io.particles_from_table(ParticleTable(position + 1e10), "x", 0.1)
+
+
+def test_positions_that_float32_would_move_are_noted():
+    _, report = io.particles_from_table(ParticleTable(position + 1e4), "x", 0.1)
+    assert any("float32 rounds positions" in note for note in report.notes)
+    _, report = io.particles_from_table(ParticleTable(position), "x", 0.1)
+    assert report.notes == ()
+
+
+def test_double_precision_is_kept_where_jax_has_it_enabled():
+    import jax
+
+    with jax.enable_x64(True):
+        particles, report = io.particles_from_table(ParticleTable(position + 1e10), "x", 0.1)
+    assert particles.dtype == np.float64 and report.notes == ()
+    np.testing.assert_array_equal(particles.position, position + 1e10)
+
+
+def test_volumes_beyond_float32_are_scaled_and_keep_their_ratios():
+    table = ParticleTable(position * 1e10, volume=density * 1e50)
+    particles, _ = io.particles_from_table(table, "x")
+    np.testing.assert_allclose(particles.volume / particles.volume[0], density, rtol=1e-6)
+
+
+def test_one_particle_is_enough():
+    particles, report = io.particles_from_table(ParticleTable(np.ones((1, 3))))
+    assert particles.num_particles == 1 and "single particle" in report.support
+
+
+def test_the_report_of_an_empty_set_can_be_printed():
+    particles, report = io.particles_from_table(ParticleTable(np.zeros((0, 3))))
+    assert particles.num_particles == 0 and "nan" in str(report)
+
+
+def test_the_report_cannot_be_changed():
+    _, report = io.particles_from_table(ParticleTable(position))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        report.quantity = "z"

@@ -1,0 +1,158 @@
+import builtins
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph.io as io
+from jaxsph.io.damage import UNENDED_NOTE
+from jaxsph.io.formats import FORMATS, find_format
+
+from_text = {"a.csv", "a.xyz"}
+NAMES = [
+    "a.npz", "polydata.vtk", "ascii.vtk", "five.vtk", "a.vtu", "big.ply", "ascii.ply", "zipped.bgeo", "plain.bgeo",
+    "gadget.hdf5", "phantom.h5", "points.hdf5", "two.gadget", "one.gadget", "a.csv", "a.xyz",
+]  # fmt: skip
+
+
+def test_every_writer_is_tested(samples):
+    assert set(NAMES) == set(samples.writers)
+
+
+@pytest.fixture(scope="session")
+def written(samples, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    for name, write in samples.writers.items():
+        write(folder / name, samples.particles())
+    return folder
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_was_written_is_read(name, written, samples):
+    p, table = samples.particles(), io.read_table(written / name)
+    np.testing.assert_array_equal(table.position, p.position)
+    assert table.position.dtype.isnative
+    for role, names in (
+        ("velocity", ("velocity", "velocities", "vxyz", "v")),
+        ("id", ("id", "ParticleIDs")),
+        ("density", ("density",)),
+    ):
+        column = table.named(*names)
+        if column is not None and name != "phantom.h5":
+            np.testing.assert_array_equal(table.columns[column], getattr(p, role))
+            assert table.columns[column].dtype.isnative
+    assert table.path == str(written / name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_format_becomes_particles_and_a_report(name, written):
+    table = io.read_table(written / name)
+    particles, report = io.particles_from_table(table)
+    assert particles.num_particles == len(table) == report.num_particles
+    assert report.quantity in str(report) and str(written / name) in str(report)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_empty_set_is_read_as_one(name, samples, tmp_path):
+    samples.writers[name](tmp_path / name, samples.particles(0))
+    table = io.read_table(tmp_path / name)
+    assert table.position.shape == (0, 3)
+    assert io.particles_from_table(table)[0].num_particles == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(fraction=st.floats(0, 1, exclude_max=True))
+@settings(max_examples=25, deadline=None)
+def test_a_file_cut_anywhere_is_refused_by_name_or_read_right(name, fraction, written, samples, tmp_path_factory):
+    whole, p = (written / name).read_bytes(), samples.particles()
+    cut = tmp_path_factory.mktemp("cut") / name
+    cut.write_bytes(whole[: int(fraction * len(whole))])
+    try:
+        table = io.read_table(cut)
+    except ValueError as error:
+        assert str(cut) in str(error)
+        return
+    cut_in_text = UNENDED_NOTE in table.conventions  # the last number may have lost digits, and this is said
+    assert len(table) == len(p.position) or name == "a.csv"  # a CSV file does not say how many rows it has
+    same = len(table) - 1 if cut_in_text else len(table)
+    np.testing.assert_array_equal(table.position[:same], p.position[:same])
+    for column, values in table.columns.items():
+        if same and column in ("velocity", "density", "id"):
+            np.testing.assert_array_equal(values[:same], getattr(p, column)[:same])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(fraction=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255))
+@settings(max_examples=25, deadline=None)
+def test_a_byte_changed_anywhere_gives_a_value_error_at_most(name, fraction, value, written, tmp_path_factory):
+    content = bytearray((written / name).read_bytes())
+    content[int(fraction * len(content))] = value
+    damaged = tmp_path_factory.mktemp("damaged") / name
+    damaged.write_bytes(content)
+    with np.errstate(all="ignore"):
+        try:
+            io.read_table(damaged)
+        except ValueError as error:
+            assert str(damaged) in str(error)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_empty_file_is_refused_by_name(name, tmp_path):
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=name):
+        io.read_table(tmp_path / name)
+
+
+def test_content_wins_over_suffix(written, tmp_path):
+    for name in NAMES:
+        if name not in from_text:
+            (tmp_path / "snapshot_005").write_bytes((written / name).read_bytes())
+            assert find_format(tmp_path / "snapshot_005") is find_format(written / name)
+
+
+def test_a_missing_file_is_a_file_not_found_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"gone\.vtk"):
+        io.read_table(tmp_path / "gone.vtk")
+
+
+def test_a_folder_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="is a folder"):
+        io.read_table(tmp_path)
+
+
+def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
+    (tmp_path / "a.doc").write_bytes(b"hello")
+    with pytest.raises(ValueError, match=r"'\.doc'") as caught:
+        io.read_table(tmp_path / "a.doc")
+    assert all(suffix in str(caught.value) for form in FORMATS for suffix in form.suffixes)
+
+
+def test_a_particle_type_is_refused_where_there_are_none(written):
+    for name in ("a.npz", "points.hdf5"):
+        with pytest.raises(ValueError, match="leave out `part_type`"):
+            io.read_table(written / name, part_type=1)
+
+
+@pytest.mark.parametrize(("name", "library"), [("gadget.hdf5", "h5py"), ("phantom.h5", "h5py")])
+def test_a_missing_library_is_named_with_the_extra_that_brings_it(name, library, written, monkeypatch):
+    for module in [m for m in sys.modules if m == library or m.startswith(f"{library}.")]:
+        monkeypatch.delitem(sys.modules, module)
+    real = builtins.__import__
+
+    def refuse(wanted, *args, **kwargs):
+        if wanted.partition(".")[0] == library:
+            raise ImportError(wanted)
+        return real(wanted, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=rf'{library}.*pip install "jaxsph\[io\]"'):
+        io.read_table(written / name)
+
+
+def test_optional_libraries_are_not_imported_before_they_are_needed():
+    code = "import sys, jaxsph.io; assert not {'h5py', 'meshio', 'tqdm', 'OpenEXR'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("form", [1, 2])
+@pytest.mark.parametrize("masses", [True, False])
+def test_both_formats_of_both_byte_orders_are_read(order, form, masses, samples, tmp_path):
+    p = samples.particles()
+    samples.write_gadget_binary(tmp_path / "snapshot_001", p, order, form, dark=3, masses=masses)
+    table = io.read_table(tmp_path / "snapshot_001")
+    np.testing.assert_array_equal(table.position, p.position)
+    np.testing.assert_array_equal(table.columns["velocity"], p.velocity)
+    np.testing.assert_array_equal(table.columns["id"], p.id)
+    np.testing.assert_array_equal(table.columns["density"], p.density)
+    np.testing.assert_array_equal(table.columns["internal_energy"], p.density + 1)
+    np.testing.assert_array_equal(table.columns["mass"], np.full(7, 3.0 if masses else 2.0))
+    np.testing.assert_array_equal(table.support, np.full(7, 0.5))
+    assert table.box_size == (16, 16, 16)
+
+
+def test_another_type_has_no_gas_columns(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
+    table = io.read_table(tmp_path / "a.gadget", part_type=1)
+    np.testing.assert_array_equal(table.position, np.zeros((3, 3)))
+    np.testing.assert_array_equal(table.columns["mass"], [4, 4, 4])
+    assert table.support is None and "density" not in table.columns
+
+
+def test_a_type_that_is_not_there_is_answered_with_those_that_are(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
+    with pytest.raises(ValueError, match="no particles of type 4; `part_type` can be 0, 1"):
+        io.read_table(tmp_path / "a.gadget", part_type=4)
+
+
+def test_block_lengths_that_disagree_are_refused(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
+    content = bytearray((tmp_path / "a.gadget").read_bytes())
+    content[16 + 4 + 256] ^= 1  # the length after the header
+    (tmp_path / "a.gadget").write_bytes(content)
+    with pytest.raises(ValueError, match="begins with length 256 and ends with another one"):
+        io.read_table(tmp_path / "a.gadget")
+
+
+def test_a_block_that_fits_no_number_of_particles_is_refused(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
+    content = bytearray((tmp_path / "a.gadget").read_bytes())
+    content[20] += 1  # one gas particle more in the header
+    (tmp_path / "a.gadget").write_bytes(content)
+    with pytest.raises(ValueError, match="which fits no number of its particles"):
+        io.read_table(tmp_path / "a.gadget")

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+from jaxsph.io.gadget_hdf5 import SWIFT_GAMMA
+
+h5py = pytest.importorskip("h5py")
+
+
+def test_the_smoothing_length_of_gadget_is_the_support(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    table = io.read_table(tmp_path / "a.hdf5")
+    np.testing.assert_array_equal(table.support, np.full(len(table), 0.5))
+    assert any("support = SmoothingLength (Gadget convention" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("kernel", list(SWIFT_GAMMA))
+def test_the_support_of_swift_is_gamma_smoothing_lengths_of_its_kernel(kernel, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel=kernel)
+    table = io.read_table(tmp_path / "a.hdf5")
+    np.testing.assert_allclose(table.support, SWIFT_GAMMA[kernel] * 0.5)
+    assert table.source == "SWIFT HDF5"
+    assert any(str(SWIFT_GAMMA[kernel]) in sentence and kernel in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("kernel", ["cubic_spline", "wendland_c2"])
+def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel):
+    from jaxsph.model import kernels
+
+    q = np.linspace(0, 1, 100_001)
+    weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].shape(1 - q**2, np)
+    deviation = np.sqrt(np.trapezoid(weight * q**4, q) / 3)
+    swift = {"cubic_spline": "Cubic spline (M4)", "wendland_c2": "Wendland C2"}[kernel]
+    assert SWIFT_GAMMA[swift] == pytest.approx(1 / (2 * deviation), rel=1e-6)
+
+
+def test_an_unknown_swift_kernel_is_refused(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel="Tophat")
+    with pytest.raises(ValueError, match="kernel 'Tophat'"):
+        io.read_table(tmp_path / "a.hdf5")
+
+
+def test_masses_come_from_the_header_where_there_is_no_data_set(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.hdf5").columns["Masses"], np.full(7, 2.0))
+
+
+def test_stored_masses_win_over_the_header(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), masses=np.arange(1.0, 8))
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.hdf5").columns["Masses"], np.arange(1.0, 8))
+
+
+def test_the_periodic_box_is_noted(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert table.box_size == (16, 16, 16)
+    assert any("periodic box" in sentence for sentence in table.conventions)
+
+
+def test_without_gas_the_first_type_with_positions_is_read(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), part_type=1)
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert len(table) == 7 and table.support is None
+    assert "particles of PartType1" in table.conventions
+
+
+def test_a_type_that_is_not_there_is_answered_with_those_that_are(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), part_type=1)
+    with pytest.raises(ValueError, match=r"a\.hdf5: has no particles of type 0; `part_type` can be 1"):
+        io.read_table(tmp_path / "a.hdf5", part_type=0)
+
+
+def test_a_data_set_of_another_length_is_refused_by_name(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), masses=np.ones(3))
+    with pytest.raises(ValueError, match="PartType0/Masses has 3 rows, but there are 7 particles"):
+        io.read_table(tmp_path / "a.hdf5")
+
+
+def test_big_endian_data_sets_become_native(samples, tmp_path):
+    p = samples.particles()
+    p.position = p.position.astype(">f4")
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", p)
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert table.position.dtype.isnative
+    np.testing.assert_array_equal(table.position, p.position)
+
+
+def test_an_hdf5_file_of_no_known_flavour_is_answered_with_what_it_holds(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["spectrum"] = np.zeros(4)
+    with pytest.raises(ValueError, match=r"a\.h5: is HDF5 with spectrum at its top"):
+        io.read_table(tmp_path / "a.h5")

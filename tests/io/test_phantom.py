@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+
+h5py = pytest.importorskip("h5py")
+
+
+def test_the_support_is_two_smoothing_lengths_and_said_so(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    table = io.read_table(tmp_path / "a.h5")
+    np.testing.assert_array_equal(table.support, np.full(7, 1.0))
+    assert "support = 2 x smoothing length h (Phantom convention)" in table.conventions
+
+
+def test_mass_density_and_volume_follow_from_h(samples, tmp_path):
+    h = np.linspace(0.5, 2, 7)
+    samples.write_phantom(tmp_path / "a.h5", samples.particles(), h=h)
+    table = io.read_table(tmp_path / "a.h5")
+    np.testing.assert_allclose(table.columns["density"], 2 * (1.25 / h) ** 3)
+    np.testing.assert_allclose(table.volume, table.columns["mass"] / table.columns["density"])
+
+
+def test_dead_particles_are_dropped_and_said_so(samples, tmp_path):
+    p, h = samples.particles(), np.full(7, 0.5)
+    h[[1, 4]] = -0.5, 0
+    samples.write_phantom(tmp_path / "a.h5", p, h=h)
+    table = io.read_table(tmp_path / "a.h5")
+    np.testing.assert_array_equal(table.position, p.position[[0, 2, 3, 5, 6]])
+    assert "dropped 2 dead or accreted particles (h <= 0)" in table.conventions
+
+
+def test_one_type_is_read_with_its_own_mass(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles(), itype=np.array([1, 1, 3, 3, 3, 1, 1]))
+    gas, other = io.read_table(tmp_path / "a.h5"), io.read_table(tmp_path / "a.h5", part_type=3)
+    assert len(gas) == 4 and len(other) == 3
+    assert set(gas.columns["mass"]) == {2.0} and set(other.columns["mass"]) == {3.0}
+    assert any("left out 3 of other types" in sentence for sentence in gas.conventions)
+    with pytest.raises(ValueError, match="no particles of type 2; `part_type` can be 1, 3"):
+        io.read_table(tmp_path / "a.h5", part_type=2)
+
+
+def test_a_dump_without_hfact_is_refused(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        del file["header/hfact"]
+    with pytest.raises(ValueError, match=r"a\.h5: has no `hfact`"):
+        io.read_table(tmp_path / "a.h5")

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+
+points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.5]])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("bare.csv", "1,2,3,7\n4,5,6.5,8\n"),
+        ("bare.txt", "1 2 3 7\n  4\t5 6.5 8\n"),
+        ("semicolon.csv", "1;2;3;7\n4;5;6.5;8\n"),
+        ("header.csv", "x,y,z,a\n1,2,3,7\n4,5,6.5,8\n"),
+        ("quoted.csv", '"x","y","z","a"\n"1","2","3","7"\n"4","5","6.5","8"\n'),
+        ("paraview.csv", '"a","Points:0","Points:1","Points:2"\n7,1,2,3\n8,4,5,6.5\n'),
+        ("units.csv", "a (kg),x [m],y [m],z [m]\n7,1,2,3\n8,4,5,6.5\n"),
+        ("header.txt", "x y z a\n1 2 3 7\n4 5 6.5 8\n"),
+        ("comment.dat", "# made by hand\n# x y z a\n1 2 3 7\n4 5 6.5 8\n"),
+        ("other_comment.dat", "# hello\n1 2 3 7\n4 5 6.5 8\n"),
+        ("windows.csv", "\ufeffX,Y,Z,a\r\n1,2,3,7\r\n4,5,6.5,8\r\n"),
+        ("words.csv", "kind,x,y,z,a\nwater,1,2,3,7\nwater,4,5,6.5,8\n"),
+        ("element.xyz", "2\nhello\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
+        ("bare.xyz", "2\nhello there\n1 2 3 7\n4 5 6.5 8\n"),
+        ("blank.xyz", "2\n\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
+        ("extended.xyz", "2\nProperties=species:S:1:pos:R:3:a:R:1\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
+    ],
+)
+def test_points_and_a_scalar_are_found_in(name, content, tmp_path):
+    (tmp_path / name).write_text(content, encoding="utf-8", newline="")
+    table = io.read_table(tmp_path / name)
+    np.testing.assert_array_equal(table.position, points)
+    np.testing.assert_array_equal(table.columns[table.scalars[0]], [7, 8])
+
+
+def test_columns_of_words_are_left_out_and_said_so(tmp_path):
+    (tmp_path / "a.csv").write_text("kind,x,y,z\nwater,1,2,3\n")
+    table = io.read_table(tmp_path / "a.csv")
+    assert table.columns == {} and "left out kind: not numbers" in table.conventions
+
+
+def test_components_become_vectors(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,vx,vy,vz,B:0,B:1,B:2\n1,2,3,4,5,6,7,8,9\n")
+    table = io.read_table(tmp_path / "a.csv")
+    np.testing.assert_array_equal(table.columns["v"], [[4, 5, 6]])
+    np.testing.assert_array_equal(table.columns["B"], [[7, 8, 9]])
+
+
+def test_a_line_without_an_end_is_pointed_out(tmp_path):
+    (tmp_path / "a.csv").write_text("1,2,3\n4,5,6")
+    assert any("check that the file is complete" in s for s in io.read_table(tmp_path / "a.csv").conventions)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("1,2,3\n4,5\n", "rows of 2 and 3 columns"),
+        ("x,y,z\n1,2,water\n3,4,5\n", "cannot be read as text table|holds no positions"),
+        ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"),
+        ("x,y\n1,2\n", "holds no positions: there are x, y"),
+        ("x,y,z,z\n1,2,3,4\n", "columns of the same name"),
+        ("x,y,z\n1,2,3,4\n", "names 3 columns, but its first row has 4"),
+        ("x,y,z\n1,2,nan\n", "positions must be finite"),
+        ("3\n\nAr 1 2 3\n", "announces 3 particles, but 1 lines follow"),
+        ("1,2\0,3\n", "it holds zero bytes"),
+    ],
+)
+def test_bad_tables_are_refused_with_the_reason(content, reason, tmp_path):
+    (tmp_path / "a.csv").write_text(content)
+    with pytest.raises(ValueError, match=reason) as caught:
+        io.read_table(tmp_path / "a.csv")
+    assert "a.csv" in str(caught.value)
