@@ -30,7 +30,8 @@ from jaxsph.numerics.checks import is_traced
 STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
 MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 LARGEST_CAPACITY = 1 << 30
-CELL_SAMPLES = (4, 8, 16)
+CELL_SAMPLES = 16  # the paper's D_z
+SLAB_SAMPLES = (4, 8, 16)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,12 +77,13 @@ class Plan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
 
 
-def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell_samples: int | None = None) -> Plan:
+def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
     Args:
         scene, camera, settings: as for `jaxsph.render`.
-        cell_samples: samples of a cell along depth; by default chosen from how deep a support is in samples.
+        slab_samples: samples of a cell that share a window of particles, a divisor of 16; by default chosen from how deep a
+            support is in samples.
 
     Raises:
         ValueError: under a trace, or when even a band of one row of tiles exceeds `settings.memory_limit`.
@@ -93,11 +95,11 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
     tiles, bundles, depth_extent = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
     num_classes = _num_classes(particles)
-    cell_samples = cell_samples or _choose_cell_samples(float(depth_extent))
+    slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
     bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
-        made = _for_bands(camera, settings, particles, rows, columns, tiles, bundles, num_classes, cell_samples)
+        made = _for_bands(camera, settings, particles, rows, columns, tiles, bundles, num_classes, slab_samples)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
         if fits or rows == 1:
             break
@@ -119,14 +121,14 @@ def _for_bands(
     tiles: np.ndarray,
     bundles: np.ndarray,
     num_classes: int,
-    cell_samples: int,
+    slab_samples: int,
 ) -> Plan:
     bands = _ceil(len(tiles), rows)
     fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in (tiles, bundles)]
     lists = ListPlan(rows, columns, *(round_up(max(count, 1)) for count in fullest))
-    slabs = _ceil(settings.samples, cell_samples)
-    chunk = max(16, min(2048 // cell_samples, 1 << (lists.num_bundles - 1).bit_length()))
-    cast = CastPlan(chunk, cell_samples)
+    slabs = _ceil(settings.samples, slab_samples)
+    chunk = max(16, min(2048 // slab_samples, 1 << (lists.num_bundles - 1).bit_length()))
+    cast = CastPlan(chunk, slab_samples, CELL_SAMPLES // slab_samples)
     number = np.dtype(particles.dtype).itemsize
     memory = (
         particles.capacity * (24 * number + 32)
@@ -134,7 +136,7 @@ def _for_bands(
         + lists.list_capacity * 8
         + num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
-        + cast.chunk * cell_samples * BUNDLE * BUNDLE * number * 16
+        + cast.chunk * slab_samples * BUNDLE * BUNDLE * number * 16
         + camera.width * camera.height * 8 * number
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
@@ -164,12 +166,12 @@ def _num_classes(particles: Particles) -> int:
     return min(1 + math.ceil(max(octaves - 0.01, 0)), MOST_CLASSES)
 
 
-def _choose_cell_samples(depth_extent: float) -> int:
-    """Deeper cells for deeper supports: a window is the cell's depth plus a support's diameter."""
-    for cell_samples in CELL_SAMPLES:
-        if depth_extent <= 6 * cell_samples:
-            return cell_samples
-    return CELL_SAMPLES[-1]
+def _choose_slab_samples(depth_extent: float) -> int:
+    """Deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter."""
+    for slab_samples in SLAB_SAMPLES:
+        if depth_extent <= 6 * slab_samples:
+            return slab_samples
+    return SLAB_SAMPLES[-1]
 
 
 @functools.partial(jax.jit, static_argnames=("samples", "tile_rows"))

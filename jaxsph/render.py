@@ -133,7 +133,7 @@ def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
-    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.cell_samples, plan.num_classes)
+    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.slab_samples, plan.num_classes)
 
 
 @functools.partial(jax.jit, static_argnames="plan")

@@ -10,17 +10,19 @@ test, with prefix sums and a scatter that keep the order. Lists hold ranks, so t
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.access.footprint import pixel_ranges, side_distances, touches
 from jaxsph.access.ordering import Ordered
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
+from jaxsph.numerics.staging import computed_once
 
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
@@ -129,25 +131,28 @@ def _split(
     ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Any, rank: Array, tile: Array, start: Array, overflow: Array
 ) -> BundleLists:
     """Split each tile's list among its four bundles."""
-    kept = _touched_children(ordered, camera, plan, first_row, rank, tile)
-    before = [jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(flag.astype(jnp.int32))]) for flag in kept]
-    counts = jnp.stack([upto[start[1:]] - upto[start[:-1]] for upto in before], 1).reshape(-1)
-    total = counts.astype(jnp.float32).sum()
-    overflow |= faults.raised(faults.LIST_OVERFLOW, total > plan.list_capacity)
+    touch = functools.partial(_touched_children, plan=plan)
+    touched = computed_once(start[-1] >= 0, touch, ordered, camera, first_row, rank, tile)
+    kept = [(touched >> child) & 1 for child in range(4)]
+    before = [jnp.cumsum(flag) - flag for flag in kept]
+    totals = [jnp.append(upto, upto[-1] + flag[-1]) for upto, flag in zip(before, kept, strict=True)]
+    upto_tile = jnp.stack([upto[start] for upto in totals], 1)
+    counts = (upto_tile[1:] - upto_tile[:-1]).reshape(-1)
+    overflow |= faults.raised(faults.LIST_OVERFLOW, counts.astype(jnp.float32).sum() > plan.list_capacity)
     begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(counts)])
-    shift = begins[:-1].reshape(-1, 4) - jnp.stack([upto[start[:-1]] for upto in before], 1)
+    shift = begins[:-1].reshape(-1, 4) - upto_tile[:-1]
     out = jnp.zeros(plan.list_capacity, jnp.int32)
     here = jnp.minimum(tile, plan.num_tiles - 1)
-    for child, flag in enumerate(kept):
-        target = jnp.where(flag, before[child][:-1] + shift[:, child][here], plan.list_capacity)
+    for child in range(4):
+        target = jnp.where(kept[child] > 0, before[child] + shift[:, child][here], plan.list_capacity)
         out = out.at[target].set(rank, mode="drop", unique_indices=True)
     return BundleLists(out, jnp.minimum(begins, plan.list_capacity), overflow)
 
 
 def _touched_children(
-    ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Any, rank: Array, tile: Array
-) -> list[Bool[Array, " pairs"]]:
-    """For each child bundle of a pair's tile, whether the particle's sphere meets its pyramid of rays."""
+    ordered: Ordered, camera: Camera, first_row: Any, rank: Array, tile: Array, *, plan: ListPlan
+) -> Int[Array, " pairs"]:
+    """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
     x, y, z, reach = (column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
     row, column = (tile // plan.tile_columns) * TILE + first_row, (tile % plan.tile_columns) * TILE
     sides: dict[str, list[tuple[Array, Array]]] = {"x": [], "y": []}
@@ -157,8 +162,10 @@ def _touched_children(
         sides["x"].append(side_distances(x, z, *u, camera.is_perspective))
         sides["y"].append(side_distances(y, z, *v, camera.is_perspective))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
-    inside = tile < plan.num_tiles
-    return [touches(sides["x"][child & 1], sides["y"][child >> 1], reach, size) & inside for child in range(4)]
+    mask = jnp.zeros_like(rank)
+    for child in range(4):
+        mask |= touches(sides["x"][child & 1], sides["y"][child >> 1], reach, size).astype(jnp.int32) << child
+    return jnp.where(tile < plan.num_tiles, mask, 0)
 
 
 jax.tree_util.register_dataclass(BundleLists, data_fields=["rank", "start", "faults"], meta_fields=[])

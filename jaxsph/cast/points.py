@@ -2,9 +2,10 @@ r"""Ray casting of particles: thread-coherent marching of the first paper's sect
 
 Flow: cells -> [points] -> image.
 
-Slabs are marched front to back. In each, the bundles that are not empty are ordered by their number of particles and taken
-`chunk` at a time, so that a chunk's trip count is nearly its mean; then blocks of `BLOCK` particles are added to all samples
-of a cell at once. Shapes, once: accumulators are (chunk, samples of a cell, 8 rows, 8 columns).
+Layers of cells are marched front to back. In each, the bundles that are not empty are ordered by their number of particles and
+taken `chunk` at a time, so that a chunk's trip counts are nearly their mean; a cell is marched slab by slab, and in a slab
+blocks of `BLOCK` particles are added to all samples at once. Shapes, once: accumulators are (chunk, samples of a slab, 8 rows,
+8 columns).
 
 The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$ (perspective)
 or 1 (orthographic), so with
@@ -16,6 +17,7 @@ are squared, so nothing cancels.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -27,17 +29,35 @@ from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer import Segments, TransferFunction, look_up
+from jaxsph.numerics.staging import computed_once
 
 BLOCK = 16  # particles unrolled in the inner loop: with 8 or 12 XLA fuses A and B into every term and is 8 times slower
 
 
 @dataclasses.dataclass(frozen=True)
 class CastPlan:
-    """Static sizes of the march: bundles marched together, and samples of a cell."""
+    """Static sizes of the march.
+
+    Attributes:
+        chunk: bundles marched together.
+        slab_samples: samples whose windows are evaluated together.
+        slabs_per_cell: slabs of a cell, between which the rays' state stays at hand.
+    """
 
     chunk: int
-    cell_samples: int
+    slab_samples: int
+    slabs_per_cell: int
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if getattr(self, field.name) < 1:
+                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+
+    @property
+    def cell_samples(self) -> int:
+        """Samples of a cell along depth (D_z in the first paper)."""
+        return self.slab_samples * self.slabs_per_cell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,58 +92,65 @@ def cast_points(
     """
     num_bundles = cells.count.shape[1]
     dtype = ordered.x.dtype
-    order, num_chunks = _schedule(cells.count, plan.chunk)
+    order, num_chunks = _schedule(cells.count, plan)
     slabs = cells.count.shape[0]
-    padding = slabs * plan.cell_samples - depths.shape[0]
+    padding = slabs * plan.slab_samples - depths.shape[0]
     depths = jnp.pad(depths, (0, padding), mode="edge")
     edges = jnp.pad(edges, (0, padding), mode="edge")  # samples past the end have length zero
     state = (
-        jnp.zeros((3, num_bundles + 1, BUNDLE, BUNDLE), dtype),
+        *(jnp.zeros((num_bundles + 1, BUNDLE, BUNDLE), dtype) for _ in range(3)),
         jnp.ones((num_bundles + 1, BUNDLE, BUNDLE), dtype),
         jnp.full((num_bundles + 1, BUNDLE, BUNDLE), jnp.inf, dtype),
     )
+    segments = transfer.segments()
     row, column = (jnp.append(origin, 0) for origin in origins)
     begin, length = (jnp.pad(window, ((0, 0), (0, 0), (0, 1))) for window in (cells.begin, cells.length))
 
-    def march_slab(slab: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        s = lax.dynamic_slice_in_dim(depths, slab * plan.cell_samples, plan.cell_samples)
-        border = lax.dynamic_slice_in_dim(edges, slab * plan.cell_samples, plan.cell_samples + 1)
-
+    def march_cells(layer: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         def march_chunk(chunk: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-            color, transmittance, depth = state
-            bundle = lax.dynamic_slice(order, (slab, chunk * plan.chunk), (1, plan.chunk))[0]
+            bundle = lax.dynamic_slice(order, (layer, chunk * plan.chunk), (1, plan.chunk))[0]
             pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
             u = camera.column((column[bundle][:, None] + pixel).astype(dtype) + 0.5)
             v = camera.row((row[bundle][:, None] + pixel).astype(dtype) + 0.5)
-            window = begin[:, slab, bundle], length[:, slab, bundle]
-            weight, weighted = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
-            rays = color[:, bundle], transmittance[bundle], depth[bundle]
-            rays = _composite(rays, weight, weighted, (u, v, border), camera.is_perspective, transfer)
-            return (
-                color.at[:, bundle].set(rays[0]),
-                transmittance.at[bundle].set(rays[1]),
-                depth.at[bundle].set(rays[2]),
-            )
 
-        return lax.fori_loop(0, num_chunks[slab], march_chunk, state)
+            def march_slab(slab: Array, rays: list[Array]) -> list[Array]:
+                s = lax.dynamic_slice_in_dim(depths, slab * plan.slab_samples, plan.slab_samples)
+                border = lax.dynamic_slice_in_dim(edges, slab * plan.slab_samples, plan.slab_samples + 1)
+                window = begin[:, slab, bundle], length[:, slab, bundle]
+                return lax.cond(window[1].any(), march_filled, lambda rays, *_: rays, rays, s, border, window)
 
-    color, transmittance, depth = lax.fori_loop(0, slabs, march_slab, state)
-    in_slab = jnp.minimum(plan.cell_samples, depths.shape[0] - padding - jnp.arange(slabs) * plan.cell_samples)
+            def march_filled(rays: list[Array], s: Array, border: Array, window: tuple[Array, Array]) -> list[Array]:
+                sums = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
+                shade = functools.partial(_shade, perspective=camera.is_perspective)
+                shaded = computed_once(border[0] < jnp.inf, shade, *sums, (u, v, border), segments)
+                return _composite(rays, shaded, border)
+
+            first = layer * plan.slabs_per_cell
+            last = jnp.minimum(first + plan.slabs_per_cell, slabs)
+            rays = lax.fori_loop(first, last, march_slab, [field[bundle] for field in state])
+            return tuple(field.at[bundle].set(new) for field, new in zip(state, rays, strict=True))
+
+        return lax.fori_loop(0, num_chunks[layer], march_chunk, state)
+
+    *color, transmittance, depth = (field[:-1] for field in lax.fori_loop(0, order.shape[0], march_cells, state))
+    in_slab = jnp.minimum(plan.slab_samples, depths.shape[0] - padding - jnp.arange(slabs) * plan.slab_samples)
     evaluations = (cells.count.astype(jnp.float32) * in_slab[:, None].astype(jnp.float32)).sum(0)
-    return Rays(color[:, :-1], transmittance[:-1], depth[:-1], evaluations)
+    return Rays(jnp.stack(color), transmittance, depth, evaluations)
 
 
-def _schedule(count: Int[Array, "slabs bundles"], chunk: int) -> tuple[Array, Array]:
-    """Bundle ids of each slab, fullest first, padded to whole chunks with a dummy id, and the number of chunks to march."""
+def _schedule(count: Int[Array, "slabs bundles"], plan: CastPlan) -> tuple[Array, Array]:
+    """Bundle ids of each layer of cells, fullest first, padded to whole chunks with a dummy id, and the chunks to march."""
     slabs, bundles = count.shape
+    count = jnp.pad(count, ((0, -slabs % plan.slabs_per_cell), (0, 0)))
+    count = count.reshape(-1, plan.slabs_per_cell, bundles).sum(1)
     bits = (bundles + 1).bit_length()
     key = (jnp.minimum(count, (1 << (32 - bits)) - 1).astype(jnp.uint32) << bits) | jnp.arange(bundles, dtype=jnp.uint32)
     key = ~lax.sort(~key, dimension=1)
     order = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
     active = (count > 0).sum(1)
     order = jnp.where(jnp.arange(bundles) < active[:, None], order, bundles)
-    order = jnp.pad(order, ((0, 0), (0, -bundles % chunk)), constant_values=bundles)
-    return order, (active + chunk - 1) // chunk
+    order = jnp.pad(order, ((0, 0), (0, -bundles % plan.chunk)), constant_values=bundles)
+    return order, (active + plan.chunk - 1) // plan.chunk
 
 
 def _gather_field(
@@ -134,7 +161,10 @@ def _gather_field(
     perspective: bool,
     kernel: str,
 ) -> tuple[Array, Array]:
-    """Sums of V W and q V W (up to one common factor) at every sample of the chunk's cells."""
+    """Sums of V W and q V W (up to one common factor) at every sample of the chunk's cells.
+
+    The two sums travel as one complex number: of a pair XLA makes two kernels, and each evaluates every weight again.
+    """
     u, v, s = rays
     begin, length = window
     total = length.sum(0)
@@ -143,8 +173,8 @@ def _gather_field(
     columns = (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.weight, ordered.quantity)
     smooth = kernels.by_name(kernel)
 
-    def add_block(block: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
-        weight, weighted = sums
+    def add_block(block: Array, sums: Array) -> Array:
+        weight, weighted = sums.real, sums.imag
         index = block * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
         inside = index < total[:, None]
         particle = rank[jnp.clip(_position(index, begin, length), 0, rank.shape[0] - 1)]
@@ -162,11 +192,12 @@ def _gather_field(
                 w = w * strength[:, k, None, None, None]
             weight = weight + w
             weighted = weighted + w * quantity[:, k, None, None, None]
-        return weight, weighted
+        return lax.complex(weight, weighted)
 
     zero = jnp.zeros((*su.shape[:2], BUNDLE, BUNDLE), su.dtype)
     blocks = (total.max() + BLOCK - 1) // BLOCK
-    return lax.fori_loop(0, blocks, add_block, (zero, zero))
+    sums = lax.fori_loop(0, blocks, add_block, lax.complex(zero, zero))
+    return sums.real, sums.imag
 
 
 def _position(index: Array, begin: Array, length: Array) -> Array:
@@ -179,32 +210,42 @@ def _position(index: Array, begin: Array, length: Array) -> Array:
     return position
 
 
-def _composite(
-    rays: tuple[Array, Array, Array],
-    weight: Array,
-    weighted: Array,
-    geometry: tuple[Array, Array, Array],
-    perspective: bool,
-    transfer: TransferFunction,
-) -> tuple[Array, Array, Array]:
-    """Front to back over the samples of the cells: first paper, equations 2 and 3, with `T_i = exp(-extinction * length)`."""
-    color, transmittance, depth = rays
+def _shade(
+    weight: Array, weighted: Array, geometry: tuple[Array, Array, Array], segments: Segments, *, perspective: bool
+) -> list[Array]:
+    """Red, green, blue, optical thickness and transmittance of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
-    per_depth = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2) if perspective else jnp.ones_like(u[:, None] * v[:, :, None])
     inside = weight > 0
     quantity = jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
-    red, green, blue, extinction = transfer.interpolate(quantity)
-    step = border[1:] - border[:-1]
-    thickness = jnp.where(inside, extinction * (step[:, None, None] * per_depth[:, None]), 0)
-    for k in range(weight.shape[1]):
-        behind = transmittance * jnp.exp(-thickness[:, k])
-        gained = transmittance * -jnp.expm1(-thickness[:, k])
-        color = color + jnp.stack([gained * channel[:, k] for channel in (red, green, blue)])
+    *channels, extinction = look_up(segments, quantity)
+    per_depth = jnp.ones_like(u[:, None, :] * v[:, :, None])
+    if perspective:
+        per_depth = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2)
+    step = (border[1:] - border[:-1])[:, None, None]
+    thickness = jnp.where(inside, extinction * (step * per_depth[:, None]), 0)
+    return [*channels, thickness, jnp.exp(-thickness)]
+
+
+def _composite(rays: list[Array], shaded: list[Array], border: Array) -> list[Array]:
+    """Front to back over the samples of a slab: first paper, equation 3.
+
+    A sample adds its colour times the light it takes away, `T - T T_i`: however thin the samples, colours then add up to
+    exactly the alpha that is lost.
+    """
+    *color, transmittance, depth = rays
+    *channels, thickness, passed = shaded
+    before, crossing, length, front = (jnp.full_like(depth, value) for value in (1, 1, 0, jnp.inf))
+    for k in range(passed.shape[1]):
+        behind = transmittance * passed[:, k]
+        color = [total + (transmittance - behind) * channel[:, k] for total, channel in zip(color, channels, strict=True)]
         crossed = (transmittance > 0.5) & (behind <= 0.5)
-        part = jnp.log(2 * jnp.where(crossed, transmittance, 1)) / jnp.where(crossed, thickness[:, k], 1)
-        depth = jnp.where(crossed, border[k] + part * step[k], depth)
+        before = jnp.where(crossed, transmittance, before)
+        crossing = jnp.where(crossed, thickness[:, k], crossing)
+        length = jnp.where(crossed, border[k + 1] - border[k], length)
+        front = jnp.where(crossed, border[k], front)
         transmittance = behind
-    return color, transmittance, depth
+    depth = jnp.minimum(depth, front + jnp.log(2 * before) / crossing * length)
+    return [*color, transmittance, depth]
 
 
 jax.tree_util.register_dataclass(

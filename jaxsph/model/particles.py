@@ -127,7 +127,8 @@ class Particles:
 def _padded(value: Any, dtype: Any, capacity: int, fill: float) -> Array:
     xp = jnp if is_traced(value) else np
     width = [(0, capacity - value.shape[0])] + [(0, 0)] * (value.ndim - 1)
-    return jnp.asarray(xp.pad(value, width, constant_values=fill), dtype)
+    with np.errstate(over="ignore"):  # what overflows is refused by name, later
+        return jnp.asarray(xp.pad(value, width, constant_values=fill).astype(dtype))
 
 
 def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> None:

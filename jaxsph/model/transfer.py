@@ -11,7 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
@@ -74,34 +75,112 @@ class TransferFunction:
 
     def __call__(self, quantity: Float[Array, "..."]) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
         """Colour and extinction of `quantity` (any shape): `colour(Q)` (..., 3), `extinction(Q)` (...) per length unit."""
-        channels = self.interpolate(jnp.asarray(quantity, self.values.dtype))
+        channels = look_up(self.segments(), jnp.asarray(quantity, self.values.dtype))
         return jnp.stack(channels[:3], -1), channels[3]
 
-    def interpolate(self, quantity: Float[Array, "..."]) -> list[Float[Array, "..."]]:
-        """The same as separate channels `[red, green, blue, extinction]`, each shaped like `quantity`."""
+    def segments(self) -> Segments:
+        """The tables that `look_up` reads: made once, outside of loops."""
         table = jnp.concatenate([self.colors, self.extinction[:, None]], 1).T
-        if self.values.shape[0] == 1:
-            return [jnp.broadcast_to(row[0], quantity.shape) for row in table]
-        right = jnp.clip(_count_not_above(self.values, quantity), 1, self.values.shape[0] - 1)
-        left = right - 1
-        start = self.values[left]
-        width = self.values[right] - start
-        beyond = (quantity >= start).astype(quantity.dtype)
-        where = jnp.where(width > 0, jnp.clip((quantity - start) / jnp.where(width > 0, width, 1), 0, 1), beyond)
-        return [row[left] * (1 - where) + row[right] * where for row in table]
+        change = jnp.append(table[:, 1:] - table[:, :-1], jnp.zeros((4, 1), table.dtype), 1)
+        width = jnp.append(self.values[1:] - self.values[:-1], 0)
+        largest = jnp.finfo(width.dtype).max
+        inverse = jnp.where(width > 0, jnp.minimum(1 / jnp.where(width > 0, width, 1), largest), 0)
+        buckets = BUCKETS_A_POINT * self.values.shape[0]
+        extent = self.values[-1] - self.values[0]
+        rate = jnp.where(extent > 0, jnp.minimum(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
+        inside = _bucket(self.values, self.values[0], rate, buckets)
+        below = jnp.searchsorted(inside, jnp.arange(buckets + 1, dtype=jnp.int32)).astype(jnp.int32)
+        fullest = (below[1:] - below[:-1]).max()
+        even = jnp.linspace(self.values[0], self.values[-1], self.values.shape[0])
+        off = jnp.abs(self.values - even) <= EVEN * jnp.finfo(width.dtype).eps * jnp.maximum(jnp.abs(even[0]), jnp.abs(even[-1]))
+        return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
 
 
-COMPARE_ALL = 16  # up to this many control points counting comparisons vectorises better than bisection gathers
+@dataclasses.dataclass(frozen=True)
+class Segments:
+    """A transfer function cut into segments; the last reaches to infinity and is constant.
+
+    Attributes:
+        start: where each segment begins.
+        inverse: 1 / its width, 0 for jumps and for the last.
+        base, change: red, green, blue and extinction at its beginning, and how much they change over it.
+        below: number of control points before each of a number of uniform buckets; `rate` is buckets a unit.
+        fullest: most control points in a bucket.
+        even: whether the points are evenly spaced but for rounding.
+    """
+
+    start: Float[Array, " points"]
+    inverse: Float[Array, " points"]
+    base: Float[Array, "4 points"]
+    change: Float[Array, "4 points"]
+    below: Int[Array, " buckets_and_one"]
+    rate: Float[Array, ""]
+    fullest: Int[Array, ""]
+    even: Bool[Array, ""]
 
 
-def _count_not_above(values: Float[Array, " points"], quantity: Float[Array, "..."]) -> Array:
-    """How many control points are <= quantity."""
-    if values.shape[0] <= COMPARE_ALL:
-        count = jnp.zeros(quantity.shape, jnp.int32)
-        for i in range(values.shape[0]):
-            count += (quantity >= values[i]).astype(jnp.int32)
-        return count
-    return jnp.searchsorted(values, quantity, side="right", method="scan_unrolled").astype(jnp.int32)
+EVEN = 4  # eps of the largest value that evenly spaced points may be off, as rounded tables are
+BUCKETS_A_POINT = 2
+SELECT_ALL = 16  # up to this many control points a chain of selects vectorises, and beats any gather
 
 
+def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Array, "..."]]:
+    """`[red, green, blue, extinction]` of `quantity`, each of its shape.
+
+    A segment is evaluated as base + part * change from its own beginning, so control points are met exactly (evenly spaced
+    ones to a few eps of the whole range).
+    """
+    if segments.start.shape[0] <= SELECT_ALL:
+        rows = [segments.start, segments.inverse, *segments.base, *segments.change]
+        found = [row[0] for row in rows]
+        for i in range(1, segments.start.shape[0]):
+            past = quantity >= segments.start[i]
+            found = [jnp.where(past, row[i], value) for row, value in zip(rows, found, strict=True)]
+        part = jnp.clip((quantity - found[0]) * found[1], 0, 1)
+        return [base + part * change for base, change in zip(found[2:6], found[6:], strict=True)]
+    i, part = lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+    return [_at(base, i) + part * _at(change, i) for base, change in zip(segments.base, segments.change, strict=True)]
+
+
+def _at(row: Array, i: Array) -> Array:
+    """`row[i]` for indices known to be in range: a clamped gather is a third slower."""
+    return row.at[i].get(mode="promise_in_bounds")
+
+
+def _bucket(value: Array, lowest: Array, rate: Array, buckets: int) -> Array:
+    """Uniform bucket of a value; monotone in floating point, as every step is. In range even for NaN."""
+    return jnp.clip(jnp.clip((value - lowest) * rate, 0, buckets - 1).astype(jnp.int32), 0, buckets - 1)
+
+
+def _segment(segments: Segments, quantity: Array) -> Array:
+    """Segment that holds `quantity`: its bucket says which control points are to be looked at, bisection finds the last <= it."""
+    count, buckets = segments.start.shape[0], segments.below.shape[0] - 1
+    bucket = _bucket(quantity, segments.start[0], segments.rate, buckets)
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) // 2
+        past = (low < high) & (quantity >= _at(segments.start, jnp.minimum(middle, count - 1)))
+        return jnp.where(past, middle + 1, low), jnp.where(past | (low >= high), high, middle)
+
+    steps = 32 - lax.clz(segments.fullest)
+    not_above = lax.fori_loop(0, steps, halve, (_at(segments.below, bucket), _at(segments.below, bucket + 1)))[0]
+    return jnp.maximum(not_above - 1, 0)
+
+
+def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """Segment and place within it, for any control points."""
+    i = _segment(segments, quantity)
+    return i, jnp.clip((quantity - _at(segments.start, i)) * _at(segments.inverse, i), 0, 1)
+
+
+def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """The same for control points that are evenly spaced but for rounding: no tables, no search."""
+    last = segments.start.shape[0] - 1
+    place = jnp.clip((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
+    i = jnp.clip(place.astype(jnp.int32), 0, last)
+    return i, place - i.astype(place.dtype)
+
+
+jax.tree_util.register_dataclass(Segments, data_fields=[f.name for f in dataclasses.fields(Segments)], meta_fields=[])
 jax.tree_util.register_dataclass(TransferFunction, data_fields=["values", "colors", "extinction"], meta_fields=[])

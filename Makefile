@@ -1,0 +1,55 @@
+# make setup: .venv with everything. make test: lint and the whole suite. make demo: one picture. Nothing but Python is needed.
+SHELL := /bin/bash
+VENV := .venv
+PYTHON ?=
+# 0 runs the suite in one process; each further process compiles its own programs.
+JOBS ?= 0
+PYTEST_ARGS ?=
+PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
+
+.PHONY: setup test test-slow lint format demo clean
+
+setup: $(VENV)/.installed-all
+
+# The first interpreter that is new enough, starts, and can make an environment: a shim on the PATH may do none of it.
+$(VENV)/.python:
+	@for candidate in $(PYTHON) python3.13 python3.12 python3.11 python3 python3.14 /usr/bin/python3; do \
+		if "$$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+			echo "making $(VENV) with $$candidate"; \
+			rm -rf $(VENV) && "$$candidate" -m venv $(VENV) && $(PIP) install --upgrade pip && touch $@ && exit 0; \
+		fi; \
+	done; \
+	echo "no working Python 3.11 or newer found (with venv and pip); name one: make $(MAKECMDGOALS) PYTHON=/path/to/python3" >&2; exit 1
+
+$(VENV)/.installed-test: pyproject.toml | $(VENV)/.python
+	@echo "installing jaxsph[test] into $(VENV)"
+	@$(PIP) install --editable '.[test]'
+	@touch $@
+
+$(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
+	@echo "installing jaxsph[all] into $(VENV)"
+	@$(PIP) install --editable '.[all]'
+	@touch $(VENV)/.installed-test $@
+
+test: lint
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.installed-test
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) -m '' $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-test
+	@$(VENV)/bin/ruff check --quiet --output-format concise .
+	@$(VENV)/bin/ruff format --check --quiet . || { echo "formatting differs: make format" >&2; exit 1; }
+	@$(VENV)/bin/mypy --no-error-summary
+	@$(VENV)/bin/lint-imports --no-cache > $(VENV)/lint-imports.log || { cat $(VENV)/lint-imports.log; exit 1; }
+
+format: $(VENV)/.installed-test
+	@$(VENV)/bin/ruff check --quiet --fix-only .
+	@$(VENV)/bin/ruff format --quiet .
+
+demo: $(VENV)/.installed-all
+	@$(VENV)/bin/jaxsph demo -o demo
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache demo.exr demo.png
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,8 @@
+"""`python -m jaxsph`: the same as the command `jaxsph`."""
+
+import sys
+
+from jaxsph.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

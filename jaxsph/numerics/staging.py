@@ -1,0 +1,31 @@
+"""Keep XLA from fusing a computation into each of its consumers.
+
+On CPU, XLA fuses cheap-looking producers into every consumer and evaluates them anew in each: shading was computed six times,
+the sphere-against-pyramid test twelve times. `lax.optimization_barrier` is dropped before fusion there. A branch is a
+boundary that fusion respects, so the computation is put behind one that is always taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+
+def computed_once(always: Bool[Array, ""], function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)`, computed once however many consumers it has.
+
+    Args:
+        always: a scalar that is true in every run but not known to be when compiling; where it were false, zeros come back.
+        function: pure; returns a pytree of arrays.
+    """
+    shapes = jax.eval_shape(function, *arguments)
+
+    def nothing(*_: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    return lax.cond(always, function, nothing, *arguments)

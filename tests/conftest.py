@@ -1,0 +1,94 @@
+"""What all tests share: hypothesis settings, and random scenes of one fixed shape (so that programs are compiled once)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.access.lists import ListPlan
+from jaxsph.cast.points import CastPlan
+
+hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
+hypothesis.settings.load_profile("jaxsph")
+
+CAPACITY = 24
+WIDTH, HEIGHT, SAMPLES = 21, 18, 37
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Random frames of one shape, and a plan with room for all of them."""
+
+    width: int = WIDTH
+    height: int = HEIGHT
+    samples: int = SAMPLES
+    capacity: int = CAPACITY
+
+    def plan(self, slab_samples: int = 4, num_classes: int = 3) -> js.Plan:
+        lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
+        cast = CastPlan(16, slab_samples, 16 // slab_samples)
+        return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
+
+    @property
+    def settings(self) -> js.Settings:
+        return js.Settings(samples=self.samples)
+
+    def scene(
+        self, rng: np.random.Generator, kernel: str = "poly6", decades: float = 1.0, count: int | None = None, dtype=np.float32
+    ) -> js.Scene:
+        """Particles around the origin, supports log-uniform over `decades`, and a transfer function of five points."""
+        count = self.capacity if count is None else count
+        position = rng.uniform(-1, 1, (count, 3)).astype(dtype)
+        support = (0.9 * 10 ** -rng.uniform(0, decades, count)).astype(dtype)
+        quantity, volume = rng.uniform(0, 1, count).astype(dtype), rng.uniform(0.1, 1, count).astype(dtype)
+        particles = js.Particles.from_arrays(position, support, quantity, volume, kernel, capacity=self.capacity)
+        values = np.sort(rng.uniform(0, 1, 5)).astype(dtype)
+        extinction = rng.uniform(0, 4, 5).astype(dtype)
+        transfer = js.TransferFunction.from_points(values, rng.uniform(0, 1, (5, 3)).astype(dtype), extinction)
+        return js.Scene(particles=particles, transfer=transfer)
+
+    def camera(self, rng: np.random.Generator, projection: str = "perspective", distance: float = 3.0, dtype=np.float32) -> js.Camera:
+        """Looks at the origin from `distance`; with a small distance it stands among the particles."""
+        direction = rng.normal(size=3)
+        eye = (distance * direction / np.linalg.norm(direction)).astype(dtype)
+        target = rng.uniform(-0.1, 0.1, 3).astype(dtype)
+        near, far = max(distance - 1.7, 0.05), distance + 1.7
+        size = {"width": self.width, "height": self.height, "near": near, "far": far}
+        up = (0.1, 1.0, 0.2) if abs(direction[1]) < 0.9 * np.linalg.norm(direction) else (1.0, 0.1, 0.2)
+        if projection == "perspective":
+            return js.Camera.look_at(eye, target, up, 50.0, **size)
+        return js.Camera.orthographic(eye, target, up, 2.5, **size)
+
+
+@pytest.fixture(scope="session")
+def frames() -> Frames:
+    return Frames()
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def compare() -> Callable[..., None]:
+    """`compare(image, truth, atol, share)`: colour, alpha and depth agree on at least `share` of the pixels."""
+
+    def check(image: js.Image, truth: js.Image, atol: float, share: float = 1.0) -> None:
+        for name in ("color", "transmittance"):
+            error = np.abs(np.asarray(getattr(image, name), np.float64) - getattr(truth, name))
+            error = error.reshape(*truth.shape, -1).max(-1)
+            assert (error <= atol).mean() >= share, f"{name}: {(error > atol).sum()} pixels over {atol}, worst {error.max()}"
+        deep, true = np.asarray(image.depth, np.float64), truth.depth
+        close = (np.isinf(deep) & np.isinf(true)) | (np.abs(deep - true) <= 100 * atol * np.maximum(true, 1))
+        grazing = np.abs(truth.transmittance - 0.5) <= 10 * atol  # half transmittance is met at the far end, or just not
+        assert (close | grazing).mean() >= share, f"depth differs on {(~(close | grazing)).sum()} pixels"
+
+    return check

@@ -1,0 +1,97 @@
+"""Promises of the camera: the contract's axes, rays and sample depths; framing shows everything; bad views are refused."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxsph as js
+
+view = {"eye": (1.0, 2.0, 5.0), "target": (0.5, 0.0, -1.0), "near": 0.5, "far": 8.0}
+
+
+def test_axes_are_right_up_forward_as_the_contract_says():
+    camera = js.Camera.look_at(**view)
+    forward = np.array(view["target"]) - view["eye"]
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0, 1, 0))
+    right /= np.linalg.norm(right)
+    np.testing.assert_allclose(camera.axes, [right, np.cross(right, forward), forward], atol=1e-6)
+    np.testing.assert_allclose(camera.to_view(jnp.array(view["target"])), [0, 0, np.linalg.norm(np.subtract(view["target"], view["eye"]))], atol=1e-6)
+
+
+def test_up_in_the_world_is_up_in_the_image_and_right_is_right():
+    camera = js.Camera.look_at((0, 0, 5), (0, 0, 0), near=1, far=9)
+    assert camera.to_view(jnp.array([0.0, 1.0, 0.0]))[1] > 0
+    assert camera.to_view(jnp.array([1.0, 0.0, 0.0]))[0] > 0
+    assert camera.row(0.5) > camera.row(1.5)
+    assert camera.column(0.5) < camera.column(1.5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (7, 5), (640, 480)])
+def test_rays_are_those_of_the_contract(width, height):
+    camera = js.Camera.look_at(**view, fov_degrees=60, width=width, height=height)
+    c, r = np.arange(width), np.arange(height)
+    half = np.tan(np.radians(30))
+    np.testing.assert_allclose(camera.column(c + 0.5), half * width / height * (2 * (c + 0.5) / width - 1), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(camera.row(r + 0.5), half * (1 - 2 * (r + 0.5) / height), rtol=1e-5, atol=1e-7)
+
+
+@given(u=st.floats(0, 1), near=st.floats(1e-3, 10), ratio=st.floats(1.001, 1e6))
+def test_depth_is_geometric_in_perspective_and_linear_in_orthographic(u, near, ratio):
+    far = near * ratio
+    size = {"eye": (0, 0, 0), "target": (0, 0, 1), "near": near, "far": far}
+    assert float(js.Camera.look_at(**size).depth(jnp.float32(u * 64), 64)) == pytest.approx(near * ratio**u, rel=1e-5)
+    assert float(js.Camera.orthographic(**size).depth(jnp.float32(u * 64), 64)) == pytest.approx(near + (far - near) * u, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [(512, 512), (200, 600), (601, 100)])
+@pytest.mark.parametrize("direction", [(0, 0, -1), (1, 1, 1), (-0.3, -2, 0.4)])
+def test_framing_shows_every_support_between_near_and_far(size, direction):
+    rng = np.random.default_rng(0)
+    particles = js.Particles.from_arrays(rng.normal(size=(50, 3)) * (3, 1, 0.5) + 7, rng.uniform(0.1, 0.5, 50), 0.0)
+    camera = js.Camera.framing(particles, direction=direction, width=size[0], height=size[1])
+    x, y, z = np.asarray(camera.to_view(particles.position)).T
+    h = np.asarray(particles.support)
+    assert np.all(z - h >= float(camera.near) * (1 - 1e-5))
+    assert np.all(z + h <= float(camera.far) * (1 + 1e-5))
+    half = float(camera.half_height)
+    assert np.all(np.abs(y) + h <= half * (z + h) * 1.0001)
+    assert np.all(np.abs(x) + h <= half * size[0] / size[1] * (z + h) * 1.0001)
+
+
+def test_framing_of_nothing_and_of_one_particle_works():
+    js.Camera.framing(js.Particles.from_arrays([], 1.0, 0.0))
+    js.Camera.framing(js.Particles.from_arrays([[5, 5, 5]], 1e-3, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"near": 8.0, "far": 0.5}, "`near` must be less than `far`"),
+        ({"near": 1.0, "far": 1.0}, "`near` must be less than `far`"),
+        ({"near": 1.0, "far": 1.0 + 1e-9}, "same number in float32"),
+        ({"near": 0.0}, "`near` must be > 0 for a perspective camera"),
+        ({"far": np.inf}, "both finite"),
+        ({"target": (1.0, 2.0, 5.0)}, "`target` must differ from `eye`"),
+        ({"up": (0.5, 2.0, 6.0)}, "parallel to the line of sight"),
+        ({"up": (0.0, 0.0, 0.0)}, "zero or parallel"),
+        ({"eye": (np.nan, 0, 0)}, "`eye` must be finite"),
+        ({"eye": (1, 2)}, r"`eye` must have shape \(3,\)"),
+        ({"fov_degrees": 180}, r"`fov_degrees` must lie in \(0, 180\)"),
+        ({"width": 0}, "`width` must be an integer from 1"),
+        ({"height": 2.5}, "`height` must be an integer from 1"),
+    ],
+)
+def test_a_view_that_cannot_be_is_refused(change, message):
+    if "up" in change and any(change["up"]):
+        change = {"up": tuple(np.subtract(view["target"], view["eye"]))}
+    with pytest.raises(ValueError, match=message):
+        js.Camera.look_at(**{**view, **change})
+
+
+def test_orthographic_refuses_a_height_of_nothing_and_allows_negative_depths():
+    with pytest.raises(ValueError, match="`view_height` must be > 0"):
+        js.Camera.orthographic(**view, view_height=0.0)
+    js.Camera.orthographic(**{**view, "near": -3.0})

@@ -1,0 +1,28 @@
+"""Promises of the image: how it is shown."""
+
+import io
+
+import numpy as np
+from PIL import Image as Pillow
+
+import jaxsph as js
+
+
+def image(color):
+    flat = np.zeros(color.shape[:2])
+    return js.Image(color, 1 - flat, flat, flat, flat, True, 0, {})
+
+
+def test_uint8_clips_and_rounds_to_nearest():
+    color = np.array([[[0, 0.5, 1], [-1, 2, np.nan], [0.498 / 255, 0.502 / 255, 254.6 / 255]]])
+    assert image(color).to_uint8().tolist() == [[[0, 128, 255], [0, 255, 0], [0, 1, 255]]]
+
+
+def test_a_notebook_shows_it_as_png_of_its_size():
+    shown = Pillow.open(io.BytesIO(image(np.full((3, 5, 3), 0.5))._repr_png_()))
+    assert shown.size == (5, 3)
+    assert shown.getpixel((0, 0)) == (128, 128, 128)
+
+
+def test_alpha_is_what_is_not_transmitted():
+    assert image(np.zeros((2, 2, 3))).alpha.tolist() == [[0, 0], [0, 0]]

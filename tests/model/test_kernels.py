@@ -1,0 +1,65 @@
+"""Promises of the kernels: unit integral, compact support, accuracy, one definition for NumPy and JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import integrate
+
+from jaxsph.model import kernels
+
+names = pytest.mark.parametrize("name", kernels.KERNELS)
+formulas = {
+    "poly6": lambda q: 315 / (64 * np.pi) * (1 - q * q) ** 3,
+    "cubic_spline": lambda q: 8 / np.pi * (1 - 6 * q**2 + 6 * q**3 if q <= 0.5 else 2 * (1 - q) ** 3),
+    "wendland_c2": lambda q: 21 / (2 * np.pi) * (1 - q) ** 4 * (1 + 4 * q),
+}
+
+
+@names
+@pytest.mark.parametrize("support", [1e-3, 1.0, 250.0])
+def test_integral_over_space_is_one(name, support, x64):
+    shell = lambda r: 4 * np.pi * r * r * float(kernels.evaluate(name, r, support))
+    value = integrate.quad(shell, 0, support, points=[support / 2], epsabs=0, epsrel=1e-10)[0]
+    assert abs(value - 1) < 1e-9
+
+
+@names
+def test_is_zero_at_and_beyond_the_support(name):
+    assert np.all(np.asarray(kernels.evaluate(name, jnp.array([2.0, 2.0000002, 3.0, 1e6]), 2.0)) == 0)
+
+
+@names
+@given(q=st.floats(0, 1, width=32))
+def test_float32_is_within_sixteen_eps_of_the_peak(name, q):
+    got = float(kernels.evaluate(name, np.float32(q), np.float32(1)))
+    assert abs(got - formulas[name](q)) <= 16 * np.finfo(np.float32).eps * formulas[name](0)
+
+
+@names
+@given(t=st.floats(-3, 1))
+def test_shape_is_the_same_function_in_numpy_and_jax(name, t):
+    with jax.enable_x64(True):
+        shape = kernels.by_name(name).shape
+        assert abs(float(shape(jnp.asarray(t, jnp.float64), jnp)) - shape(np.float64(t), np)) <= 1e-15
+
+
+@names
+@given(t=st.floats(-1, 1), c=st.floats(0, 8))
+def test_a_homogeneous_kernel_scales_as_it_claims(name, t, c):
+    kernel = kernels.by_name(name)
+    if kernel.homogeneous is not None:
+        assert kernel.shape(c * t, np) == pytest.approx(c**kernel.homogeneous * kernel.shape(t, np), rel=1e-12, abs=1e-300)
+
+
+@names
+@pytest.mark.parametrize("r", [0.0, 0.5, 1.0, 1.5])
+def test_gradient_is_finite_at_the_particle_at_the_edge_and_outside(name, r):
+    assert np.isfinite(jax.grad(lambda r: kernels.evaluate(name, r, 1.0))(r))
+
+
+def test_unknown_kernel_lists_the_known_ones():
+    with pytest.raises(ValueError, match="poly6, cubic_spline, wendland_c2"):
+        kernels.by_name("gaussian")

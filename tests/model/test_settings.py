@@ -1,0 +1,30 @@
+"""Promises of settings and scene: what cannot be meant is refused when made."""
+
+import pytest
+
+import jaxsph as js
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "`samples` must be an integer of at least 1, got 0"),
+        ({"samples": 2.5}, "`samples` must be an integer"),
+        ({"samples": 1 << 21}, "cannot be told apart"),
+        ({"memory_limit": 0}, "`memory_limit` must be > 0"),
+        ({"tolerance": 0.004}, "error control is not part of this version"),
+    ],
+)
+def test_bad_settings_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        js.Settings(**change)
+
+
+def test_settings_are_hashable_and_equal_by_value():
+    assert hash(js.Settings(samples=8)) == hash(js.Settings(samples=8))
+    assert js.Settings(samples=8) != js.Settings(samples=9)
+
+
+def test_a_scene_of_the_wrong_parts_is_refused():
+    with pytest.raises(ValueError, match="`particles` must be a `jaxsph.Particles`, got str"):
+        js.Scene(particles="mixer.npz", transfer=None)

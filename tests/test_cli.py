@@ -1,0 +1,184 @@
+"""The command line: what it writes, what it says, and how it refuses."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph import cli, io
+
+TINY = ["--size", "24x16", "--samples", "16"]
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A small particle file in an otherwise empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in").mkdir()
+    generator = np.random.default_rng(0)
+    path = tmp_path / "in" / "drop.npz"
+    position = generator.normal(size=(60, 3)).astype(np.float32)
+    columns = {"temperature": position[:, 0], "pressure": position[:, 1] ** 2, "support": np.full(60, 0.8, np.float32)}
+    np.savez(path, position=position, **columns)
+    return path
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and the lines of stderr."""
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+def test_render_writes_an_exr_and_says_what_it_picked(file, tmp_path, capsys):
+    code, out, err = run(capsys, "render", file, "-o", "out.exr", *TINY)
+    assert (code, err) == (0, [])
+    image = io.read_image(tmp_path / "out.exr")
+    assert image.color.shape == (16, 24, 3) and np.asarray(image.alpha).max() > 0.1
+    for said in (
+        "60 particles",
+        "temperature",
+        "viridis",
+        "0.8",
+        "--eye",
+        "out.exr",
+        "24 x 16",
+        "16 samples",
+        "M kernel",
+    ):
+        assert said in out
+
+
+def test_without_output_the_picture_lands_here_and_is_named(file, tmp_path, capsys):
+    code, out, _ = run(capsys, "render", file, *TINY)
+    assert code == 0 and (tmp_path / "drop.png").stat().st_size > 0 and "drop.png" in out
+
+
+def test_the_picture_is_the_one_that_the_library_makes(file, tmp_path, capsys):
+    arguments = ["--quantity", "pressure", "--colormap", "heat", "--support", "0.5", "--range", "0", "2"]
+    code, out, _ = run(capsys, "render", file, "-o", "out.exr", *TINY, *arguments)
+    assert code == 0 and "pressure" in out and "heat" in out
+    particles = io.read_particles(file, quantity="pressure", support=0.5)
+    scene = js.Scene(particles=particles, transfer=js.scenes.default_transfer(particles, "heat", (0, 2)))
+    camera = js.Camera.framing(particles, width=24, height=16)
+    expected = js.reference.render(scene, camera, js.Settings(samples=16))
+    differs = np.abs(np.asarray(io.read_image(tmp_path / "out.exr").color) - expected.color).max(-1) > 1e-4
+    assert differs.sum() <= 1  # one sample lies within rounding of a support's edge: in float32 it is outside
+
+
+def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
+    run(capsys, "render", file, "-o", "framed.exr", *TINY)
+    _, out, _ = run(
+        capsys, "render", file, "-o", "placed.exr", *TINY, "--eye", 0, 0, 9, "--target", 0, 0, 0, "--fov", 30
+    )
+    assert "--eye 0 0 9" in out and "--fov 30" in out
+    framed, placed = (np.asarray(io.read_image(tmp_path / name).color) for name in ("framed.exr", "placed.exr"))
+    assert np.abs(framed - placed).max() > 0.01
+    line = next(line for line in out.splitlines() if line.startswith("camera"))
+    pasted = line.split("camera")[1].split(",")[0].split()
+    assert run(capsys, "render", file, "-o", "pasted.exr", *TINY, *pasted)[0] == 0  # what it says can be said to it
+    assert np.abs(placed - np.asarray(io.read_image(tmp_path / "pasted.exr").color)).max() < 1e-3
+
+
+def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, "render", "scene:dam_break", "--particles", 60, "--frame", 0, *TINY)
+    assert (code, err) == (0, []) and "60 particles" in out and (tmp_path / "dam_break.png").exists()
+
+
+def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
+    code, out, err = run(capsys, "info", file)
+    assert (code, err) == (0, [])
+    attributes = ("position", "60 x 3", "temperature", "pressure", "float32")
+    for said in ("60 particles", *attributes, "support   0.8", "would show", "quantity  temperature"):
+        assert said in out
+    assert run(capsys, "info", "scene:radial")[0] == 0
+
+
+def test_the_demo_prints_paths_tolerance_error_and_time(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "DEMO_CHECK", 8)
+    load = js.scenes.load
+    monkeypatch.setattr(js.scenes, "load", lambda name, **sizes: load(name, 300, **sizes))
+    code, out, _ = run(capsys, "demo", "-o", tmp_path / "demo", "--size", "8x8")
+    assert code == 0 and (tmp_path / "demo.exr").exists() and (tmp_path / "demo.png").exists()
+    told = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert str(tmp_path / "demo") in told["image"] and "none" in told["tolerance"] and " s " in told["time"]
+    assert float(told["error"].split(",")[0]) < 1e-4
+
+
+WRONG_USAGE = [
+    (["render"], "FILE"),
+    (["paint", "FILE"], "invalid choice"),
+    (["render", "FILE", "--size", "0x4"], "at least 1 pixel"),
+    (["render", "FILE", "--size", "big"], "640x480"),
+    (["render", "FILE", "--samples", "0"], "`samples` must be"),
+    (["render", "FILE", "--samples", "many"], "invalid int"),
+    (["render", "FILE", "--tolerance", "-1"], "`tolerance`"),
+    (["render", "FILE", "-o", "out.jpg"], ".exr or .png"),
+    (["render", "FILE", "--target", "0", "0", "0"], "--target needs --eye"),
+    (["render", "FILE", "--eye", "0", "0", "0", "--target", "0", "0", "0"], "must differ"),
+    (["render", "FILE", "--fov", "180"], "got 180"),
+    (["render", "FILE", "--support", "0"], "--support must be > 0"),
+    (["render", "FILE", "--colormap", "nope"], "viridis"),
+    (["render", "FILE", "--range", "1", "0"], "ascend"),
+    (["render", "FILE", "--frame", "1"], "built-in scenes"),
+    (["render", "FILE", "--memory", "0"], "--memory"),
+    (["render", "scene:nowhere"], "mixer, radial, checker_board, dam_break"),
+    (["render", "scene:mixer", "--frame", "9"], "one of [0, 1, 2]"),
+    (["render", "scene:mixer", "--quantity", "x"], "not for built-in scenes"),
+    (["render", "scene:mixer", "--particles", "0"], "at least 1"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG_USAGE, ids=[" ".join(case[0]) for case in WRONG_USAGE])
+def test_wrong_usage_is_exit_code_2_and_one_line(file, capsys, arguments, message):
+    code, _, err = run(capsys, *[file if argument == "FILE" else argument for argument in arguments])
+    assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
+
+
+def test_failures_are_exit_code_1_and_one_line(file, tmp_path, capsys):
+    (tmp_path / "broken.npz").write_bytes(file.read_bytes()[:100])
+    (tmp_path / "taken.png").mkdir()
+    cases = [
+        (["render", "absent.npz"], "absent.npz"),
+        (["info", "absent.npz"], "absent.npz"),
+        (["render", "broken.npz"], "broken.npz"),
+        (["render", file, "--quantity", "salinity"], "temperature, pressure"),
+        (["render", file, "-o", "no/such/folder/out.png"], "no folder"),
+        (["render", file, "-o", "taken.png"], "cannot be written"),
+    ]
+    for arguments, message in cases:
+        code, _, err = run(capsys, *arguments)
+        assert code == 1 and len(err) == 1 and message in err[0] and "Traceback" not in err[0], arguments
+
+
+def test_an_image_that_would_not_fit_the_memory_limit_says_so(file, capsys):
+    code, _, err = run(capsys, "render", file, "--size", "4096x4096", "--memory", "1e-6")
+    assert code == 1 and len(err) == 1 and "memory_limit" in err[0]
+
+
+def test_debug_shows_where_a_failure_comes_from(tmp_path, capsys):
+    code, _, err = run(capsys, "render", tmp_path / "absent.npz", "--debug")
+    assert code == 1 and err[0].startswith("Traceback") and err[-1].startswith("jaxsph render:")
+
+
+def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.savez("none.npz", position=np.zeros((0, 3)), temperature=np.zeros(0))
+    assert run(capsys, "info", "none.npz")[0] == 0
+    code, _, err = run(capsys, "render", "none.npz", *TINY, "-o", "none.exr")
+    assert (code, err) == (0, []) and np.asarray(io.read_image(tmp_path / "none.exr").color).max() == 0
+
+
+def test_help_and_version_are_exit_code_0(capsys):
+    for arguments in (["--help"], ["render", "--help"], ["info", "--help"], ["--version"]):
+        code, out, err = run(capsys, *arguments)
+        assert code == 0 and out and not err
+    assert js.__version__ in out
+
+
+def test_it_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "jaxsph", "render"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1

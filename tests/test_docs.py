@@ -1,0 +1,52 @@
+"""The README keeps its word: its Python runs as pasted, its commands and files exist."""
+
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+from jaxsph import cli, io, scenes
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def smaller(code):
+    """The same code with fewer particles, pixels and samples."""
+    for many, few in (("20_000", "300"), ("5000", "300"), ("256", "24"), ("128", "16")):
+        code = code.replace(many, few)
+    return code
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
+def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(smaller(block), "README.md", "exec"), {})
+    assert list(tmp_path.glob("*.png"))
+    assert not jax.config.jax_enable_x64
+
+
+def test_there_are_blocks_to_run():
+    assert len(BLOCKS) == 2 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
+
+
+def test_pictures_and_files_that_are_named_exist():
+    for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
+        assert (ROOT / path).stat().st_size < 300_000
+    assert (ROOT / "CITATION.cff").exists()
+
+
+def test_commands_that_are_named_exist(capsys):
+    for command in {a or b for a, b in re.findall(r"(?:`jaxsph (\w+)|^jaxsph (\w+) FILE)", README, re.MULTILINE)}:
+        assert cli.main([command, "--help"]) == 0
+    for target in set(re.findall(r"`make (\w+)`", README)):
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_every_scene_and_format_is_named():
+    assert all(f"`{name}`" in README for name in scenes.names())
+    table = README[README.index("## Files") : README.index("## Built-in")]
+    named = {*re.findall(r"`(\.\w+)`", table), ".gadget"}
+    assert {form.suffixes[0] for form in io.FORMATS} <= named

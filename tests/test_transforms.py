@@ -1,0 +1,101 @@
+"""Promises about JAX: eager, jit and vmap are one image; one program serves all similar frames; x64 is never switched on."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+
+
+def test_eager_and_jit_give_the_same_bits(frames):
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
+    eager = js.render(scene, camera, frames.settings, plan=plan)
+    jitted = jax.jit(lambda s: js.render(s, camera, frames.settings, plan=plan))(scene)
+    for layer in ("color", "transmittance", "depth", "evaluations"):
+        np.testing.assert_array_max_ulp(np.asarray(getattr(eager, layer)), np.asarray(getattr(jitted, layer)), maxulp=4)
+    assert int(jitted.faults) == 0
+    assert int(jitted.stats["pairs"]) == eager.stats["pairs"]
+
+
+def test_jit_renders_in_bands_too(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), dataclasses.replace(frames.camera(rng), height=40)
+    whole = js.plan(scene, camera, frames.settings)
+    banded = dataclasses.replace(whole, bands=3, lists=dataclasses.replace(whole.lists, tile_rows=1))
+    color = [jax.jit(lambda s, p=plan: js.render(s, camera, frames.settings, plan=p).color)(scene) for plan in (whole, banded)]
+    np.testing.assert_allclose(*color, atol=1e-6)
+
+
+def test_vmap_over_cameras_and_over_quantities(frames):
+    rng = np.random.default_rng(0)
+    scene, plan = frames.scene(rng), frames.plan()
+    cameras = [frames.camera(rng) for _ in range(3)]
+    many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    batch = jax.jit(jax.vmap(lambda c: js.render(scene, c, frames.settings, plan=plan).color))(many)
+    for camera, color in zip(cameras, batch, strict=True):
+        np.testing.assert_allclose(color, js.render(scene, camera, frames.settings, plan=plan).color, atol=1e-6)
+
+    def of(quantity):
+        particles = dataclasses.replace(scene.particles, quantity=quantity)
+        return js.render(dataclasses.replace(scene, particles=particles), cameras[0], frames.settings, plan=plan).color
+
+    quantities = jnp.asarray(rng.uniform(0, 1, (2, frames.capacity)), jnp.float32)
+    batch = jax.vmap(of)(quantities)
+    np.testing.assert_allclose(batch[1], jax.jit(of)(quantities[1]), atol=1e-6)
+
+
+def test_one_program_serves_moving_particles_turning_cameras_and_new_transfer_functions(frames):
+    plan = frames.plan()
+    traces = []
+
+    @jax.jit
+    def draw(scene, camera):
+        traces.append(1)
+        return js.render(scene, camera, frames.settings, plan=plan).color
+
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        draw(frames.scene(rng, decades=float(seed)), frames.camera(rng))
+    assert len(traces) == 1
+
+
+def test_plans_of_similar_frames_are_equal(frames):
+    rng = np.random.default_rng(0)
+    scene = frames.scene(rng, decades=0)
+    cameras = [js.Camera.look_at((3 * np.sin(a), 0, 3 * np.cos(a)), (0, 0, 0), width=64, height=64, near=1, far=5) for a in (0, 0.01, 0.02)]
+    assert len({js.plan(scene, camera, frames.settings) for camera in cameras}) == 1
+
+
+def test_tracing_without_a_plan_says_how_to_make_one(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    with pytest.raises(ValueError, match=r"make it outside with `jaxsph.plan"):
+        jax.jit(lambda s: js.render(s, camera, frames.settings).color)(scene)
+    with pytest.raises(ValueError, match="`plan` needs concrete arrays"):
+        jax.jit(lambda s: js.plan(s, camera, frames.settings))(scene)
+
+
+def test_importing_and_rendering_leave_x64_alone():
+    code = "import jax, jaxsph; assert not jax.config.jax_enable_x64"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_forward_gradient_of_the_image_is_finite(frames):
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
+
+    def of(extinction):
+        transfer = dataclasses.replace(scene.transfer, extinction=extinction)
+        return js.render(dataclasses.replace(scene, transfer=transfer), camera, frames.settings, plan=plan).color.sum()
+
+    extinction = scene.transfer.extinction
+    slope = jax.jvp(of, (extinction,), (jnp.ones_like(extinction),))[1]
+    step = 1e-2
+    difference = (of(extinction + step) - of(extinction - step)) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=2e-2)
