@@ -2,7 +2,7 @@
 
 __version__ = "0.1.0"
 
-from jaxsph import reference
+from jaxsph import io, reference, scenes
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
 from jaxsph.plan import Plan, plan
 from jaxsph.render import CapacityError, render
@@ -16,7 +16,9 @@ __all__ = [
     "Scene",
     "Settings",
     "TransferFunction",
+    "io",
     "plan",
     "reference",
     "render",
+    "scenes",
 ]

@@ -89,9 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--debug", action="store_true", help="show where an error comes from")
 
     def command(name: str, run: Callable[[argparse.Namespace], None], text: str, more: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(
-            name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}. {more}"
-        )
+        made = commands.add_parser(name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}. {more}")
         made.set_defaults(run=run)
         return made
 
@@ -122,9 +120,7 @@ def _add_source(parser: argparse.ArgumentParser) -> None:
 
 def _add_picture(parser: argparse.ArgumentParser) -> None:
     maps, depth = ", ".join(scenes.appearance.COLORMAPS), scenes.appearance.OPTICAL_DEPTH
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)"
-    )
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=_size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")

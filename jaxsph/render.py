@@ -71,7 +71,9 @@ def render(
     settings = settings or Settings()
     if is_traced(scene, camera):
         if plan is None:
-            raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
+            raise ValueError(
+                "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`"
+            )
         plan.check(scene, camera, settings)
         return _render_traced(scene, camera, plan)
     return _render_eager(scene, camera, settings, plan, progress)
@@ -90,7 +92,11 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         first_row = jnp.int32(band * plan.band_height)
         lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
         band_rays = clock.run(
-            "cast", _cast, (ordered, lists, cells, camera, scene.transfer, first_row), plan=plan, kernel=scene.particles.kernel
+            "cast",
+            _cast,
+            (ordered, lists, cells, camera, scene.transfer, first_row),
+            plan=plan,
+            kernel=scene.particles.kernel,
         )
         words.append(lists.faults)
         cells_found += int((cells.count > 0).sum())
@@ -103,9 +109,23 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     image = _assemble(_stack(bands), camera, plan, jnp.int32(word))
     clock.mark("image")
     total = int(np.asarray(image.evaluations, np.float64).sum())
-    stats = {"evaluations": total, "evaluations_full": total, "cells": cells_found, "pairs": pairs, "seconds": clock.seconds}
+    stats = {
+        "evaluations": total,
+        "evaluations_full": total,
+        "cells": cells_found,
+        "pairs": pairs,
+        "seconds": clock.seconds,
+    }
     return Image(
-        image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, True, word, stats, _metadata(camera)
+        image.color,
+        image.transmittance,
+        image.depth,
+        image.error_bound,
+        image.evaluations,
+        True,
+        word,
+        stats,
+        _metadata(camera),
     )
 
 
@@ -121,14 +141,16 @@ def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, cells_found, pairs = results
-    word = _input_faults(scene, camera) | ordered.faults | functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
+    word = (
+        _input_faults(scene, camera)
+        | ordered.faults
+        | functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
+    )
     image = _assemble(layers, camera, plan, word)
     total = image.evaluations.sum()
     stats = {"evaluations": total, "evaluations_full": total, "cells": cells_found.sum(), "pairs": pairs.sum()}
     certified = jnp.asarray(True)
-    return Image(
-        image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, certified, word, stats
-    )
+    return Image(image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, certified, word, stats)
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -251,7 +273,7 @@ MOST_PROGRAMS = 64  # compiled stages that are kept; the oldest goes first
 def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type, str(leaf.sharding)) for leaf in leaves)
-    key = (function, tuple(static.items()), structure, shapes, jax.config.jax_enable_x64)
+    key = (function, tuple(static.items()), structure, shapes, jax.config.read("jax_enable_x64"))
     if key not in _PROGRAMS:
         while len(_PROGRAMS) >= MOST_PROGRAMS:
             del _PROGRAMS[next(iter(_PROGRAMS))]

@@ -70,9 +70,7 @@ def test_the_picture_is_the_one_that_the_library_makes(file, tmp_path, capsys):
 
 def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
     run(capsys, "render", file, "-o", "framed.exr", *TINY)
-    _, out, _ = run(
-        capsys, "render", file, "-o", "placed.exr", *TINY, "--eye", 0, 0, 9, "--target", 0, 0, 0, "--fov", 30
-    )
+    _, out, _ = run(capsys, "render", file, "-o", "placed.exr", *TINY, "--eye", 0, 0, 9, "--target", 0, 0, 0, "--fov", 30)
     assert "--eye 0 0 9" in out and "--fov 30" in out
     framed, placed = (np.asarray(io.read_image(tmp_path / name).color) for name in ("framed.exr", "placed.exr"))
     assert np.abs(framed - placed).max() > 0.01

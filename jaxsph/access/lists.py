@@ -24,6 +24,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.staging import computed_once
 
+MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
 
@@ -77,32 +78,35 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
     return row, column
 
 
-def tile_counts(
+def bundle_ranges(
     ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
 ) -> tuple[Array, Array, Array, Array]:
-    """First tile column and row that each particle can touch in the band, and how many columns and rows."""
+    """First and last bundle column, first and last bundle row of the band that each particle can touch (first > last: none)."""
     left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
-    top = jnp.maximum(top, first_row) - first_row
-    bottom = jnp.minimum(bottom, first_row + plan.tile_rows * TILE - 1) - first_row
-    columns = jnp.where(right >= left, right // TILE - left // TILE + 1, 0)
-    rows = jnp.where(bottom >= top, bottom // TILE - top // TILE + 1, 0)
-    return left // TILE, top // TILE, columns, rows
+    top = jnp.maximum(top - first_row, 0)
+    bottom = jnp.minimum(bottom - first_row, plan.tile_rows * TILE - 1)
+    seen = (right >= left) & (bottom >= top)
+    return left // BUNDLE, jnp.where(seen, right // BUNDLE, -1), top // BUNDLE, jnp.where(seen, bottom // BUNDLE, -1)
 
 
 def build_lists(
     ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
 ) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`."""
-    rank, tile, start, overflow = _tile_lists(ordered, camera, depths, plan, first_row)
-    return _split(ordered, camera, plan, first_row, rank, tile, start, overflow)
+    ranges = bundle_ranges(ordered, camera, depths, plan, first_row)
+    rank, tile, start, overflow = _tile_lists(ranges, plan)
+    touch = functools.partial(_touched_children, plan=plan)
+    touched = computed_once(start[-1] >= 0, touch, ordered, camera, first_row, ranges, rank, tile)
+    return _split(plan, touched, rank, tile, start, overflow)
 
 
-def _tile_lists(ordered: Ordered, camera: Camera, depths: Array, plan: ListPlan, first_row: Any) -> tuple[Array, ...]:
+def _tile_lists(ranges: tuple[Array, ...], plan: ListPlan) -> tuple[Array, ...]:
     """Ranks sorted by (tile, rank), the tile of each, where each tile's ranks start, and a fault word."""
-    left, top, columns, rows = tile_counts(ordered, camera, depths, plan, first_row)
+    left, right, top, bottom = (bundle >> 1 for bundle in ranges)
+    columns, rows = jnp.where(right >= 0, right - left + 1, 0), bottom - top + 1
     count = columns * rows
     end = jnp.cumsum(count)
-    total = jnp.where(count.astype(jnp.float32).sum() < 2.0**30, end[-1] if end.size else 0, plan.tile_capacity + 1)
+    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], plan.tile_capacity + 1)
     overflow = faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity)
     slots = jnp.arange(plan.tile_capacity, dtype=jnp.int32)
     particle = jnp.repeat(jnp.arange(count.shape[0], dtype=jnp.int32), count, total_repeat_length=plan.tile_capacity)
@@ -118,7 +122,7 @@ def _sort_pairs(tile: Array, rank: Array, num_tiles: int, num_particles: int) ->
     """Sort by (tile, rank) through one packed key, 32 bits wide where it fits."""
     bits = max(num_particles - 1, 1).bit_length()
     wide = bits + num_tiles.bit_length() > 32
-    with jax.enable_x64(wide or jax.config.jax_enable_x64):
+    with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
         kind = jnp.uint64 if wide else jnp.uint32
         key = lax.sort((tile.astype(kind) << bits) | rank.astype(kind))
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
@@ -127,12 +131,8 @@ def _sort_pairs(tile: Array, rank: Array, num_tiles: int, num_particles: int) ->
     return rank, tile, start
 
 
-def _split(
-    ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Any, rank: Array, tile: Array, start: Array, overflow: Array
-) -> BundleLists:
+def _split(plan: ListPlan, touched: Array, rank: Array, tile: Array, start: Array, overflow: Array) -> BundleLists:
     """Split each tile's list among its four bundles."""
-    touch = functools.partial(_touched_children, plan=plan)
-    touched = computed_once(start[-1] >= 0, touch, ordered, camera, first_row, rank, tile)
     kept = [(touched >> child) & 1 for child in range(4)]
     before = [jnp.cumsum(flag) - flag for flag in kept]
     totals = [jnp.append(upto, upto[-1] + flag[-1]) for upto, flag in zip(before, kept, strict=True)]
@@ -150,21 +150,35 @@ def _split(
 
 
 def _touched_children(
-    ordered: Ordered, camera: Camera, first_row: Any, rank: Array, tile: Array, *, plan: ListPlan
+    ordered: Ordered,
+    camera: Camera,
+    first_row: Any,
+    ranges: tuple[Array, ...],
+    rank: Array,
+    tile: Array,
+    *,
+    plan: ListPlan,
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
     x, y, z, reach = (column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
     row, column = (tile // plan.tile_columns) * TILE + first_row, (tile % plan.tile_columns) * TILE
     sides: dict[str, list[tuple[Array, Array]]] = {"x": [], "y": []}
     for half in (0, BUNDLE):
-        u = (camera.column(column + half + 0.5).astype(x.dtype), camera.column(column + half + BUNDLE - 0.5).astype(x.dtype))
+        u = (
+            camera.column(column + half + 0.5).astype(x.dtype),
+            camera.column(column + half + BUNDLE - 0.5).astype(x.dtype),
+        )
         v = (camera.row(row + half + BUNDLE - 0.5).astype(x.dtype), camera.row(row + half + 0.5).astype(x.dtype))
         sides["x"].append(side_distances(x, z, *u, camera.is_perspective))
         sides["y"].append(side_distances(y, z, *v, camera.is_perspective))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
+    left, right, top, bottom = (bound[rank] for bound in ranges)
     mask = jnp.zeros_like(rank)
     for child in range(4):
-        mask |= touches(sides["x"][child & 1], sides["y"][child >> 1], reach, size).astype(jnp.int32) << child
+        across, down = 2 * (tile % plan.tile_columns) + (child & 1), 2 * (tile // plan.tile_columns) + (child >> 1)
+        inside = (left <= across) & (across <= right) & (top <= down) & (down <= bottom)
+        touched = inside & touches(sides["x"][child & 1], sides["y"][child >> 1], reach, size)
+        mask |= touched.astype(jnp.int32) << child
     return jnp.where(tile < plan.num_tiles, mask, 0)
 
 

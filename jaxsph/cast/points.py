@@ -248,6 +248,4 @@ def _composite(rays: list[Array], shaded: list[Array], border: Array) -> list[Ar
     return [*color, transmittance, depth]
 
 
-jax.tree_util.register_dataclass(
-    Rays, data_fields=["color", "transmittance", "depth", "evaluations"], meta_fields=[]
-)
+jax.tree_util.register_dataclass(Rays, data_fields=["color", "transmittance", "depth", "evaluations"], meta_fields=[])

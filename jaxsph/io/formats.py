@@ -83,8 +83,7 @@ def find_format(path: Path) -> Format:
     found = by_content or by_name
     if found is None:
         raise DataError(
-            f"{path}: the format is known neither by content nor by the suffix {path.suffix!r}; "
-            f"known are {known_suffixes()}"
+            f"{path}: the format is known neither by content nor by the suffix {path.suffix!r}; known are {known_suffixes()}"
         )
     return found
 

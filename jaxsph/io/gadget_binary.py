@@ -66,9 +66,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         box_size = (edge, edge, edge) if edge > 0 else None
         if box_size:
             said.append(f"periodic box of {edge:g}: {PERIODIC_NOTE}")
-        return ParticleTable(
-            columns.pop("POS"), columns, support, box_size=box_size, source=SOURCE, conventions=tuple(said)
-        )
+        return ParticleTable(columns.pop("POS"), columns, support, box_size=box_size, source=SOURCE, conventions=tuple(said))
 
 
 def looks_like(start: bytes) -> bool:

@@ -79,9 +79,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     box_size = _box(header)
     if box_size is not None:
         said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
-    return ParticleTable(
-        position, columns, support, None, box_size, SWIFT_SOURCE if swift else SOURCE, conventions=tuple(said)
-    )
+    return ParticleTable(position, columns, support, None, box_size, SWIFT_SOURCE if swift else SOURCE, conventions=tuple(said))
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:

@@ -66,6 +66,4 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     ]
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
-    return ParticleTable(
-        position[keep], columns, SUPPORT_OVER_H * h, (h / hfact) ** 3, source=SOURCE, conventions=tuple(said)
-    )
+    return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, (h / hfact) ** 3, source=SOURCE, conventions=tuple(said))

@@ -99,8 +99,7 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     if role == "density" and density is not None:
         return density(), "density"
     raise DataError(
-        f"there is no quantity {name!r}; there are {', '.join(available_quantities(table))}, "
-        f"and `log10:` before any of them"
+        f"there is no quantity {name!r}; there are {', '.join(available_quantities(table))}, and `log10:` before any of them"
     )
 
 

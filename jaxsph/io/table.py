@@ -112,9 +112,7 @@ def table_from_columns(
             f"column `{smoothing}` looks like a smoothing length and is not used: the factor from it to the support "
             f"radius differs between codes; pass `support=` to set supports yourself"
         )
-    return ParticleTable(
-        position, rest, special.get("support"), special.get("volume"), source=source, conventions=tuple(said)
-    )
+    return ParticleTable(position, rest, special.get("support"), special.get("volume"), source=source, conventions=tuple(said))
 
 
 def native(array: np.ndarray) -> np.ndarray:

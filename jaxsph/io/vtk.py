@@ -62,9 +62,7 @@ class _Cursor:
             raise DataError(f"stores {what} as {kind!r}; known types are {', '.join(TYPES)}")
         dtype = np.dtype(">" + TYPES[kind.lower()])
         if count < 0 or count > len(self.content):
-            raise DataError(
-                f"announces {count} numbers of {what}, more than it has room for: it is cut short or damaged"
-            )
+            raise DataError(f"announces {count} numbers of {what}, more than it has room for: it is cut short or damaged")
         if self.is_ascii:
             return np.array(self._tokens(count, what)).astype(dtype.newbyteorder("="))
         stop = self.at + count * dtype.itemsize

@@ -77,7 +77,11 @@ class Camera:
             ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
         """
         _require_fov(fov_degrees)
-        half = jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360)) if is_traced(fov_degrees) else math.tan(math.radians(fov_degrees) / 2)
+        half = (
+            jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360))
+            if is_traced(fov_degrees)
+            else math.tan(math.radians(fov_degrees) / 2)
+        )
         return _make(eye, target, up, half, width, height, near, far, "perspective")
 
     @classmethod
@@ -175,7 +179,9 @@ class Camera:
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = np.asarray(self.eye).tolist(), np.asarray(self.axes).round(9).tolist()
-        opening = f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
+        opening = (
+            f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
+        )
         size = f"{self.width}x{self.height}"
         return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={float(self.near):.9g} far={float(self.far):.9g}"
 
@@ -192,9 +198,7 @@ def _axes(forward: Any, up: Any, xp: Any) -> Any:
     return xp.stack([right, xp.cross(right, forward), forward])
 
 
-def _make(
-    eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str
-) -> Camera:
+def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str) -> Camera:
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= LARGEST_SIDE:
             raise ValueError(f"`{name}` must be an integer from 1 to {LARGEST_SIDE} pixels, got {size!r}")
@@ -226,13 +230,17 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
         raise ValueError(f"`target` must differ from `eye`, both are {np.asarray(eye).tolist()}; move one of them")
     side = np.linalg.norm(np.cross(forward / length, np.asarray(up, np.float64)))
     if not side > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"`up` = {np.asarray(up).tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)")
+        raise ValueError(
+            f"`up` = {np.asarray(up).tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)"
+        )
     near, far = float(near), float(far)
     if not (np.isfinite(near) and np.isfinite(far) and near < far):
-        raise ValueError(f"`near` must be less than `far`, both finite, got near = {near}, far = {far}; they are depths from the eye")
+        raise ValueError(
+            f"`near` must be less than `far`, both finite, got near = {near}, far = {far}; they are depths from the eye"
+        )
     if projection == "perspective" and near <= 0:
         raise ValueError(f"`near` must be > 0 for a perspective camera, got {near}; samples are spaced geometrically from it")
-    if np.float32(near) >= np.float32(far) and not jax.config.jax_enable_x64:
+    if np.float32(near) >= np.float32(far) and not jax.config.read("jax_enable_x64"):
         raise ValueError(f"`near` = {near} and `far` = {far} are the same number in float32; move them apart")
 
 

@@ -25,7 +25,7 @@ def _poly6(t: Any, xp: Any) -> Any:
 
 
 def _distance(t: Any, xp: Any) -> Any:
-    """q = r / H from the margin; the floor keeps the root's derivative finite at the particle."""
+    """Q = r / H from the margin; the floor keeps the root's derivative finite at the particle."""
     return xp.sqrt(xp.maximum(1 - xp.maximum(t, 0), SMALLEST_SQUARE))
 
 

@@ -59,7 +59,8 @@ class Particles:
             quantity: (N,) or a number.
             volume: (N,) or a number, >= 0.
             kernel: name of the smoothing kernel.
-            capacity: pad to this many entries (so that sets of different size share a compiled program); default N.
+            capacity: pad to this many entries (so that sets of different size share a compiled program); default N, or 1 for an
+                empty set.
 
         Returns:
             Particles of dtype float64 if `position` is float64 and x64 is enabled, else float32. float16 and bfloat16
@@ -87,9 +88,9 @@ class Particles:
             require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
             require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
-        capacity = count if capacity is None else capacity
-        if capacity < count:
-            raise ValueError(f"`capacity` must be at least the number of particles ({count}), got {capacity}")
+        capacity = max(count, 1) if capacity is None else capacity
+        if capacity < max(count, 1):
+            raise ValueError(f"`capacity` must be at least the number of particles ({count}) and 1, got {capacity}")
         padding = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}
         packed = {name: _padded(value, dtype, capacity, padding[name]) for name, value in arrays.items()}
         if not is_traced(*arrays.values()) and count:
@@ -137,7 +138,9 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
         require_finite(name, packed[name], f"it overflows {packed[name].dtype}: rescale it, or use float64 under jax.enable_x64")
     count = given["position"].shape[0]
     require_positive(
-        "support", packed["support"][:count], f"it underflows {packed['support'].dtype}: rescale the scene or use float64"
+        "support",
+        packed["support"][:count],
+        f"it underflows {packed['support'].dtype}: rescale the scene or use float64",
     )
 
 

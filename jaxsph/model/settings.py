@@ -31,7 +31,9 @@ class Settings:
         if self.samples > 1 << 20:
             raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
         if self.tolerance is not None:
-            raise ValueError(f"`tolerance` = {self.tolerance}: error control is not part of this version; use tolerance=None (full rate)")
+            raise ValueError(
+                f"`tolerance` = {self.tolerance}: error control is not part of this version; use tolerance=None (full rate)"
+            )
         if not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 

@@ -65,7 +65,9 @@ class TransferFunction:
             if descents.size:
                 i = int(descents[0])
                 before, after = given["values"][i], given["values"][i + 1]
-                raise ValueError(f"`values` must ascend, but values[{i}] = {before} > values[{i + 1}] = {after}; sort the control points")
+                raise ValueError(
+                    f"`values` must ascend, but values[{i}] = {before} > values[{i + 1}] = {after}; sort the control points"
+                )
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
         packed = {name: jnp.asarray(value, dtype) for name, value in given.items()}
         if not is_traced(*given.values()):

@@ -16,8 +16,6 @@ from jaxsph.access.lists import build_lists, bundle_origins
 from jaxsph.access.ordering import order_particles
 
 
-
-
 def sample_depths(camera, samples, dtype):
     return camera.depth(jnp.arange(samples, dtype=dtype) + 0.5, samples).astype(dtype)
 
@@ -27,7 +25,13 @@ def grid(particles, camera, plan):
     depths = sample_depths(camera, plan.samples, particles.dtype)
     ordered = order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
     lists = build_lists(ordered, camera, depths, plan.lists, 0)
-    return ordered, lists, find_cells(ordered, lists), bundle_origins(plan.lists, 0), pixel_ranges(ordered, camera, depths[0], depths[-1])
+    return (
+        ordered,
+        lists,
+        find_cells(ordered, lists),
+        bundle_origins(plan.lists, 0),
+        pixel_ranges(ordered, camera, depths[0], depths[-1]),
+    )
 
 
 def weights(scene, camera, samples, dtype):
@@ -67,7 +71,9 @@ def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
     origin = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
     for particle, r, c, k in np.argwhere(positive):
         bundle = origin[r // 8 * 8, c // 8 * 8]
-        assert members[bundle, k // plan.cast.slab_samples, particle], f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
+        assert members[bundle, k // plan.cast.slab_samples, particle], (
+            f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
+        )
 
 
 scenes = {
@@ -92,7 +98,10 @@ def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
         check_every_sample_finds_its_particles(scene, camera, frames.plan(slab_samples), dtype)
 
 
-@given(seed=st.integers(0, 2**32 - 1), where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]),
+)
 def test_particles_in_awkward_places_are_found(frames, seed, where):
     """Tangent to rays and samples, across the near plane, around the eye, behind it."""
     rng = np.random.default_rng(seed)

@@ -43,24 +43,14 @@ def write_vtk(path, p, dataset="POLYDATA", binary=True, scalar_width="1"):
         else (lambda a, kind: "\n".join(" ".join(map(str, row)) for row in np.atleast_2d(a.T).T.tolist()).encode())
     )
     cells = np.stack([np.ones(n, np.int32), np.arange(n, dtype=np.int32)], axis=1)
-    out = (
-        b"# vtk DataFile Version 3.0\ntitle\n"
-        + (b"BINARY" if binary else b"ASCII")
-        + b"\nDATASET "
-        + dataset.encode()
-        + b"\n"
-    )
+    out = b"# vtk DataFile Version 3.0\ntitle\n" + (b"BINARY" if binary else b"ASCII") + b"\nDATASET " + dataset.encode() + b"\n"
     out += b"POINTS %d float\n" % n + encode(p.position, ">f4") + b"\n"
     if dataset == "POLYDATA":
         out += b"VERTICES %d %d\n" % (n, 2 * n) + encode(cells, ">i4") + b"\n"
     else:
         out += b"CELLS %d %d\n" % (n, 2 * n) + encode(cells, ">i4") + b"\n"
         out += b"CELL_TYPES %d\n" % n + encode(np.ones(n, np.int32), ">i4") + b"\n"
-    out += (
-        b"POINT_DATA %d\nSCALARS id int %s\nLOOKUP_TABLE default\n" % (n, scalar_width.encode())
-        + encode(p.id, ">i4")
-        + b"\n"
-    )
+    out += b"POINT_DATA %d\nSCALARS id int %s\nLOOKUP_TABLE default\n" % (n, scalar_width.encode()) + encode(p.id, ">i4") + b"\n"
     out += b"FIELD FieldData 2\nvelocity 3 %d float\n" % n + encode(p.velocity, ">f4") + b"\n"
     out += b"density 1 %d float\n" % n + encode(p.density, ">f4") + b"\n"
     path.write_bytes(out)
@@ -69,11 +59,7 @@ def write_vtk(path, p, dataset="POLYDATA", binary=True, scalar_width="1"):
 def write_vtk5(path, p):
     n = len(p.position)
     out = b"# vtk DataFile Version 5.1\ntitle\nBINARY\nDATASET POLYDATA\n"
-    out += (
-        b"POINTS %d double\n" % n
-        + p.position.astype(">f8").tobytes()
-        + b"\nMETADATA\nINFORMATION 1\nNAME x\nDATA y\n\n"
-    )
+    out += b"POINTS %d double\n" % n + p.position.astype(">f8").tobytes() + b"\nMETADATA\nINFORMATION 1\nNAME x\nDATA y\n\n"
     out += b"VERTICES %d %d\nOFFSETS vtktypeint64\n" % (n + 1, n) + np.arange(n + 1).astype(">i8").tobytes()
     out += b"\nCONNECTIVITY vtktypeint64\n" + np.arange(n).astype(">i8").tobytes() + b"\n"
     out += b"CELL_DATA %d\nSCALARS cell float\nLOOKUP_TABLE default\n" % n + np.zeros(n, ">f4").tobytes() + b"\n"
@@ -166,9 +152,7 @@ def write_gadget_binary(path, p, order="<", form=2, dark=0, masses=False):
     n = len(p.position)
     counts = np.array([n, dark, 0, 0, 0, 0], f"{order}u4").tobytes()
     table = np.array([0 if masses else 2.0, 4.0, 0, 0, 0, 0], f"{order}f8").tobytes()
-    head = (
-        counts + table + struct.pack(f"{order}ddii", 1.0, 0.0, 0, 0) + counts + struct.pack(f"{order}iid", 0, 1, 16.0)
-    )
+    head = counts + table + struct.pack(f"{order}ddii", 1.0, 0.0, 0, 0) + counts + struct.pack(f"{order}iid", 0, 1, 16.0)
     everyone = lambda a: np.concatenate([a, np.zeros((dark, *a.shape[1:]), a.dtype)])  # noqa: E731
     number = lambda a: a.astype(f"{order}f4").tobytes()  # noqa: E731
     blocks = {"HEAD": head.ljust(256, b"\0"), "POS": number(everyone(p.position)), "VEL": number(everyone(p.velocity))}

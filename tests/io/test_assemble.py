@@ -47,9 +47,7 @@ def test_without_support_the_nearest_neighbours_give_it():
 
 
 def test_the_volume_is_mass_over_density_where_both_are_there():
-    particles, report = io.particles_from_table(
-        ParticleTable(position, {"Masses": 3 * density, "rho": density}), "x", 0.5
-    )
+    particles, report = io.particles_from_table(ParticleTable(position, {"Masses": 3 * density, "rho": density}), "x", 0.5)
     np.testing.assert_allclose(particles.volume, 3, rtol=1e-6)
     assert report.volume == "Masses / rho"
 
@@ -77,9 +75,7 @@ def test_errors_name_the_file(samples, tmp_path):
 
 def test_read_particles_passes_every_choice_on(samples, tmp_path):
     samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
-    particles = io.read_particles(
-        str(tmp_path / "a.gadget"), quantity="z", support=0.25, kernel="wendland_c2", part_type=1
-    )
+    particles = io.read_particles(str(tmp_path / "a.gadget"), quantity="z", support=0.25, kernel="wendland_c2", part_type=1)
     assert particles.num_particles == 3 and particles.kernel == "wendland_c2"
     np.testing.assert_array_equal(particles.support, [0.25] * 3)
 

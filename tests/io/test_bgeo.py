@@ -20,9 +20,7 @@ def test_positions_and_any_attributes_are_read(compressed, names, samples, tmp_p
 
 def test_positions_overwritten_by_an_attribute_are_refused_and_the_cause_is_named(samples, tmp_path):
     samples.write_bgeo(tmp_path / "a.bgeo", samples.particles(), overwrite=True)
-    with pytest.raises(
-        ValueError, match=r"a\.bgeo: its x coordinates were overwritten by the attribute `id`.*requested twice"
-    ):
+    with pytest.raises(ValueError, match=r"a\.bgeo: its x coordinates were overwritten by the attribute `id`.*requested twice"):
         io.read_table(tmp_path / "a.bgeo")
 
 

@@ -46,8 +46,6 @@ def test_grids_are_refused(tmp_path):
 
 
 def test_a_count_that_the_file_has_no_room_for_is_refused_before_memory_is_asked_for(tmp_path):
-    (tmp_path / "a.vtk").write_text(
-        "# vtk DataFile Version 3.0\nt\nBINARY\nDATASET POLYDATA\nPOINTS 99999999999 float\n"
-    )
+    (tmp_path / "a.vtk").write_text("# vtk DataFile Version 3.0\nt\nBINARY\nDATASET POLYDATA\nPOINTS 99999999999 float\n")
     with pytest.raises(ValueError, match="cut short"):
         io.read_table(tmp_path / "a.vtk")

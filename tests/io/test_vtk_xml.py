@@ -71,9 +71,7 @@ def test_words_are_left_out_and_said_so(tmp_path):
     assert set(table.columns) == {"a"} and "left out label: not numbers" in table.conventions
 
 
-@pytest.mark.parametrize(
-    "options", [{"binary": False}, {"compression": None}, {"compression": "zlib"}, {"compression": "lzma"}]
-)
+@pytest.mark.parametrize("options", [{"binary": False}, {"compression": None}, {"compression": "zlib"}, {"compression": "lzma"}])
 def test_every_encoding_that_meshio_writes_is_read(options, tmp_path):
     meshio = pytest.importorskip("meshio")
     position = np.random.default_rng(0).random((20_000, 3))  # several compressed blocks

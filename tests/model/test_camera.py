@@ -18,7 +18,11 @@ def test_axes_are_right_up_forward_as_the_contract_says():
     right = np.cross(forward, (0, 1, 0))
     right /= np.linalg.norm(right)
     np.testing.assert_allclose(camera.axes, [right, np.cross(right, forward), forward], atol=1e-6)
-    np.testing.assert_allclose(camera.to_view(jnp.array(view["target"])), [0, 0, np.linalg.norm(np.subtract(view["target"], view["eye"]))], atol=1e-6)
+    np.testing.assert_allclose(
+        camera.to_view(jnp.array(view["target"])),
+        [0, 0, np.linalg.norm(np.subtract(view["target"], view["eye"]))],
+        atol=1e-6,
+    )
 
 
 def test_up_in_the_world_is_up_in_the_image_and_right_is_right():
@@ -43,7 +47,9 @@ def test_depth_is_geometric_in_perspective_and_linear_in_orthographic(u, near, r
     far = near * ratio
     size = {"eye": (0, 0, 0), "target": (0, 0, 1), "near": near, "far": far}
     assert float(js.Camera.look_at(**size).depth(jnp.float32(u * 64), 64)) == pytest.approx(near * ratio**u, rel=1e-5)
-    assert float(js.Camera.orthographic(**size).depth(jnp.float32(u * 64), 64)) == pytest.approx(near + (far - near) * u, rel=1e-5)
+    assert float(js.Camera.orthographic(**size).depth(jnp.float32(u * 64), 64)) == pytest.approx(
+        near + (far - near) * u, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("size", [(512, 512), (200, 600), (601, 100)])

@@ -27,7 +27,7 @@ good = {"position": np.zeros((3, 3)), "support": np.ones(3), "quantity": np.aran
         ({"quantity": np.ones(3) * 1j}, "real numbers"),
         ({"volume": -1.0}, "`volume` must be >= 0"),
         ({"kernel": "cubic"}, "`kernel` must be one of poly6"),
-        ({"capacity": 2}, r"`capacity` must be at least the number of particles \(3\), got 2"),
+        ({"capacity": 2}, r"`capacity` must be at least the number of particles \(3\) and 1, got 2"),
     ],
 )
 def test_bad_input_is_refused_by_name_with_the_value(change, message):

@@ -24,7 +24,11 @@ def expected(transfer, q):
 
 def spaced(count, how, rng):
     even = np.linspace(-1, 2, count)
-    return {"even": even, "uneven": np.sort(rng.uniform(-1, 2, count)), "crowded": np.sort(2 * rng.uniform(0, 1, count) ** 12)}[how]
+    return {
+        "even": even,
+        "uneven": np.sort(rng.uniform(-1, 2, count)),
+        "crowded": np.sort(2 * rng.uniform(0, 1, count) ** 12),
+    }[how]
 
 
 @pytest.mark.parametrize("how", ["even", "uneven", "crowded"])

@@ -1,0 +1,245 @@
+"""Promises of `render`: it is the reference image, whatever the scene, the camera and the plan."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.numerics import faults
+
+kernel_names = ["poly6", "cubic_spline", "wendland_c2"]
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("kernel", kernel_names)
+@settings(max_examples=12)
+@given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 1.0, 4.0]), distance=st.sampled_from([3.0, 0.5]))
+def test_float32_agrees_with_the_reference_to_1e_4_on_999_of_1000_pixels(
+    frames, compare, kernel, projection, seed, decades, distance
+):
+    """A sample at the edge of a support may fall on the other side of it in float32; so one pixel in a thousand may differ."""
+    rng = np.random.default_rng(seed)
+    scene, camera = frames.scene(rng, kernel, decades), frames.camera(rng, projection, distance)
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    truth = js.reference.render(scene, camera, frames.settings)
+    alone = np.asarray(edge_flips(scene, camera, frames.samples))
+    assert alone.mean() <= 0.02
+    for layer in ("color", "transmittance"):
+        error = np.abs(np.asarray(getattr(image, layer), np.float64) - getattr(truth, layer)).reshape(*truth.shape, -1).max(-1)
+        assert (error[~alone] <= 1e-4).mean() >= 0.999, (error[~alone].max(), alone.sum())
+
+
+def edge_flips(scene, camera, samples):
+    """Pixels with a sample so near the edge of the only supports around it that float32 cannot tell on which side it is."""
+
+    def covered(factor):
+        particles = dataclasses.replace(scene.particles, support=scene.particles.support * np.float32(factor))
+        return js.reference.field(dataclasses.replace(scene, particles=particles), camera, samples)[1] > 0
+
+    return (covered(1 - 3e-6) != covered(1 + 3e-6)).any(-1)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("kernel", kernel_names)
+@settings(max_examples=8)
+@given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 4.0]))
+def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, projection, seed, decades):
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(seed)
+        scene, camera = (
+            frames.scene(rng, kernel, decades, dtype=np.float64),
+            frames.camera(rng, projection, dtype=np.float64),
+        )
+        image = js.render(scene, camera, frames.settings, plan=frames.plan())
+        assert image.color.dtype == jnp.float64
+        compare(image, js.reference.render(scene, camera, frames.settings), 1e-10)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (9, 7), (33, 16), (5, 40)])
+@pytest.mark.parametrize("samples", [1, 5, 16, 33])
+def test_any_image_size_and_number_of_samples(frames, compare, size, samples):
+    rng = np.random.default_rng(size[0] * samples)
+    scene = frames.scene(rng, decades=0.0)
+    camera = dataclasses.replace(frames.camera(rng), width=size[0], height=size[1])
+    settings = js.Settings(samples=samples)
+    image = js.render(scene, camera, settings)
+    assert image.shape == (size[1], size[0])
+    assert image.transmittance.shape == image.depth.shape == image.error_bound.shape == (size[1], size[0])
+    compare(image, js.reference.render(scene, camera, settings), 1e-4)
+
+
+def test_an_empty_scene_is_black_transparent_and_infinitely_deep(frames):
+    scene = frames.scene(np.random.default_rng(0), count=0)
+    image = js.render(scene, frames.camera(np.random.default_rng(0)), frames.settings)
+    assert not np.asarray(image.color).any()
+    assert np.all(np.asarray(image.transmittance) == 1)
+    assert np.all(np.isinf(image.depth))
+    assert image.stats["evaluations"] == image.stats["pairs"] == image.stats["cells"] == 0
+    empty = dataclasses.replace(scene, particles=js.Particles.from_arrays([], 1.0, 0.0))
+    assert not np.asarray(js.render(empty, frames.camera(np.random.default_rng(0)), frames.settings).color).any()
+
+
+def test_a_scene_behind_the_camera_is_black(frames):
+    scene = frames.scene(np.random.default_rng(0), decades=2)
+    camera = js.Camera.look_at((0, 0, 4), (0, 0, 9), width=20, height=20, near=0.1, far=5)
+    assert not np.asarray(js.render(scene, camera, frames.settings).color).any()
+
+
+def test_a_camera_inside_a_particle_that_covers_the_screen(frames, compare):
+    particles = js.Particles.from_arrays([[0, 0, 0], [0.3, 0, 0]], [50.0, 0.2], [0.2, 0.9])
+    scene = js.Scene(particles=particles, transfer=js.TransferFunction.from_points([0, 1], np.eye(3)[:2], [0.1, 3.0]))
+    camera = js.Camera.look_at((0, 0, 1), (0, 0, 0), fov_degrees=150, width=30, height=20, near=0.01, far=60)
+    image = js.render(scene, camera, frames.settings)
+    compare(image, js.reference.render(scene, camera, frames.settings), 1e-5)
+    assert float(image.alpha.min()) > 0.1
+
+
+def test_a_constant_quantity_has_exactly_constant_colour(frames):
+    rng = np.random.default_rng(3)
+    scene = frames.scene(rng, decades=1)
+    scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=jnp.full(frames.capacity, 0.5)))
+    transfer = js.TransferFunction.from_points([0, 1], np.full((2, 3), 0.25), [2.0, 2.0])
+    image = js.render(dataclasses.replace(scene, transfer=transfer), frames.camera(rng), frames.settings)
+    np.testing.assert_allclose(image.color, 0.25 * np.repeat(np.asarray(image.alpha)[..., None], 3, -1), atol=2e-7)
+
+
+def test_a_uniform_medium_obeys_beer_lambert(frames):
+    """One particle far larger than the view: transmittance is exp(-extinction * length), whatever the samples."""
+    particles = js.Particles.from_arrays([[0, 0, 0]], 1e4, 0.5)
+    transfer = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [0.7, 0.7])
+    camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), width=9, height=9, near=1.0, far=3.0)
+    image = js.render(js.Scene(particles=particles, transfer=transfer), camera, frames.settings)
+    np.testing.assert_allclose(image.transmittance, np.exp(-1.4), rtol=frames.samples * np.finfo(np.float32).eps)
+    np.testing.assert_allclose(image.depth, 1 + np.log(2) / 0.7, rtol=1e-5)
+
+
+def test_bands_give_the_same_image_bit_for_bit(frames):
+    rng = np.random.default_rng(0)
+    scene = frames.scene(rng, decades=1)
+    camera = dataclasses.replace(frames.camera(rng), height=75)
+    whole = js.plan(scene, camera, frames.settings)
+    for rows in (1, 2, 3):
+        lists = dataclasses.replace(whole.lists, tile_rows=rows)
+        banded = dataclasses.replace(whole, bands=-(-5 // rows), lists=lists)
+        calls = []
+        image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))  # noqa: B023
+        assert calls[-1] == (banded.bands, banded.bands)
+        for layer in ("color", "transmittance", "depth", "evaluations"):
+            assert np.array_equal(getattr(image, layer), getattr(js.render(scene, camera, frames.settings, plan=whole), layer))
+
+
+def test_the_memory_limit_makes_bands_and_too_little_is_refused(frames):
+    rng = np.random.default_rng(0)
+    scene = frames.scene(rng, decades=0)
+    camera = dataclasses.replace(frames.camera(rng), width=256, height=256)
+    free = js.plan(scene, camera, js.Settings(samples=64))
+    tight = js.plan(scene, camera, js.Settings(samples=64, memory_limit=free.bytes // 2))
+    assert free.bands == 1
+    assert tight.bands > 1
+    assert tight.bytes <= free.bytes // 2
+    with pytest.raises(ValueError, match="`memory_limit` = 1000 bytes is too little"):
+        js.plan(scene, camera, js.Settings(samples=64, memory_limit=1000))
+
+
+def test_a_plan_that_is_too_small_raises_and_without_a_plan_it_cannot_be(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, decades=0), frames.camera(rng)
+    plan = frames.plan()
+    for capacity in ("tile_capacity", "list_capacity"):
+        small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 4}))
+        with pytest.raises(js.CapacityError, match="make a new plan"):
+            js.render(scene, camera, frames.settings, plan=small)
+        word = int(jax.jit(lambda s, p=small: js.render(s, camera, frames.settings, plan=p).faults)(scene))
+        assert word & faults.OVERFLOWS
+    assert js.render(scene, camera, frames.settings).faults == 0
+
+
+@pytest.mark.parametrize("change", ["camera", "samples", "particles"])
+def test_a_plan_for_other_shapes_is_refused(frames, change):
+    rng = np.random.default_rng(0)
+    scene, camera, settings = frames.scene(rng), frames.camera(rng), frames.settings
+    if change == "camera":
+        camera = dataclasses.replace(camera, width=22)
+    if change == "samples":
+        settings = js.Settings(samples=38)
+    if change == "particles":
+        scene = dataclasses.replace(scene, particles=js.Particles.from_arrays([[0, 0, 0]], 1.0, 0.0))
+    with pytest.raises(ValueError, match="`plan` was made for"):
+        js.render(scene, camera, settings, plan=frames.plan())
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value", "message"),
+    [
+        ("particles", "position", np.nan, "a particle has a position"),
+        ("particles", "support", -1.0, "a particle has a position"),
+        ("particles", "quantity", np.inf, "a particle has a position"),
+        ("particles", "volume", -1.0, "a particle has a position"),
+        ("transfer", "extinction", -1.0, "transfer function is not usable"),
+        ("transfer", "colors", 2.0, "transfer function is not usable"),
+        ("transfer", "values", np.nan, "transfer function is not usable"),
+        ("camera", "eye", np.nan, "camera is not usable"),
+        ("camera", "near", -1.0, "camera is not usable"),
+        ("camera", "far", 0.001, "camera is not usable"),
+    ],
+)
+def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, part, field, value, message):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    spoil = lambda owner: dataclasses.replace(
+        owner, **{field: getattr(owner, field).at[(0,) * getattr(owner, field).ndim].set(value)}
+    )
+    if part == "camera":
+        camera = spoil(camera)
+    else:
+        scene = dataclasses.replace(scene, **{part: spoil(getattr(scene, part))})
+    image = jax.jit(lambda s, c: js.render(s, c, frames.settings, plan=frames.plan()))(scene, camera)
+    assert int(image.faults) != 0
+    if part == "particles":
+        assert np.isfinite(image.color).all()
+    with pytest.raises(ValueError, match=message):
+        js.render(scene, camera, frames.settings, plan=frames.plan())
+
+
+def test_the_order_of_particles_hardly_matters_and_the_same_input_gives_the_same_bits(frames):
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng, decades=1), frames.camera(rng)
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    again = js.render(scene, camera, frames.settings, plan=frames.plan())
+    assert np.array_equal(image.color, again.color)
+    shuffle = rng.permutation(frames.capacity)
+    shuffled = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[shuffle], scene.particles))
+    other = js.render(shuffled, camera, frames.settings, plan=frames.plan())
+    np.testing.assert_allclose(other.color, image.color, atol=64 * np.finfo(np.float32).eps)
+
+
+def test_padding_changes_nothing(frames):
+    rng = np.random.default_rng(6)
+    scene, camera = frames.scene(rng, decades=1, count=20), frames.camera(rng)
+    bare = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[:20], scene.particles))
+    padded, exact = (js.render(s, camera, frames.settings) for s in (scene, bare))
+    assert np.array_equal(padded.color, exact.color)
+
+
+def test_stats_count_what_was_done(frames):
+    rng = np.random.default_rng(0)
+    image = js.render(frames.scene(rng), frames.camera(rng), frames.settings)
+    assert (
+        image.stats["evaluations"]
+        == image.stats["evaluations_full"]
+        == pytest.approx(float(np.asarray(image.evaluations, np.float64).sum()))
+    )
+    assert image.stats["pairs"] > 0
+    assert image.stats["cells"] > 0
+    assert {"grid", "adapt", "cast", "compile"} <= set(image.stats["seconds"])
+    assert image.certified
+    assert image.faults == 0
+    assert not np.asarray(image.error_bound).any()
+    truth = js.reference.render(frames.scene(np.random.default_rng(0)), frames.camera(np.random.default_rng(0)), frames.settings)
+    assert image.stats["evaluations"] > 0
+    assert truth.stats["evaluations"] > 0
