@@ -30,8 +30,11 @@ from jaxsph.numerics.checks import is_traced
 STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
 MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 LARGEST_CAPACITY = 1 << 30
-CELL_SAMPLES = 16  # the paper's D_z
-SLAB_SAMPLES = (4, 8, 16)
+WORTH_SPLITTING = 1 << 19  # (particle, tile) pairs from which building lists side by side pays
+CELL_SAMPLES = (4, 8, 16)
+SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
+CHUNKS_A_LAYER = 12
+SMALLEST_CHUNK = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,10 +46,11 @@ class Plan:
         samples: fine samples a ray.
         num_particles: entries of the particle arrays, padding included.
         num_classes: classes of support.
-        bands: horizontal bands that are rendered one after the other.
+        bands: horizontal bands that are cast one after the other, a multiple of `abreast`.
+        abreast: bands whose lists are built in one program, side by side on the cores.
         lists: sizes of the lists of one band.
         cast: sizes of the march.
-        bytes: estimate of the working memory of one band, in bytes.
+        bytes: estimate of the working memory, in bytes.
     """
 
     width: int
@@ -55,6 +59,7 @@ class Plan:
     num_particles: int
     num_classes: int
     bands: int
+    abreast: int
     lists: ListPlan
     cast: CastPlan
     bytes: int
@@ -77,13 +82,12 @@ class Plan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
 
 
-def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
+def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell_samples: int | None = None) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
     Args:
         scene, camera, settings: as for `jaxsph.render`.
-        slab_samples: samples of a cell that share a window of particles, a divisor of 16; by default chosen from how deep a
-            support is in samples.
+        cell_samples: samples of a cell along depth; by default chosen from how deep a support is in samples.
 
     Raises:
         ValueError: under a trace, or when even a band of one row of tiles exceeds `settings.memory_limit`.
@@ -93,17 +97,22 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     particles = scene.particles
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
-    tiles, bundles, depth_extent = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
+    tiles, bundles, depth_extent, covered = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
     num_classes = _num_classes(particles)
-    slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
-    bands = 1
+    cell_samples = cell_samples or _choose_cell_samples(float(depth_extent))
+    abreast = 2 if tiles.sum() >= WORTH_SPLITTING and tile_rows > 1 else 1
+    bands = abreast
     while True:
         rows = _ceil(tile_rows, bands)
-        made = _for_bands(camera, settings, particles, rows, columns, tiles, bundles, num_classes, slab_samples)
+        cast = CastPlan(_choose_chunk(int(covered), rows * columns, cell_samples), cell_samples)
+        made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast, abreast)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
-        if fits or rows == 1:
+        if fits or (rows == 1 and abreast == 1):
             break
-        bands = min(2 * bands, tile_rows)
+        if rows > 1:
+            bands *= 2
+        else:
+            bands, abreast = tile_rows, 1
     if not fits:
         raise ValueError(
             f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs about {made.bytes} "
@@ -116,31 +125,29 @@ def _for_bands(
     camera: Camera,
     settings: Settings,
     particles: Particles,
-    rows: int,
-    columns: int,
-    tiles: np.ndarray,
-    bundles: np.ndarray,
+    tiles_a_band: tuple[int, int],
+    pairs_a_row: tuple[np.ndarray, np.ndarray],
     num_classes: int,
-    slab_samples: int,
+    cast: CastPlan,
+    abreast: int,
 ) -> Plan:
-    bands = _ceil(len(tiles), rows)
-    fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in (tiles, bundles)]
-    lists = ListPlan(rows, columns, *(round_up(max(count, 1)) for count in fullest))
-    slabs = _ceil(settings.samples, slab_samples)
-    chunk = max(16, min(2048 // slab_samples, 1 << (lists.num_bundles - 1).bit_length()))
-    cast = CastPlan(chunk, slab_samples, CELL_SAMPLES // slab_samples)
+    rows = tiles_a_band[0]
+    bands = _ceil(_ceil(len(pairs_a_row[0]), rows), abreast) * abreast
+    fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in pairs_a_row]
+    lists = ListPlan(*tiles_a_band, *(round_up(max(count, 1)) for count in fullest))
+    slabs = _ceil(settings.samples, cast.cell_samples)
     number = np.dtype(particles.dtype).itemsize
     memory = (
         particles.capacity * (24 * number + 32)
-        + lists.tile_capacity * (12 * number + 48)
-        + lists.list_capacity * 8
-        + num_classes * slabs * lists.num_bundles * 40
+        + abreast * lists.tile_capacity * (12 * number + 48)
+        + abreast * lists.list_capacity * 8
+        + abreast * num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
-        + cast.chunk * slab_samples * BUNDLE * BUNDLE * number * 16
+        + cast.chunk * cast.cell_samples * BUNDLE * BUNDLE * number * 16
         + camera.width * camera.height * 8 * number
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
-    return Plan(*size, num_classes, bands, lists, cast, int(memory))
+    return Plan(*size, num_classes, bands, abreast, lists, cast, int(memory))
 
 
 def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:
@@ -166,17 +173,27 @@ def _num_classes(particles: Particles) -> int:
     return min(1 + math.ceil(max(octaves - 0.01, 0)), MOST_CLASSES)
 
 
-def _choose_slab_samples(depth_extent: float) -> int:
-    """Deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter."""
-    for slab_samples in SLAB_SAMPLES:
-        if depth_extent <= 6 * slab_samples:
-            return slab_samples
-    return SLAB_SAMPLES[-1]
+def _choose_cell_samples(depth_extent: float) -> int:
+    """Deeper cells for deeper supports: a window is the cell's depth plus a support's diameter."""
+    for cell_samples in CELL_SAMPLES:
+        if depth_extent <= 6 * cell_samples:
+            return cell_samples
+    return CELL_SAMPLES[-1]
+
+
+def _choose_chunk(covered: int, tiles: int, cell_samples: int) -> int:
+    """As many bundles as fill the caches, but few enough that a layer of the covered bundles makes some eight chunks."""
+    wanted = min(SAMPLES_AT_ONCE // cell_samples, max(covered // CHUNKS_A_LAYER, SMALLEST_CHUNK), 4 * tiles)
+    return 1 << (wanted - 1).bit_length()
 
 
 @functools.partial(jax.jit, static_argnames=("samples", "tile_rows"))
-def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -> tuple[Array, Array, Array]:
-    """Pairs in each row of tiles (with tiles, and at most with bundles), and the median diameter of a support in samples."""
+def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -> tuple[Array, Array, Array, Array]:
+    """What a plan is made from.
+
+    Pairs in each row of tiles (with tiles, and at most with bundles); the median diameter of a support in samples; and the
+    number of bundles that particles stand in.
+    """
     depths = camera.depth(jnp.arange(samples, dtype=camera.dtype) + 0.5, samples).astype(particles.dtype)
     ordered = order_particles(particles, camera, depths, samples, 1)
     left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
@@ -191,4 +208,8 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
         tiles, bundles = (target, bundles) if counts == "tiles" else (tiles, target)
     index = jnp.arange(samples, dtype=depths.dtype)
     extent = jnp.interp(ordered.z + ordered.reach, depths, index) - jnp.interp(ordered.z - ordered.reach, depths, index)
-    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
+    columns = _ceil(camera.width, BUNDLE)
+    place = (top + bottom) // (2 * BUNDLE) * columns + (left + right) // (2 * BUNDLE)
+    stood = jnp.zeros(2 * tile_rows * columns + 1, bool).at[jnp.where(seen, place, 2 * tile_rows * columns)].set(True)[:-1]
+    median = jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
+    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, stood.sum()

@@ -52,8 +52,8 @@ def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
         smaller = (rank[jnp.minimum(middle, rank.shape[0] - 1)] < wanted) & (low < high)
         return jnp.where(smaller, middle + 1, low), jnp.where(smaller, high, jnp.maximum(middle, low))
 
-    steps = lax.fori_loop(0, rank.shape[0].bit_length(), halve, (low, high))
-    return steps[0]
+    longest = (high - low).max(initial=0)
+    return lax.fori_loop(0, 32 - lax.clz(longest), halve, (low, high))[0]
 
 
 jax.tree_util.register_dataclass(Cells, data_fields=["begin", "length", "count"], meta_fields=[])

@@ -25,6 +25,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.staging import computed_once
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
+RUNS = 8  # sorts that run side by side
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
 
@@ -78,108 +79,145 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
     return row, column
 
 
-def bundle_ranges(
-    ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
-) -> tuple[Array, Array, Array, Array]:
-    """First and last bundle column, first and last bundle row of the band that each particle can touch (first > last: none)."""
-    left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
-    top = jnp.maximum(top - first_row, 0)
-    bottom = jnp.minimum(bottom - first_row, plan.tile_rows * TILE - 1)
-    seen = (right >= left) & (bottom >= top)
-    return left // BUNDLE, jnp.where(seen, right // BUNDLE, -1), top // BUNDLE, jnp.where(seen, bottom // BUNDLE, -1)
-
-
 def build_lists(
     ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
 ) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`."""
     ranges = bundle_ranges(ordered, camera, depths, plan, first_row)
-    rank, tile, start, overflow = _tile_lists(ranges, plan)
+    pairs = _tile_pairs(ranges, plan)
     touch = functools.partial(_touched_children, plan=plan)
-    touched = computed_once(start[-1] >= 0, touch, ordered, camera, first_row, ranges, rank, tile)
-    return _split(plan, touched, rank, tile, start, overflow)
+    touched = computed_once(pairs.start[0, 0] >= 0, touch, ordered, camera, first_row, ranges, pairs)
+    return _split(pairs, touched, plan)
 
 
-def _tile_lists(ranges: tuple[Array, ...], plan: ListPlan) -> tuple[Array, ...]:
-    """Ranks sorted by (tile, rank), the tile of each, where each tile's ranks start, and a fault word."""
-    left, right, top, bottom = (bundle >> 1 for bundle in ranges)
-    columns, rows = jnp.where(right >= 0, right - left + 1, 0), bottom - top + 1
-    count = columns * rows
-    end = jnp.cumsum(count)
-    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], plan.tile_capacity + 1)
-    overflow = faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity)
-    slots = jnp.arange(plan.tile_capacity, dtype=jnp.int32)
-    particle = jnp.repeat(jnp.arange(count.shape[0], dtype=jnp.int32), count, total_repeat_length=plan.tile_capacity)
-    within = slots - (end - count)[particle]
+@dataclasses.dataclass(frozen=True)
+class Ranges:
+    """Which bundles of a band each particle can touch: first, and past the last; none if `left >= right`."""
+
+    left: Int[Array, " particles"]
+    right: Int[Array, " particles"]
+    top: Int[Array, " particles"]
+    bottom: Int[Array, " particles"]
+
+
+def bundle_ranges(
+    ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
+) -> Ranges:
+    """Bundle columns and rows, counted from the band's corner, of the pixels that each particle can touch."""
+    left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
+    top = jnp.maximum(top - first_row, 0)
+    bottom = jnp.minimum(bottom - first_row, plan.tile_rows * TILE - 1)
+    seen = (right >= left) & (bottom >= top)
+    past = [jnp.where(seen, last // BUNDLE + 1, 0) for last in (right, bottom)]
+    return Ranges(left // BUNDLE, past[0], top // BUNDLE, past[1])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pairs:
+    """(Particle, tile) pairs in runs, each sorted by (tile, rank); a run's ranks all precede those of the next run.
+
+    `start[run, tile]` is where a run's pairs of a tile begin; tile `num_tiles` collects unused slots.
+    """
+
+    rank: Int[Array, " pairs"]
+    tile: Int[Array, " pairs"]
+    run: Int[Array, " pairs"]
+    start: Int[Array, "runs tiles_and_one"]
+    faults: Int[Array, ""]
+
+
+def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
+    """Expand particles to the tiles that they can touch."""
+    capacity, num_particles = plan.tile_capacity, ranges.left.shape[0]
+    left, top = ranges.left >> 1, ranges.top >> 1
+    columns = jnp.where(ranges.right > ranges.left, ((ranges.right + 1) >> 1) - left, 0)
+    count = columns * (((ranges.bottom + 1) >> 1) - top)
+    end = lax.associative_scan(jnp.add, count)
+    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], capacity + 1)
+    slots = jnp.arange(capacity, dtype=jnp.int32)
+    begin = jnp.where(count > 0, end - count, capacity)
+    particle = jnp.zeros(capacity, jnp.int32).at[begin].set(jnp.arange(num_particles, dtype=jnp.int32), mode="drop")
+    particle = lax.associative_scan(jnp.maximum, particle)
+    within = slots - begin[particle]
     # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
     row = ((within.astype(jnp.float32) + 0.5) / columns[particle].astype(jnp.float32)).astype(jnp.int32)
-    tile = (top[particle] + row) * plan.tile_columns + left[particle] + within - row * columns[particle]
+    tile = (top * plan.tile_columns + left)[particle] + row * (plan.tile_columns - columns[particle]) + within
     tile = jnp.where(slots < total, tile, plan.num_tiles)
-    return *_sort_pairs(tile, particle, plan.num_tiles, count.shape[0]), overflow
+    overflow = faults.raised(faults.TILE_OVERFLOW, total > capacity)
+    return _sorted_runs(tile, particle, plan, num_particles, overflow)
 
 
-def _sort_pairs(tile: Array, rank: Array, num_tiles: int, num_particles: int) -> tuple[Array, Array, Array]:
-    """Sort by (tile, rank) through one packed key, 32 bits wide where it fits."""
+def _sorted_runs(tile: Array, rank: Array, plan: ListPlan, num_particles: int, overflow: Array) -> _Pairs:
+    """Sort by (tile, rank) through one packed key, in runs that are independent, so that XLA sorts them side by side."""
     bits = max(num_particles - 1, 1).bit_length()
-    wide = bits + num_tiles.bit_length() > 32
+    wide = bits + plan.num_tiles.bit_length() > 32
+    runs = RUNS if plan.tile_capacity % RUNS == 0 else 1
     with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
         kind = jnp.uint64 if wide else jnp.uint32
-        key = lax.sort((tile.astype(kind) << bits) | rank.astype(kind))
+        key = (tile.astype(kind) << bits) | rank.astype(kind)
+        key = jnp.concatenate([lax.sort(part) for part in jnp.split(key, runs)])
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
         tile = (key >> bits).astype(jnp.int32)
-    start = jnp.searchsorted(tile, jnp.arange(num_tiles + 1, dtype=jnp.int32)).astype(jnp.int32)
-    return rank, tile, start
+    wanted = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)
+    starts = jax.vmap(lambda part: jnp.searchsorted(part, wanted))(tile.reshape(runs, -1)).astype(jnp.int32)
+    length = plan.tile_capacity // runs
+    run = jnp.arange(plan.tile_capacity, dtype=jnp.int32) // length
+    return _Pairs(rank, tile, run, starts + jnp.arange(runs, dtype=jnp.int32)[:, None] * length, overflow)
 
 
-def _split(plan: ListPlan, touched: Array, rank: Array, tile: Array, start: Array, overflow: Array) -> BundleLists:
-    """Split each tile's list among its four bundles."""
-    kept = [(touched >> child) & 1 for child in range(4)]
-    before = [jnp.cumsum(flag) - flag for flag in kept]
-    totals = [jnp.append(upto, upto[-1] + flag[-1]) for upto, flag in zip(before, kept, strict=True)]
-    upto_tile = jnp.stack([upto[start] for upto in totals], 1)
-    counts = (upto_tile[1:] - upto_tile[:-1]).reshape(-1)
-    overflow |= faults.raised(faults.LIST_OVERFLOW, counts.astype(jnp.float32).sum() > plan.list_capacity)
-    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(counts)])
-    shift = begins[:-1].reshape(-1, 4) - upto_tile[:-1]
-    out = jnp.zeros(plan.list_capacity, jnp.int32)
-    here = jnp.minimum(tile, plan.num_tiles - 1)
+def _split(pairs: _Pairs, touched: Int[Array, " pairs"], plan: ListPlan) -> BundleLists:
+    """Split each tile's pairs among its four bundles: lists are ordered by tile, bundle, run, rank."""
+    counts, befores = [], []
     for child in range(4):
-        target = jnp.where(kept[child] > 0, before[child] + shift[:, child][here], plan.list_capacity)
-        out = out.at[target].set(rank, mode="drop", unique_indices=True)
-    return BundleLists(out, jnp.minimum(begins, plan.list_capacity), overflow)
+        flag = (touched >> child) & 1
+        upto = lax.associative_scan(jnp.add, flag)
+        at_start = jnp.where(pairs.start > 0, upto[jnp.maximum(pairs.start - 1, 0)], 0)
+        counts.append(at_start[:, 1:] - at_start[:, :-1])
+        befores.append((upto - flag, at_start[:, :-1]))
+    count = jnp.stack(counts, 2)
+    ordered_count = jnp.moveaxis(count, 0, 2).reshape(-1)
+    overflow = pairs.faults | faults.raised(faults.LIST_OVERFLOW, count.astype(jnp.float32).sum() > plan.list_capacity)
+    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(ordered_count)])
+    runs = count.shape[0]
+    run_begins = jnp.moveaxis(begins[:-1].reshape(plan.num_tiles, 4, runs), 2, 0)
+    rank = jnp.zeros(plan.list_capacity, jnp.int32)
+    segment = pairs.run * plan.num_tiles + jnp.minimum(pairs.tile, plan.num_tiles - 1)
+    for child, (before, at_start) in enumerate(befores):
+        shift = (run_begins[:, :, child] - at_start).reshape(-1)
+        target = jnp.where((touched >> child) & 1 > 0, before + shift[segment], plan.list_capacity)
+        rank = rank.at[target].set(pairs.rank, mode="drop", unique_indices=True)
+    return BundleLists(rank, jnp.minimum(begins[::runs], plan.list_capacity), overflow)
 
 
 def _touched_children(
-    ordered: Ordered,
-    camera: Camera,
-    first_row: Any,
-    ranges: tuple[Array, ...],
-    rank: Array,
-    tile: Array,
-    *,
-    plan: ListPlan,
+    ordered: Ordered, camera: Camera, first_row: Any, ranges: Ranges, pairs: _Pairs, *, plan: ListPlan
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
+    rank = pairs.rank
     x, y, z, reach = (column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
-    row, column = (tile // plan.tile_columns) * TILE + first_row, (tile % plan.tile_columns) * TILE
-    sides: dict[str, list[tuple[Array, Array]]] = {"x": [], "y": []}
-    for half in (0, BUNDLE):
-        u = (
-            camera.column(column + half + 0.5).astype(x.dtype),
-            camera.column(column + half + BUNDLE - 0.5).astype(x.dtype),
-        )
-        v = (camera.row(row + half + BUNDLE - 0.5).astype(x.dtype), camera.row(row + half + 0.5).astype(x.dtype))
-        sides["x"].append(side_distances(x, z, *u, camera.is_perspective))
-        sides["y"].append(side_distances(y, z, *v, camera.is_perspective))
+    tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
+    down, across = ((2 * place)[pairs.tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
+    columns: list[tuple[Array, tuple[Array, Array]]] = []
+    rows: list[tuple[Array, tuple[Array, Array]]] = []
+    for half in range(2):
+        near, far = (across + half) * BUNDLE + 0.5, (across + half) * BUNDLE + BUNDLE - 0.5
+        sides = side_distances(x, z, _of(x, camera.column(near)), _of(x, camera.column(far)), camera.is_perspective)
+        columns.append(((ranges.left[rank] <= across + half) & (across + half < ranges.right[rank]), sides))
+        high, low = (down + half) * BUNDLE + 0.5 + first_row, (down + half) * BUNDLE + BUNDLE - 0.5 + first_row
+        sides = side_distances(y, z, _of(x, camera.row(low)), _of(x, camera.row(high)), camera.is_perspective)
+        rows.append(((ranges.top[rank] <= down + half) & (down + half < ranges.bottom[rank]), sides))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
-    left, right, top, bottom = (bound[rank] for bound in ranges)
     mask = jnp.zeros_like(rank)
     for child in range(4):
-        across, down = 2 * (tile % plan.tile_columns) + (child & 1), 2 * (tile // plan.tile_columns) + (child >> 1)
-        inside = (left <= across) & (across <= right) & (top <= down) & (down <= bottom)
-        touched = inside & touches(sides["x"][child & 1], sides["y"][child >> 1], reach, size)
+        (inside_column, x_side), (inside_row, y_side) = columns[child & 1], rows[child >> 1]
+        touched = inside_column & inside_row & touches(x_side, y_side, reach, size)
         mask |= touched.astype(jnp.int32) << child
-    return jnp.where(tile < plan.num_tiles, mask, 0)
+    return jnp.where(pairs.tile < plan.num_tiles, mask, 0)
 
 
-jax.tree_util.register_dataclass(BundleLists, data_fields=["rank", "start", "faults"], meta_fields=[])
+def _of(like: Array, value: Array) -> Array:
+    return value.astype(like.dtype)
+
+
+for _kind in (BundleLists, Ranges, _Pairs):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

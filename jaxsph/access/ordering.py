@@ -11,6 +11,7 @@ particles together would hold nearly everything; a window a class is never more 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -22,6 +23,7 @@ from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.numerics import faults
+from jaxsph.numerics.staging import computed_once
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
 DEAD_CLASS = 255
@@ -33,8 +35,8 @@ class Ordered:
     """Particles in view space, in rank order (class, then depth); those that no sample can meet come last and are not `live`.
 
     `reach` is the support widened by the rounding of coordinates: what lies outside it has weight zero in floating point.
-    For a kernel homogeneous of degree n (poly6: 3) the particle's strength m = V / H^3 is folded into its lengths,
-    `weight = m^(1/n)` and `scale = sqrt(weight) / H`; otherwise `weight = m` and `scale = 1 / H`.
+    The particle's strength m = V / H^3 is folded into its lengths: `size = m^(1/n)` and `scale = size / H`, with n the degree
+    of its kernel.
     """
 
     x: Float[Array, " particles"]
@@ -42,7 +44,7 @@ class Ordered:
     z: Float[Array, " particles"]
     reach: Float[Array, " particles"]
     scale: Float[Array, " particles"]
-    weight: Float[Array, " particles"]
+    size: Float[Array, " particles"]
     quantity: Float[Array, " particles"]
     live: Bool[Array, " particles"]
     first_rank: Int[Array, "classes slabs"]
@@ -51,37 +53,23 @@ class Ordered:
 
 
 def order_particles(
-    particles: Particles, camera: Camera, depths: Float[Array, " samples"], slab_samples: int, num_classes: int
+    particles: Particles, camera: Camera, depths: Float[Array, " samples"], cell_samples: int, num_classes: int
 ) -> Ordered:
-    """Rank `particles` for the sample `depths` (ascending), in slabs of `slab_samples`.
+    """Rank `particles` for the sample `depths` (ascending), in slabs of `cell_samples`.
 
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, and one key more is taken on
     either side.
     """
-    view = camera.to_view(particles.position)
-    x, y, z = view[:, 0], view[:, 1], view[:, 2]
-    finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
-    usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
-    usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
-    bad = faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any())
-    eps = jnp.finfo(view.dtype).eps * ROUNDING
-    offset = jnp.abs(particles.position - camera.eye).max(1)
-    reach = particles.support * (1 + eps) + eps * offset
-    live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
-
-    largest = jnp.where(live, reach, 0).max(initial=0)
-    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
-    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
-    widest = jax.ops.segment_max(jnp.where(live, reach, 0), octave.astype(jnp.int32), num_segments=num_classes)
-
-    key = (octave << DEPTH_BITS) | _depth_key(camera, z)
+    look = functools.partial(_view, num_classes=num_classes)
+    columns, key, widest, bad = computed_once(camera.near < camera.far, look, particles, camera, depths)
     key, order = _sort_by(key)
+    eps = jnp.finfo(widest.dtype).eps * ROUNDING
 
-    slabs = math.ceil(depths.shape[0] / slab_samples)
-    front = depths[::slab_samples]
-    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * slab_samples, depths.shape[0]) - 1]
+    slabs = math.ceil(depths.shape[0] / cell_samples)
+    front = depths[::cell_samples]
+    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * cell_samples, depths.shape[0]) - 1]
     class_key = (jnp.arange(num_classes, dtype=jnp.uint32) << DEPTH_BITS)[:, None]
-    widest = jnp.maximum(widest, 0)[:, None]
+    widest = widest[:, None]
     lowest = _depth_key(camera, front[None] - widest * (1 + eps))
     highest = _depth_key(camera, back[None] + widest * (1 + eps))
     lowest = class_key | jnp.where(lowest > 0, lowest - 1, 0)
@@ -89,10 +77,33 @@ def order_particles(
     first_rank = jnp.searchsorted(key, lowest, side="left").astype(jnp.int32)
     last_rank = jnp.searchsorted(key, highest, side="right").astype(jnp.int32)
 
-    scale, weight = _folded(particles, live)
-    quantity = jnp.where(live, particles.quantity, 0)
-    columns = [jnp.where(live, v, 0) for v in (x, y, z)] + [reach, scale, weight, quantity, live]
-    return Ordered(*(column[order] for column in columns), first_rank, last_rank, bad)
+    ranked = {name: column[order] for name, column in columns.items()}
+    return Ordered(**ranked, first_rank=first_rank, last_rank=last_rank, faults=bad)
+
+
+def _view(
+    particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int
+) -> tuple[dict[str, Array], Array, Array, Array]:
+    """Columns of `Ordered` in the order of `particles`, sort keys, the largest reach of each class, and a fault word."""
+    view = camera.to_view(particles.position)
+    x, y, z = view[:, 0], view[:, 1], view[:, 2]
+    finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
+    usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
+    usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
+    eps = jnp.finfo(view.dtype).eps * ROUNDING
+    reach = particles.support * (1 + eps) + eps * jnp.abs(particles.position - camera.eye).max(1)
+    live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
+
+    largest = jnp.where(live, reach, 0).max(initial=0)
+    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
+    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
+    widest = [jnp.where(live & (octave == k), reach, 0).max(initial=0) for k in range(num_classes)]
+
+    scale, size = _folded(particles, live)
+    columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size, "quantity": particles.quantity}
+    columns = {name: jnp.where(live, column, 0) for name, column in columns.items()}
+    bad = faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any())
+    return {**columns, "reach": reach, "live": live}, (octave << DEPTH_BITS) | _depth_key(camera, z), jnp.stack(widest), bad
 
 
 def _depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
@@ -115,7 +126,7 @@ def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
 
 
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array]:
-    """`scale` and `weight` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1."""
+    """`scale` and `size` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1."""
     support = jnp.where(live, particles.support, 1)
     inverse = 1 / support
     smallest = jnp.where(live, particles.support, jnp.inf).min(initial=jnp.inf)
@@ -123,11 +134,9 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     strength = jnp.where(live, particles.volume, 0) * relative * relative * relative
     peak = strength.max(initial=0)
     strength = strength / jnp.where(peak > 0, peak, 1)
-    degree = kernels.by_name(particles.kernel).homogeneous
-    if degree is None:
-        return inverse, strength
-    weight = strength ** (1 / degree) if degree != 3 else jnp.cbrt(strength)
-    return inverse * jnp.sqrt(weight), weight
+    degree = kernels.by_name(particles.kernel).degree
+    size = jnp.where(strength > 0, jnp.where(strength > 0, strength, 1) ** (1 / degree), 0)
+    return inverse * size, size
 
 
 jax.tree_util.register_dataclass(

@@ -2,8 +2,9 @@ r"""SPH smoothing kernels, by name, with **support** radius $H$: $W(r, H) = 0$ f
 
 Flow: [kernels] -> particles, cast, reference.
 
-Each kernel is $W(r, H) = \sigma H^{-3} w(t)$ with the *margin* $t = 1 - (r/H)^2$: the squared distance is what a marcher has
-at hand, poly6 needs no root, and near the edge of the support $t$ is exact where $1 - r/H$ would cancel.
+Each kernel is $W(r, H) = \sigma H^{-3} w(q, 1)$ with $q = r / H$ and a polynomial $w(q, c)$ that is homogeneous of degree n:
+$w(cq, c) = c^n w(q, 1)$. So a marcher folds a particle's strength m into its lengths, with $c = m^{1/n}$, and no weight is
+multiplied in the inner loop. Squared distances come in two parts, one of which is prepared outside of it.
 """
 
 from __future__ import annotations
@@ -16,29 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SMALLEST_SQUARE = 1e-30  # (r/H)^2 below this is the particle itself: far under eps of any kernel value, well above underflow
-
-
-def _poly6(t: Any, xp: Any) -> Any:
-    t = xp.maximum(t, 0)
-    return t * t * t
-
-
-def _distance(t: Any, xp: Any) -> Any:
-    """Q = r / H from the margin; the floor keeps the root's derivative finite at the particle."""
-    return xp.sqrt(xp.maximum(1 - xp.maximum(t, 0), SMALLEST_SQUARE))
-
-
-def _cubic_spline(t: Any, xp: Any) -> Any:
-    q = _distance(t, xp)
-    outer, inner = 1 - q, xp.maximum(0.5 - q, 0)
-    return 2 * outer * outer * outer - 8 * inner * inner * inner
-
-
-def _wendland_c2(t: Any, xp: Any) -> Any:
-    q = _distance(t, xp)
-    outer = (1 - q) * (1 - q)
-    return outer * outer * (1 + 4 * q)
+SMALLEST_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,22 +27,58 @@ class Kernel:
     Attributes:
         name: what users call it.
         norm: $\sigma$, so that $\int W dx = 1$.
-        shape: `shape(t, xp)` gives $w(t)$, 0 for $t \le 0$; `xp` is `numpy` or `jax.numpy`.
-        homogeneous: the degree $n$ if $w(c t) = c^n w(t)$, else `None`: lets a marcher fold a weight into `t`.
+        degree: n, with $w(c q, c) = c^n w(q, 1)$.
+        prepare: `prepare(part, size)`: what the inner loop needs of the first part of $(c q)^2$ and of c.
+        weigh: `weigh(prepared, rest, size, xp)`: $w(c q, c)$ for $(c q)^2$ = part + rest, and 0 outside the support; `xp` is
+            `numpy` or `jax.numpy`.
         source: where the formula is from.
     """
 
     name: str
     norm: float
-    shape: Callable[[Any, Any], Any]
-    homogeneous: int | None
+    degree: int
+    prepare: Callable[[Any, Any], Any]
+    weigh: Callable[[Any, Any, Any, Any], Any]
     source: str
+
+    def of_square(self, square: Any, xp: Any) -> Any:
+        """The unnormalised kernel $w(q, 1)$ of $q^2$."""
+        return self.weigh(self.prepare(square, 1.0), 0.0, 1.0, xp)
+
+
+def _poly6(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
+    t = xp.maximum(margin - rest, 0)
+    return t * t * t
+
+
+def _cubic_spline(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
+    return 2 * outer * outer * outer - 8 * inner * inner * inner
+
+
+def _wendland_c2(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    outer = xp.maximum(size - r, 0)
+    square = outer * outer
+    return square * square * (size + 4 * r)
+
+
+def _margin(part: Any, size: Any) -> Any:
+    return size * size - part
+
+
+def _under_root(part: Any, size: Any) -> Any:
+    return part + SMALLEST_SQUARE * (size * size)
 
 
 KERNELS = {
-    "poly6": Kernel("poly6", 315 / (64 * math.pi), _poly6, 3, "Mueller, Charypar & Gross 2003, equation 20"),
-    "cubic_spline": Kernel("cubic_spline", 8 / math.pi, _cubic_spline, None, "Monaghan & Lattanzio 1985, with H = 2h"),
-    "wendland_c2": Kernel("wendland_c2", 21 / (2 * math.pi), _wendland_c2, None, "Dehnen & Aly 2012, MNRAS 425, table 1"),
+    kernel.name: kernel
+    for kernel in (
+        Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, "Mueller, Charypar & Gross 2003, equation 20"),
+        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic_spline, "Monaghan & Lattanzio 1985, with H = 2h"),
+        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland_c2, "Dehnen & Aly 2012, MNRAS 425, table 1"),
+    )
 }
 
 
@@ -97,4 +112,4 @@ def evaluate(name: str, r: Float[Array, "..."], support: Float[Array, "..."]) ->
     kernel = by_name(name)
     r, support = jnp.asarray(r), jnp.asarray(support)
     q = r / support
-    return kernel.norm / support**3 * kernel.shape((1 - q) * (1 + q), jnp)
+    return kernel.norm / support**3 * kernel.of_square(q * q, jnp)

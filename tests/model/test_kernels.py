@@ -39,19 +39,20 @@ def test_float32_is_within_sixteen_eps_of_the_peak(name, q):
 
 
 @names
-@given(t=st.floats(-3, 1))
-def test_shape_is_the_same_function_in_numpy_and_jax(name, t):
+@given(square=st.floats(0, 4))
+def test_is_the_same_function_in_numpy_and_jax(name, square):
     with jax.enable_x64(True):
-        shape = kernels.by_name(name).shape
-        assert abs(float(shape(jnp.asarray(t, jnp.float64), jnp)) - shape(np.float64(t), np)) <= 1e-15
+        kernel = kernels.by_name(name)
+        got = float(kernel.of_square(jnp.asarray(square, jnp.float64), jnp))
+        assert abs(got - kernel.of_square(np.float64(square), np)) <= 1e-15
 
 
 @names
-@given(t=st.floats(-1, 1), c=st.floats(0, 8))
-def test_a_homogeneous_kernel_scales_as_it_claims(name, t, c):
+@given(part=st.floats(0, 1), rest=st.floats(0, 1), size=st.floats(1e-3, 1))
+def test_a_strength_can_be_folded_into_the_lengths(name, part, rest, size):
     kernel = kernels.by_name(name)
-    if kernel.homogeneous is not None:
-        assert kernel.shape(c * t, np) == pytest.approx(c**kernel.homogeneous * kernel.shape(t, np), rel=1e-12, abs=1e-300)
+    folded = kernel.weigh(kernel.prepare(part * size**2, size), rest * size**2, size, np)
+    assert folded == pytest.approx(size**kernel.degree * kernel.of_square(part + rest, np), rel=1e-9, abs=1e-15 * size**kernel.degree)
 
 
 @names
