@@ -118,7 +118,10 @@ def ratios(records: list[dict]) -> dict[str, dict[str, float]]:
     table: dict[str, dict[str, float]] = {}
     for load in dict.fromkeys(record["workload"] for record in records):
         total = {record["contender"]: record["total"] for record in records if record["workload"] == load}
-        best = {k: min(t for name, t in total.items() if name.startswith("numba") and name.endswith(k)) for k in ("cubic_spline", "poly6")}
+        best = {
+            k: min(t for name, t in total.items() if name.startswith("numba") and name.endswith(k))
+            for k in ("cubic_spline", "poly6")
+        }
         table[load] = {
             "poly6 / peer with cubic spline": total["jaxsph poly6"] / best["cubic_spline"],
             "poly6 / peer with poly6": total["jaxsph poly6"] / best["poly6"],

@@ -30,7 +30,6 @@ from jaxsph.numerics.checks import is_traced
 STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
 MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 LARGEST_CAPACITY = 1 << 30
-WORTH_SPLITTING = 1 << 19  # (particle, tile) pairs from which building lists side by side pays
 CELL_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 CHUNKS_A_LAYER = 12
@@ -46,8 +45,7 @@ class Plan:
         samples: fine samples a ray.
         num_particles: entries of the particle arrays, padding included.
         num_classes: classes of support.
-        bands: horizontal bands that are cast one after the other, a multiple of `abreast`.
-        abreast: bands whose lists are built in one program, side by side on the cores.
+        bands: horizontal bands that are rendered one after the other.
         lists: sizes of the lists of one band.
         cast: sizes of the march.
         bytes: estimate of the working memory, in bytes.
@@ -59,7 +57,6 @@ class Plan:
     num_particles: int
     num_classes: int
     bands: int
-    abreast: int
     lists: ListPlan
     cast: CastPlan
     bytes: int
@@ -100,19 +97,15 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell
     tiles, bundles, depth_extent, covered = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
     num_classes = _num_classes(particles)
     cell_samples = cell_samples or _choose_cell_samples(float(depth_extent))
-    abreast = 2 if tiles.sum() >= WORTH_SPLITTING and tile_rows > 1 else 1
-    bands = abreast
+    bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
         cast = CastPlan(_choose_chunk(int(covered), rows * columns, cell_samples), cell_samples)
-        made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast, abreast)
+        made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
-        if fits or (rows == 1 and abreast == 1):
+        if fits or rows == 1:
             break
-        if rows > 1:
-            bands *= 2
-        else:
-            bands, abreast = tile_rows, 1
+        bands = min(2 * bands, tile_rows)
     if not fits:
         raise ValueError(
             f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs about {made.bytes} "
@@ -129,25 +122,24 @@ def _for_bands(
     pairs_a_row: tuple[np.ndarray, np.ndarray],
     num_classes: int,
     cast: CastPlan,
-    abreast: int,
 ) -> Plan:
     rows = tiles_a_band[0]
-    bands = _ceil(_ceil(len(pairs_a_row[0]), rows), abreast) * abreast
+    bands = _ceil(len(pairs_a_row[0]), rows)
     fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in pairs_a_row]
     lists = ListPlan(*tiles_a_band, *(round_up(max(count, 1)) for count in fullest))
     slabs = _ceil(settings.samples, cast.cell_samples)
     number = np.dtype(particles.dtype).itemsize
     memory = (
         particles.capacity * (24 * number + 32)
-        + abreast * lists.tile_capacity * (12 * number + 48)
-        + abreast * lists.list_capacity * 8
-        + abreast * num_classes * slabs * lists.num_bundles * 40
+        + lists.tile_capacity * (12 * number + 48)
+        + lists.list_capacity * 8
+        + num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
         + cast.chunk * cast.cell_samples * BUNDLE * BUNDLE * number * 16
         + camera.width * camera.height * 8 * number
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
-    return Plan(*size, num_classes, bands, abreast, lists, cast, int(memory))
+    return Plan(*size, num_classes, bands, lists, cast, int(memory))
 
 
 def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:

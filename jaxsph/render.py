@@ -88,17 +88,17 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     ordered = clock.run("grid", _order, (scene.particles, camera), plan=plan)
     bands, words = [], [_input_faults(scene, camera) | ordered.faults]
     cells_found = pairs = 0
-    for group in range(0, plan.bands, plan.abreast):
-        first_row = jnp.int32(group * plan.band_height)
-        for k, (lists, cells) in enumerate(clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)):
-            seen = (ordered, lists, cells, camera, scene.transfer, first_row + k * plan.band_height)
-            rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
-            words.append(lists.faults)
-            cells_found += int((cells.count > 0).sum())
-            pairs += int(lists.start[-1])
-            bands.append(_unbundle(rays, plan))
-            if progress is not None:
-                progress(group + k + 1, plan.bands)
+    for band in range(plan.bands):
+        first_row = jnp.int32(band * plan.band_height)
+        lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
+        seen = (ordered, lists, cells, camera, scene.transfer, first_row)
+        rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
+        words.append(lists.faults)
+        cells_found += int((cells.count > 0).sum())
+        pairs += int(lists.start[-1])
+        bands.append(_unbundle(rays, plan))
+        if progress is not None:
+            progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
     _raise(word, planned)
     image = _assemble(_stack(bands), camera, plan, jnp.int32(word))
@@ -127,20 +127,14 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
 def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
     ordered = _order(scene.particles, camera, plan=plan)
 
-    def one_group(group: Int[Array, ""]) -> Any:
-        first_row = group * (plan.abreast * plan.band_height)
-        results = []
-        for k, (lists, cells) in enumerate(_grid(ordered, camera, first_row, plan=plan)):
-            seen = (ordered, lists, cells, camera, scene.transfer, first_row + k * plan.band_height)
-            rays = _cast(*seen, plan=plan, kernel=scene.particles.kernel)
-            results.append((_unbundle(rays, plan), lists.faults, (cells.count > 0).sum(), lists.start[-1]))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+    def one_band(band: Int[Array, ""]) -> Any:
+        first_row = band * plan.band_height
+        lists, cells = _grid(ordered, camera, first_row, plan=plan)
+        rays = _cast(ordered, lists, cells, camera, scene.transfer, first_row, plan=plan, kernel=scene.particles.kernel)
+        return _unbundle(rays, plan), lists.faults, (cells.count > 0).sum(), lists.start[-1]
 
-    groups = plan.bands // plan.abreast
-    if groups > 1:
-        results = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), lax.map(one_group, jnp.arange(groups, dtype=jnp.int32)))
-    else:
-        results = one_group(jnp.int32(0))
+    bands = jnp.arange(plan.bands, dtype=jnp.int32)
+    results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, cells_found, pairs = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
     word |= _input_faults(scene, camera) | ordered.faults
@@ -157,12 +151,9 @@ def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> list[tuple[BundleLists, Cells]]:
-    """Lists and cells of the `plan.abreast` bands that begin at pixel row `first_row`."""
-    depths = _depths(camera, ordered.x, plan)[0]
-    rows = [first_row + k * plan.band_height for k in range(plan.abreast)]
-    lists = [build_lists(ordered, camera, depths, plan.lists, row) for row in rows]
-    return [(each, find_cells(ordered, each)) for each in lists]
+def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> tuple[BundleLists, Cells]:
+    lists = build_lists(ordered, camera, _depths(camera, ordered.x, plan)[0], plan.lists, first_row)
+    return lists, find_cells(ordered, lists)
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))

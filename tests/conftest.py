@@ -30,10 +30,10 @@ class Frames:
     samples: int = SAMPLES
     capacity: int = CAPACITY
 
-    def plan(self, slab_samples: int = 4, num_classes: int = 3) -> js.Plan:
+    def plan(self, cell_samples: int = 4, num_classes: int = 3) -> js.Plan:
         lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
-        cast = CastPlan(16, slab_samples, 16 // slab_samples)
-        return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, 1, lists, cast, 0)
+        cast = CastPlan(16, cell_samples)
+        return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
 
     @property
     def settings(self) -> js.Settings:

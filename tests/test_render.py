@@ -126,8 +126,6 @@ def test_bands_give_the_same_image_bit_for_bit(frames):
     for rows in (1, 2, 3):
         lists = dataclasses.replace(whole.lists, tile_rows=rows)
         banded = dataclasses.replace(whole, bands=-(-5 // rows), lists=lists)
-        if rows == 3:
-            banded = dataclasses.replace(banded, abreast=2)
         calls = []
         image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))  # noqa: B023
         assert calls[-1] == (banded.bands, banded.bands)

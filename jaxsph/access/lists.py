@@ -25,7 +25,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.staging import computed_once
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
-RUNS = 8  # sorts that run side by side
+RUNS = 16  # sorts that run side by side
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
 

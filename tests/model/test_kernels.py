@@ -52,7 +52,9 @@ def test_is_the_same_function_in_numpy_and_jax(name, square):
 def test_a_strength_can_be_folded_into_the_lengths(name, part, rest, size):
     kernel = kernels.by_name(name)
     folded = kernel.weigh(kernel.prepare(part * size**2, size), rest * size**2, size, np)
-    assert folded == pytest.approx(size**kernel.degree * kernel.of_square(part + rest, np), rel=1e-9, abs=1e-15 * size**kernel.degree)
+    assert folded == pytest.approx(
+        size**kernel.degree * kernel.of_square(part + rest, np), rel=1e-9, abs=1e-15 * size**kernel.degree
+    )
 
 
 @names
