@@ -31,6 +31,7 @@ import workloads
 import jaxsph as js
 
 LIMITS = {"cube 97336": 1.5, "cube 1000000": 1.5, "dam break": 0.8}
+PAUSE = 0.5  # seconds between turns: OpenMP threads spin for some 0.2 s after a march, on the next contender's cores
 RESULTS = pathlib.Path(__file__).parent / "results" / "peers.json"
 
 
@@ -82,6 +83,7 @@ def measure(load: workloads.Workload, kernels: list[str], repeats: int) -> list[
     images = {}
     for _ in range(repeats):
         for name, frame in contenders.items():
+            time.sleep(PAUSE)
             grid, cast, images[name] = frame()
             times[name].append((grid, cast))
     records = []

@@ -30,7 +30,8 @@ from jaxsph.numerics.checks import is_traced
 STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
 MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 LARGEST_CAPACITY = 1 << 30
-CELL_SAMPLES = (4, 8, 16)
+CELL_SAMPLES = 16  # D_z of the first paper
+SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 CHUNKS_A_LAYER = 12
 SMALLEST_CHUNK = 64
@@ -79,12 +80,13 @@ class Plan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
 
 
-def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell_samples: int | None = None) -> Plan:
+def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
     Args:
         scene, camera, settings: as for `jaxsph.render`.
-        cell_samples: samples of a cell along depth; by default chosen from how deep a support is in samples.
+        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
+            support is in samples.
 
     Raises:
         ValueError: under a trace, or when even a band of one row of tiles exceeds `settings.memory_limit`.
@@ -96,11 +98,12 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
     tiles, bundles, depth_extent, covered = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
     num_classes = _num_classes(particles)
-    cell_samples = cell_samples or _choose_cell_samples(float(depth_extent))
+    slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
     bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
-        cast = CastPlan(_choose_chunk(int(covered), rows * columns, cell_samples), cell_samples)
+        chunk = _choose_chunk(int(covered), rows * columns, slab_samples)
+        cast = CastPlan(chunk, slab_samples, CELL_SAMPLES // slab_samples)
         made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
         if fits or rows == 1:
@@ -108,8 +111,8 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, cell
         bands = min(2 * bands, tile_rows)
     if not fits:
         raise ValueError(
-            f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs about {made.bytes} "
-            f"bytes; raise the limit, or lower the image width, the samples or the number of particles"
+            f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs "
+            f"about {made.bytes} bytes; raise the limit, or lower the image width, the samples or the number of particles"
         )
     return made
 
@@ -127,7 +130,7 @@ def _for_bands(
     bands = _ceil(len(pairs_a_row[0]), rows)
     fullest = [int(_by_band(counts, rows, bands).max(initial=0)) for counts in pairs_a_row]
     lists = ListPlan(*tiles_a_band, *(round_up(max(count, 1)) for count in fullest))
-    slabs = _ceil(settings.samples, cast.cell_samples)
+    slabs = _ceil(settings.samples, cast.slab_samples)
     number = np.dtype(particles.dtype).itemsize
     memory = (
         particles.capacity * (24 * number + 32)
@@ -135,7 +138,7 @@ def _for_bands(
         + lists.list_capacity * 8
         + num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
-        + cast.chunk * cast.cell_samples * BUNDLE * BUNDLE * number * 16
+        + cast.chunk * cast.slab_samples * BUNDLE * BUNDLE * number * 16
         + camera.width * camera.height * 8 * number
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
@@ -165,17 +168,17 @@ def _num_classes(particles: Particles) -> int:
     return min(1 + math.ceil(max(octaves - 0.01, 0)), MOST_CLASSES)
 
 
-def _choose_cell_samples(depth_extent: float) -> int:
-    """Deeper cells for deeper supports: a window is the cell's depth plus a support's diameter."""
-    for cell_samples in CELL_SAMPLES:
-        if depth_extent <= 6 * cell_samples:
-            return cell_samples
-    return CELL_SAMPLES[-1]
+def _choose_slab_samples(depth_extent: float) -> int:
+    """Deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter."""
+    for slab_samples in SLAB_SAMPLES:
+        if depth_extent <= 6 * slab_samples:
+            return slab_samples
+    return SLAB_SAMPLES[-1]
 
 
-def _choose_chunk(covered: int, tiles: int, cell_samples: int) -> int:
+def _choose_chunk(covered: int, tiles: int, slab_samples: int) -> int:
     """As many bundles as fill the caches, but few enough that a layer of the covered bundles makes some eight chunks."""
-    wanted = min(SAMPLES_AT_ONCE // cell_samples, max(covered // CHUNKS_A_LAYER, SMALLEST_CHUNK), 4 * tiles)
+    wanted = min(SAMPLES_AT_ONCE // slab_samples, max(covered // CHUNKS_A_LAYER, SMALLEST_CHUNK), 4 * tiles)
     return 1 << (wanted - 1).bit_length()
 
 
@@ -200,8 +203,9 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
         tiles, bundles = (target, bundles) if counts == "tiles" else (tiles, target)
     index = jnp.arange(samples, dtype=depths.dtype)
     extent = jnp.interp(ordered.z + ordered.reach, depths, index) - jnp.interp(ordered.z - ordered.reach, depths, index)
-    columns = _ceil(camera.width, BUNDLE)
-    place = (top + bottom) // (2 * BUNDLE) * columns + (left + right) // (2 * BUNDLE)
-    stood = jnp.zeros(2 * tile_rows * columns + 1, bool).at[jnp.where(seen, place, 2 * tile_rows * columns)].set(True)[:-1]
+    across = _ceil(camera.width, BUNDLE)
+    everywhere = 2 * tile_rows * across
+    place = (top + bottom) // (2 * BUNDLE) * across + (left + right) // (2 * BUNDLE)
+    stood = jnp.zeros(everywhere + 1, bool).at[jnp.where(seen, place, everywhere)].set(True)[:-1]
     median = jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
     return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, stood.sum()

@@ -44,9 +44,10 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     color, transmittance, depth = _composite(quantity, inside, edges, _ray_lengths(camera), scene.transfer)
     per_pixel = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
-    stats = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
-    stats["seconds"] = {"cast": time.perf_counter() - started}
-    return Image(color, transmittance, depth, np.zeros_like(transmittance), per_pixel, True, 0, stats)
+    counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
+    stats = {**counts, "seconds": {"cast": time.perf_counter() - started}}
+    layers: tuple[Any, ...] = (color, transmittance, depth, np.zeros_like(transmittance), per_pixel)
+    return Image(*layers, True, 0, stats)
 
 
 def sample_depths(camera: Camera, samples: int) -> np.ndarray:

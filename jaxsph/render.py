@@ -147,7 +147,7 @@ def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
-    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.cell_samples, plan.num_classes)
+    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.slab_samples, plan.num_classes)
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -177,7 +177,8 @@ def _cast(
 def _depths(camera: Camera, like: Any, plan: Plan) -> tuple[Array, Array]:
     """Depths of the samples and of the borders between them."""
     count = jnp.arange(plan.samples + 1, dtype=like.dtype)
-    return tuple(camera.depth(u, plan.samples).astype(like.dtype) for u in (count[:-1] + 0.5, count))
+    middles, edges = (camera.depth(u, plan.samples).astype(like.dtype) for u in (count[:-1] + 0.5, count))
+    return middles, edges
 
 
 def _unbundle(rays: Rays, plan: Plan) -> tuple[Array, ...]:

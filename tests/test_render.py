@@ -17,7 +17,7 @@ kernel_names = ["poly6", "cubic_spline", "wendland_c2"]
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 @pytest.mark.parametrize("kernel", kernel_names)
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 1.0, 4.0]), distance=st.sampled_from([3.0, 0.5]))
 def test_float32_agrees_with_the_reference_to_1e_4_on_999_of_1000_pixels(
     frames, compare, kernel, projection, seed, decades, distance
@@ -46,7 +46,7 @@ def edge_flips(scene, camera, samples):
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 @pytest.mark.parametrize("kernel", kernel_names)
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 4.0]))
 def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, projection, seed, decades):
     with jax.enable_x64(True):
@@ -191,9 +191,11 @@ def test_a_plan_for_other_shapes_is_refused(frames, change):
 def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, part, field, value, message):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng), frames.camera(rng)
-    spoil = lambda owner: dataclasses.replace(
-        owner, **{field: getattr(owner, field).at[(0,) * getattr(owner, field).ndim].set(value)}
-    )
+
+    def spoil(owner):
+        whole = getattr(owner, field)
+        return dataclasses.replace(owner, **{field: whole.at[(0,) * whole.ndim].set(value)})
+
     if part == "camera":
         camera = spoil(camera)
     else:

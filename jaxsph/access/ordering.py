@@ -53,9 +53,9 @@ class Ordered:
 
 
 def order_particles(
-    particles: Particles, camera: Camera, depths: Float[Array, " samples"], cell_samples: int, num_classes: int
+    particles: Particles, camera: Camera, depths: Float[Array, " samples"], slab_samples: int, num_classes: int
 ) -> Ordered:
-    """Rank `particles` for the sample `depths` (ascending), in slabs of `cell_samples`.
+    """Rank `particles` for the sample `depths` (ascending), in slabs of `slab_samples`.
 
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, and one key more is taken on
     either side.
@@ -65,9 +65,9 @@ def order_particles(
     key, order = _sort_by(key)
     eps = jnp.finfo(widest.dtype).eps * ROUNDING
 
-    slabs = math.ceil(depths.shape[0] / cell_samples)
-    front = depths[::cell_samples]
-    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * cell_samples, depths.shape[0]) - 1]
+    slabs = math.ceil(depths.shape[0] / slab_samples)
+    front = depths[::slab_samples]
+    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * slab_samples, depths.shape[0]) - 1]
     class_key = (jnp.arange(num_classes, dtype=jnp.uint32) << DEPTH_BITS)[:, None]
     widest = widest[:, None]
     lowest = _depth_key(camera, front[None] - widest * (1 + eps))

@@ -4,9 +4,9 @@ Flow: cells -> [points] -> image.
 
 Every bundle's filled cells are stacked front to back without gaps, and marched layer by layer of that stack: first every
 bundle's first filled cell, then its second. In a layer, bundles are ordered by the number of particles of their cell and taken
-`chunk` at a time, so that a chunk's trip count is nearly its mean and empty space costs nothing; blocks of `BLOCK` particles
-are added to all samples of the chunk's cells at once. Shapes, once: accumulators are (chunk, samples of a cell, 8 rows,
-8 columns).
+`chunk` at a time, so that a chunk's trip counts are nearly their mean and empty space costs nothing. A cell is marched slab by
+slab, and blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are (chunk, samples
+of a slab, 8 rows, 8 columns).
 
 The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$
 (perspective) or 1 (orthographic), so the squared distance in supports is $A_{kc} + D_{kr}$ with $A_{kc} = ((a_k u_c - X) / H)^2$
@@ -37,15 +37,27 @@ BLOCK = 16  # particles unrolled in the inner loop
 
 @dataclasses.dataclass(frozen=True)
 class CastPlan:
-    """Static sizes of the march: bundles marched together, and samples of a cell along depth (D_z in the first paper)."""
+    """Static sizes of the march.
+
+    Attributes:
+        chunk: bundles marched together.
+        slab_samples: samples that share a window of particles.
+        slabs_per_cell: slabs marched in a row, for which the state of the rays is fetched and stored once.
+    """
 
     chunk: int
-    cell_samples: int
+    slab_samples: int
+    slabs_per_cell: int
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             if getattr(self, field.name) < 1:
                 raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+
+    @property
+    def cell_samples(self) -> int:
+        """Samples of a cell along depth (D_z in the first paper)."""
+        return self.slab_samples * self.slabs_per_cell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +92,12 @@ def cast_points(
     """
     slabs, num_bundles = cells.count.shape
     dtype = ordered.x.dtype
-    slab_of, order, num_chunks = _schedule(cells.count, plan.chunk)
-    padding = slabs * plan.cell_samples - depths.shape[0]
-    in_cell = jnp.minimum(plan.cell_samples, depths.shape[0] - jnp.arange(slabs) * plan.cell_samples)
-    evaluations = (cells.count.astype(jnp.float32) * in_cell[:, None].astype(jnp.float32)).sum(0)
+    in_slab = jnp.minimum(plan.slab_samples, depths.shape[0] - jnp.arange(slabs) * plan.slab_samples)
+    evaluations = (cells.count.astype(jnp.float32) * in_slab[:, None].astype(jnp.float32)).sum(0)
+    missing = -slabs % plan.slabs_per_cell
+    count = jnp.pad(cells.count, ((0, missing), (0, 0))).reshape(-1, plan.slabs_per_cell, num_bundles).sum(1)
+    cell_of, order, num_chunks = _schedule(count, plan.chunk)
+    padding = (slabs + missing) * plan.slab_samples - depths.shape[0]
     depths = jnp.pad(depths, (0, padding), mode="edge")
     edges = jnp.pad(edges, (0, padding), mode="edge")  # samples past the end have length zero
     segments = transfer.segments()
@@ -93,22 +107,26 @@ def cast_points(
         jnp.full((num_bundles + 1, BUNDLE, BUNDLE), jnp.inf, dtype),
     )
     row, column = (jnp.append(origin, 0) for origin in origins)
-    begin, length = (jnp.pad(window, ((0, 0), (0, 0), (0, 1))) for window in (cells.begin, cells.length))
+    begin, length = (jnp.pad(window, ((0, 0), (0, missing), (0, 1))) for window in (cells.begin, cells.length))
 
     def march_layer(layer: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         def march_chunk(chunk: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
             bundle = lax.dynamic_slice(order, (layer, chunk * plan.chunk), (1, plan.chunk))[0]
-            slab = slab_of[layer, bundle]
             pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
             u = camera.column((column[bundle][:, None] + pixel).astype(dtype) + 0.5)
             v = camera.row((row[bundle][:, None] + pixel).astype(dtype) + 0.5)
-            sample = (slab * plan.cell_samples)[:, None] + jnp.arange(plan.cell_samples + 1, dtype=jnp.int32)
-            s, border = depths[sample[:, :-1]], edges[sample]
-            window = begin[:, slab, bundle], length[:, slab, bundle]
-            sums = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
-            shade = functools.partial(_shade, perspective=camera.is_perspective)
-            shaded = computed_once(chunk >= 0, shade, *sums, (u, v, border), segments)
-            rays = _composite([field[bundle] for field in state], shaded, border)
+
+            def march_slab(k: Array, rays: list[Array]) -> list[Array]:
+                slab = cell_of[layer, bundle] * plan.slabs_per_cell + k
+                sample = (slab * plan.slab_samples)[:, None] + jnp.arange(plan.slab_samples + 1, dtype=jnp.int32)
+                s, border = depths[sample[:, :-1]], edges[sample]
+                window = begin[:, slab, bundle], length[:, slab, bundle]
+                sums = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
+                shade = functools.partial(_shade, perspective=camera.is_perspective)
+                shaded = computed_once(k >= 0, shade, *sums, (u, v, border), segments)
+                return _composite(rays, shaded, border)
+
+            rays = lax.fori_loop(0, plan.slabs_per_cell, march_slab, [field[bundle] for field in state])
             return tuple(field.at[bundle].set(new) for field, new in zip(state, rays, strict=True))
 
         return lax.fori_loop(0, num_chunks[layer], march_chunk, state)
@@ -118,19 +136,19 @@ def cast_points(
     return Rays(jnp.stack(color), transmittance, depth, evaluations)
 
 
-def _schedule(count: Int[Array, "slabs bundles"], chunk: int) -> tuple[Array, Array, Array]:
+def _schedule(count: Int[Array, "cells bundles"], chunk: int) -> tuple[Array, Array, Array]:
     """Which cells are marched when.
 
     Returns:
-        The slab of each bundle's filled cells, front to back, (layers, bundles + 1); for each layer the bundles that have one,
-        fullest first, padded to whole chunks with the dummy bundle; and each layer's number of chunks.
+        The place along depth of each bundle's filled cells, front to back, (layers, bundles + 1); for each layer the bundles
+        that have one, fullest first, padded to whole chunks with the dummy bundle; and each layer's number of chunks.
     """
-    slabs, bundles = count.shape
+    depth, bundles = count.shape
     filled = count > 0
-    layer = jnp.where(filled, jnp.cumsum(filled, 0) - 1, slabs)
+    layer = jnp.where(filled, jnp.cumsum(filled, 0) - 1, depth)
     every = jnp.broadcast_to(jnp.arange(bundles), count.shape)
-    slab_of = jnp.zeros((slabs, bundles + 1), jnp.int32)
-    slab_of = slab_of.at[layer, every].set(jnp.arange(slabs, dtype=jnp.int32)[:, None], mode="drop")
+    cell_of = jnp.zeros((depth, bundles + 1), jnp.int32)
+    cell_of = cell_of.at[layer, every].set(jnp.arange(depth, dtype=jnp.int32)[:, None], mode="drop")
     stacked = jnp.zeros_like(count).at[layer, every].set(count, mode="drop")
     bits = (bundles + 1).bit_length()
     key = (jnp.minimum(stacked, (1 << (32 - bits)) - 1).astype(jnp.uint32) << bits) | every.astype(jnp.uint32)
@@ -139,7 +157,7 @@ def _schedule(count: Int[Array, "slabs bundles"], chunk: int) -> tuple[Array, Ar
     active = (stacked > 0).sum(1)
     order = jnp.where(jnp.arange(bundles) < active[:, None], order, bundles)
     order = jnp.pad(order, ((0, 0), (0, -bundles % chunk)), constant_values=bundles)
-    return slab_of, order, (active + chunk - 1) // chunk
+    return cell_of, order, (active + chunk - 1) // chunk
 
 
 def _gather_field(

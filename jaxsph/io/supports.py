@@ -113,7 +113,7 @@ def kernel_sum(
         distance, neighbour = tree.query(position[rows], k=most, distance_upper_bound=farthest, workers=-1)
         q = distance / support[rows, None]
         q[~np.isfinite(q)] = 1.0
-        shape = chosen.shape((1 - q) * (1 + q), np)
+        shape = chosen.of_square(q * q, np)
         total[rows] = (shape * padded_weight[neighbour]).sum(axis=1)
     return chosen.norm * total / support**3
 

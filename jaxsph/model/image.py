@@ -27,7 +27,8 @@ class Image:
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound.
         faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
-        stats: `evaluations`, `evaluations_full`, `cells`, `pairs` and, from an eager render, `seconds`.
+        stats: `evaluations`, `evaluations_full`, `cells` (slabs of bundles that a particle can touch), `pairs` (particles of
+            all bundle lists) and, from an eager render, `seconds`.
         metadata: strings and numbers for the file header.
     """
 

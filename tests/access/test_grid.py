@@ -23,7 +23,7 @@ def sample_depths(camera, samples, dtype):
 @functools.partial(jax.jit, static_argnames="plan")
 def grid(particles, camera, plan):
     depths = sample_depths(camera, plan.samples, particles.dtype)
-    ordered = order_particles(particles, camera, depths, plan.cast.cell_samples, plan.num_classes)
+    ordered = order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
     lists = build_lists(ordered, camera, depths, plan.lists, 0)
     return (
         ordered,
@@ -71,7 +71,7 @@ def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
     origin = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
     for particle, r, c, k in np.argwhere(positive):
         bundle = origin[r // 8 * 8, c // 8 * 8]
-        assert members[bundle, k // plan.cast.cell_samples, particle], (
+        assert members[bundle, k // plan.cast.slab_samples, particle], (
             f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
         )
 
@@ -81,21 +81,21 @@ scenes = {
     "decades": st.sampled_from([0.0, 1.0, 4.0]),
     "distance": st.sampled_from([3.0, 0.8, 0.0001]),
     "projection": st.sampled_from(["perspective", "orthographic"]),
-    "cell_samples": st.sampled_from([4, 16]),
+    "slab_samples": st.sampled_from([4, 16]),
 }
 
 
 @given(**scenes)
-@example(seed=0, decades=4.0, distance=0.0001, projection="perspective", cell_samples=4)
+@example(seed=0, decades=4.0, distance=0.0001, projection="perspective", slab_samples=4)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
-    frames, dtype, seed, decades, distance, projection, cell_samples
+    frames, dtype, seed, decades, distance, projection, slab_samples
 ):
     with jax.enable_x64(dtype == np.float64):
         rng = np.random.default_rng(seed)
         scene = frames.scene(rng, decades=decades, dtype=dtype)
         camera = frames.camera(rng, projection, distance, dtype)
-        check_every_sample_finds_its_particles(scene, camera, frames.plan(cell_samples), dtype)
+        check_every_sample_finds_its_particles(scene, camera, frames.plan(slab_samples), dtype)
 
 
 @given(

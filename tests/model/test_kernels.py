@@ -21,7 +21,9 @@ formulas = {
 @names
 @pytest.mark.parametrize("support", [1e-3, 1.0, 250.0])
 def test_integral_over_space_is_one(name, support, x64):
-    shell = lambda r: 4 * np.pi * r * r * float(kernels.evaluate(name, r, support))
+    def shell(r):
+        return 4 * np.pi * r * r * float(kernels.evaluate(name, r, support))
+
     value = integrate.quad(shell, 0, support, points=[support / 2], epsabs=0, epsrel=1e-10)[0]
     assert abs(value - 1) < 1e-9
 

@@ -26,5 +26,5 @@ def test_settings_are_hashable_and_equal_by_value():
 
 
 def test_a_scene_of_the_wrong_parts_is_refused():
-    with pytest.raises(ValueError, match="`particles` must be a `jaxsph.Particles`, got str"):
+    with pytest.raises(ValueError, match=r"`particles` must be a `jaxsph\.Particles`, got str"):
         js.Scene(particles="mixer.npz", transfer=None)
