@@ -42,12 +42,12 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
     edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
     color, transmittance, depth = _composite(quantity, inside, edges, _ray_lengths(camera), scene.transfer)
-    per_pixel = evaluations.sum(-1).astype(np.float64)
+    per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
     counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
     stats = {**counts, "seconds": {"cast": time.perf_counter() - started}}
-    layers: tuple[Any, ...] = (color, transmittance, depth, np.zeros_like(transmittance), per_pixel)
-    return Image(*layers, True, 0, stats)
+    bound: Any = np.zeros_like(transmittance)
+    return Image(color, transmittance, depth, bound, per_pixel, True, 0, stats)
 
 
 def sample_depths(camera: Camera, samples: int) -> np.ndarray:
@@ -129,7 +129,7 @@ def _box(
 
 def _composite(
     quantity: np.ndarray, inside: np.ndarray, edges: np.ndarray, lengths: np.ndarray, transfer: TransferFunction
-) -> tuple[np.ndarray, ...]:
+) -> tuple[Any, ...]:
     """Front to back, equation 3: colour, transmittance and the depth where transmittance falls to 1/2."""
     color = np.zeros(lengths.shape + (3,))
     transmittance = np.ones(lengths.shape)
