@@ -28,7 +28,7 @@ def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(ke
     from jaxsph.model import kernels
 
     q = np.linspace(0, 1, 100_001)
-    weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].shape(1 - q**2, np)
+    weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].of_square(q**2, np)
     deviation = np.sqrt(np.trapezoid(weight * q**4, q) / 3)
     swift = {"cubic_spline": "Cubic spline (M4)", "wendland_c2": "Wendland C2"}[kernel]
     assert SWIFT_GAMMA[swift] == pytest.approx(1 / (2 * deviation), rel=1e-6)

@@ -11,7 +11,7 @@ from jaxsph.model import kernels
 def brute_force_sum(position, support, weight, kernel):
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1) / support[:, None]
     chosen = kernels.by_name(kernel)
-    return chosen.norm / support**3 * (chosen.shape(1 - distance**2, np) * weight).sum(axis=1)
+    return chosen.norm / support**3 * (chosen.of_square(distance**2, np) * weight).sum(axis=1)
 
 
 def test_the_support_is_the_distance_to_the_kth_neighbour():
