@@ -22,7 +22,7 @@ kernel_names = ["poly6", "cubic_spline", "wendland_c2"]
 def test_float32_agrees_with_the_reference_to_1e_4_on_999_of_1000_pixels(
     frames, compare, kernel, projection, seed, decades, distance
 ):
-    """A sample at the edge of a support may fall on the other side of it in float32; so one pixel in a thousand may differ."""
+    """Pixels with a sample at the very edge of a support, which may fall on either side in float32, are set apart and few."""
     rng = np.random.default_rng(seed)
     scene, camera = frames.scene(rng, kernel, decades), frames.camera(rng, projection, distance)
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
@@ -242,6 +242,4 @@ def test_stats_count_what_was_done(frames):
     assert image.certified
     assert image.faults == 0
     assert not np.asarray(image.error_bound).any()
-    truth = js.reference.render(frames.scene(np.random.default_rng(0)), frames.camera(np.random.default_rng(0)), frames.settings)
     assert image.stats["evaluations"] > 0
-    assert truth.stats["evaluations"] > 0

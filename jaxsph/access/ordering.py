@@ -27,6 +27,7 @@ from jaxsph.numerics.staging import computed_once
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
 DEAD_CLASS = 255
+KEY_MARGIN = 8  # keys that a window is wider on either side: a key is at most an ulp of its depth, a logarithm errs by a few
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 
 
@@ -57,8 +58,7 @@ def order_particles(
 ) -> Ordered:
     """Rank `particles` for the sample `depths` (ascending), in slabs of `slab_samples`.
 
-    Windows are conservative: the depth key is monotone but for the rounding of a logarithm, and one key more is taken on
-    either side.
+    Windows are conservative: the depth key is monotone but for the rounding of a logarithm, which `KEY_MARGIN` covers.
     """
     look = functools.partial(_view, num_classes=num_classes)
     columns, key, widest, bad = computed_once(camera.near < camera.far, look, particles, camera, depths)
@@ -72,8 +72,8 @@ def order_particles(
     widest = widest[:, None]
     lowest = _depth_key(camera, front[None] - widest * (1 + eps))
     highest = _depth_key(camera, back[None] + widest * (1 + eps))
-    lowest = class_key | jnp.where(lowest > 0, lowest - 1, 0)
-    highest = class_key | jnp.minimum(highest + 1, (1 << DEPTH_BITS) - 1)
+    lowest = class_key | jnp.where(lowest > KEY_MARGIN, lowest - KEY_MARGIN, 0)
+    highest = class_key | jnp.minimum(highest + KEY_MARGIN, (1 << DEPTH_BITS) - 1)
     first_rank = jnp.searchsorted(key, lowest, side="left").astype(jnp.int32)
     last_rank = jnp.searchsorted(key, highest, side="right").astype(jnp.int32)
 
