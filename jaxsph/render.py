@@ -20,6 +20,7 @@ from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.cast.points import Rays, cast_points
+from jaxsph.control.worklist import Worklist, full_rate
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
@@ -91,7 +92,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
         lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
-        seen = (ordered, lists, cells, camera, scene.transfer, first_row)
+        seen = (ordered, lists, full_rate(cells), camera, scene.transfer, first_row)
         rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
         words.append(lists.faults)
         cells_found += int((cells.count > 0).sum())
@@ -130,7 +131,7 @@ def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
     def one_band(band: Int[Array, ""]) -> Any:
         first_row = band * plan.band_height
         lists, cells = _grid(ordered, camera, first_row, plan=plan)
-        rays = _cast(ordered, lists, cells, camera, scene.transfer, first_row, plan=plan, kernel=scene.particles.kernel)
+        rays = _cast(ordered, lists, full_rate(cells), camera, scene.transfer, first_row, plan=plan, kernel=scene.particles.kernel)
         return _unbundle(rays, plan), lists.faults, (cells.count > 0).sum(), lists.start[-1]
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
@@ -147,12 +148,13 @@ def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
-    return order_particles(particles, camera, _depths(camera, particles, plan)[0], plan.cast.slab_samples, plan.num_classes)
+    depths = _half_steps(camera, particles, plan)[1::2]
+    return order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
 
 
 @functools.partial(jax.jit, static_argnames="plan")
 def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> tuple[BundleLists, Cells]:
-    lists = build_lists(ordered, camera, _depths(camera, ordered.x, plan)[0], plan.lists, first_row)
+    lists = build_lists(ordered, camera, _half_steps(camera, ordered.x, plan)[1::2], plan.lists, first_row)
     return lists, find_cells(ordered, lists)
 
 
@@ -160,7 +162,7 @@ def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: 
 def _cast(
     ordered: Ordered,
     lists: BundleLists,
-    cells: Cells,
+    work: Worklist,
     camera: Camera,
     transfer: TransferFunction,
     first_row: Int[Array, ""],
@@ -168,17 +170,16 @@ def _cast(
     plan: Plan,
     kernel: str,
 ) -> Rays:
-    depths, edges = _depths(camera, ordered.x, plan)
     origins = bundle_origins(plan.lists, first_row)
     transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
-    return cast_points(ordered, lists, cells, origins, camera, transfer, depths, edges, kernel, plan.cast)
+    half_steps = _half_steps(camera, ordered.x, plan)
+    return cast_points(ordered, lists, work, origins, camera, transfer, half_steps, kernel, plan.cast)
 
 
-def _depths(camera: Camera, like: Any, plan: Plan) -> tuple[Array, Array]:
-    """Depths of the samples and of the borders between them."""
-    count = jnp.arange(plan.samples + 1, dtype=like.dtype)
-    middles, edges = (camera.depth(u, plan.samples).astype(like.dtype) for u in (count[:-1] + 0.5, count))
-    return middles, edges
+def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
+    """View depths s(0), s(1/2), ... s(N): fine samples sit at the odd entries, between borders at the even ones."""
+    u = jnp.arange(2 * plan.samples + 1, dtype=like.dtype) / 2
+    return camera.depth(u, plan.samples).astype(like.dtype)
 
 
 def _unbundle(rays: Rays, plan: Plan) -> tuple[Array, ...]:

@@ -1,12 +1,10 @@
 r"""Ray casting of particles: thread-coherent marching of the first paper's section 6.3, as a few fat XLA kernels.
 
-Flow: cells -> [points] -> image.
+Flow: worklist -> [points] -> image.
 
-Every bundle's filled cells are stacked front to back without gaps, and marched layer by layer of that stack: first every
-bundle's first filled cell, then its second. In a layer, bundles are ordered by the number of particles of their cell and taken
-`chunk` at a time, so that a chunk's trip counts are nearly their mean and empty space costs nothing. A cell is marched slab by
-slab, and blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are (chunk, samples
-of a slab, 8 rows, 8 columns).
+Every bundle's slabs of samples are stacked front to back without gaps, and marched layer by layer of that stack
+(`access.stacks`); blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are
+(chunk, samples of a slab, 8 rows, 8 columns).
 
 The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$
 (perspective) or 1 (orthographic), so the squared distance in supports is $A_{kc} + D_{kr}$ with $A_{kc} = ((a_k u_c - X) / H)^2$
@@ -24,9 +22,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
+from jaxsph.access.stacks import stack
+from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
@@ -42,7 +41,7 @@ class CastPlan:
     Attributes:
         chunk: bundles marched together.
         slab_samples: samples that share a window of particles.
-        slabs_per_cell: slabs marched in a row, for which the state of the rays is fetched and stored once.
+        slabs_per_cell: slabs of a cell, and marched in a row, for which the state of the rays is fetched and stored once.
     """
 
     chunk: int
@@ -73,33 +72,29 @@ class Rays:
 def cast_points(
     ordered: Ordered,
     lists: BundleLists,
-    cells: Cells,
+    work: Worklist,
     origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
     camera: Camera,
     transfer: TransferFunction,
-    depths: Float[Array, " samples"],
-    edges: Float[Array, " samples_and_one"],
+    half_steps: Float[Array, " two_samples_and_one"],
     kernel: str,
     plan: CastPlan,
 ) -> Rays:
-    """March all bundles of a band at full rate.
+    """March all bundles of a band.
 
     Args:
-        ordered, lists, cells: the sparse perspective grid.
+        ordered, lists: the sparse perspective grid.
+        work: the slabs of samples to march.
         origins: pixel row and column of each bundle.
-        depths, edges: view depths of the samples and of the borders between them, length units.
+        half_steps: view depths s(0), s(1/2), s(1), ... s(N): borders of the fine samples and what lies between, length units.
         kernel: name of the smoothing kernel.
     """
-    slabs, num_bundles = cells.count.shape
+    slabs, num_bundles = work.count.shape
     dtype = ordered.x.dtype
-    in_slab = jnp.minimum(plan.slab_samples, depths.shape[0] - jnp.arange(slabs) * plan.slab_samples)
-    evaluations = (cells.count.astype(jnp.float32) * in_slab[:, None].astype(jnp.float32)).sum(0)
-    missing = -slabs % plan.slabs_per_cell
-    count = jnp.pad(cells.count, ((0, missing), (0, 0))).reshape(-1, plan.slabs_per_cell, num_bundles).sum(1)
-    cell_of, order, num_chunks = _schedule(count, plan.chunk)
-    padding = (slabs + missing) * plan.slab_samples - depths.shape[0]
-    depths = jnp.pad(depths, (0, padding), mode="edge")
-    edges = jnp.pad(edges, (0, padding), mode="edge")  # samples past the end have length zero
+    samples = half_steps.shape[0] // 2
+    # samples past the end have length zero; the dummy slab lies there
+    half_steps = jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
+    stacks = stack(work.filled, work.count, plan.slabs_per_cell, plan.chunk)
     segments = transfer.segments()
     state = (
         *(jnp.zeros((num_bundles + 1, BUNDLE, BUNDLE), dtype) for _ in range(3)),
@@ -107,57 +102,55 @@ def cast_points(
         jnp.full((num_bundles + 1, BUNDLE, BUNDLE), jnp.inf, dtype),
     )
     row, column = (jnp.append(origin, 0) for origin in origins)
-    begin, length = (jnp.pad(window, ((0, 0), (0, missing), (0, 1))) for window in (cells.begin, cells.length))
+    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 1)]), work)
 
     def march_layer(layer: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         def march_chunk(chunk: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-            bundle = lax.dynamic_slice(order, (layer, chunk * plan.chunk), (1, plan.chunk))[0]
+            bundle = lax.dynamic_slice(stacks.order, (layer, chunk * plan.chunk), (1, plan.chunk))[0]
             pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
             u = camera.column((column[bundle][:, None] + pixel).astype(dtype) + 0.5)
             v = camera.row((row[bundle][:, None] + pixel).astype(dtype) + 0.5)
 
-            def march_slab(k: Array, rays: list[Array]) -> list[Array]:
-                slab = cell_of[layer, bundle] * plan.slabs_per_cell + k
-                sample = (slab * plan.slab_samples)[:, None] + jnp.arange(plan.slab_samples + 1, dtype=jnp.int32)
-                s, border = depths[sample[:, :-1]], edges[sample]
-                window = begin[:, slab, bundle], length[:, slab, bundle]
+            def march_item(k: Array, rays: list[Array]) -> list[Array]:
+                slab = stacks.place[layer * plan.slabs_per_cell + k, bundle]
+                item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
+                s, border = _sample_depths(item, slab, half_steps, plan)
+                window = item.begin, item.length
                 sums = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
                 shade = functools.partial(_shade, perspective=camera.is_perspective)
-                shaded = computed_once(k >= 0, shade, *sums, (u, v, border), segments)
+                shaded = computed_once(k >= 0, shade, *sums, (u, v, border), segments, item)
                 return _composite(rays, shaded, border)
 
-            rays = lax.fori_loop(0, plan.slabs_per_cell, march_slab, [field[bundle] for field in state])
+            rays = lax.fori_loop(0, plan.slabs_per_cell, march_item, [field[bundle] for field in state])
             return tuple(field.at[bundle].set(new) for field, new in zip(state, rays, strict=True))
 
-        return lax.fori_loop(0, num_chunks[layer], march_chunk, state)
+        return lax.fori_loop(0, stacks.num_chunks[layer], march_chunk, state)
 
-    layers = (num_chunks > 0).sum()
+    layers = (stacks.num_chunks > 0).sum()
     *color, transmittance, depth = (field[:-1] for field in lax.fori_loop(0, layers, march_layer, state))
-    return Rays(jnp.stack(color), transmittance, depth, evaluations)
+    return Rays(jnp.stack(color), transmittance, depth, evaluations(work, samples, plan))
 
 
-def _schedule(count: Int[Array, "cells bundles"], chunk: int) -> tuple[Array, Array, Array]:
-    """Which cells are marched when.
+def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " bundles"]:
+    """Kernel evaluations that `work` takes for each ray of a bundle."""
+    beyond = (jnp.arange(work.count.shape[0]) + 1) * plan.slab_samples - samples
+    in_slab = plan.slab_samples - jnp.maximum(beyond, 0)[:, None] * (work.level == 0)
+    return (work.count.astype(jnp.float32) * in_slab.astype(jnp.float32)).sum(0)
 
-    Returns:
-        The place along depth of each bundle's filled cells, front to back, (layers, bundles + 1); for each layer the bundles
-        that have one, fullest first, padded to whole chunks with the dummy bundle; and each layer's number of chunks.
+
+def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPlan) -> tuple[Array, Array]:
+    """View depths of an item's samples, and of the borders between them.
+
+    A coarse sample sits at the sample-space middle of its window. A super-pixel is a single sample as long as the cell.
     """
-    depth, bundles = count.shape
-    filled = count > 0
-    layer = jnp.where(filled, jnp.cumsum(filled, 0) - 1, depth)
-    every = jnp.broadcast_to(jnp.arange(bundles), count.shape)
-    cell_of = jnp.zeros((depth, bundles + 1), jnp.int32)
-    cell_of = cell_of.at[layer, every].set(jnp.arange(depth, dtype=jnp.int32)[:, None], mode="drop")
-    stacked = jnp.zeros_like(count).at[layer, every].set(count, mode="drop")
-    bits = (bundles + 1).bit_length()
-    key = (jnp.minimum(stacked, (1 << (32 - bits)) - 1).astype(jnp.uint32) << bits) | every.astype(jnp.uint32)
-    key = ~lax.sort(~key, dimension=1)
-    order = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
-    active = (stacked > 0).sum(1)
-    order = jnp.where(jnp.arange(bundles) < active[:, None], order, bundles)
-    order = jnp.pad(order, ((0, 0), (0, -bundles % chunk)), constant_values=bundles)
-    return cell_of, order, (active + chunk - 1) // chunk
+    step = (1 << item.level)[:, None]
+    first = (slab * plan.slab_samples)[:, None]
+    border = first + step * jnp.arange(plan.slab_samples + 1, dtype=jnp.int32)
+    middle = 2 * border[:, :-1] + step
+    if item.painted is not None:
+        border = jnp.where(item.painted[:, None], jnp.minimum(border, first + (1 << COARSEST)), border)
+    last = half_steps.shape[0] - 1
+    return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
 
 
 def _gather_field(
@@ -219,13 +212,24 @@ def _position(index: Array, begin: Array, length: Array) -> Array:
 
 
 def _shade(
-    weight: Array, weighted: Array, geometry: tuple[Array, Array, Array], segments: Segments, *, perspective: bool
+    weight: Array,
+    weighted: Array,
+    geometry: tuple[Array, Array, Array],
+    segments: Segments,
+    item: Worklist,
+    *,
+    perspective: bool,
 ) -> list[Array]:
     """Red, green, blue, optical thickness and transmittance of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
     inside = weight > 0
     quantity = jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
-    *channels, extinction = look_up(segments, quantity)
+    optics = look_up(segments, quantity)
+    if item.paint is not None and item.painted is not None:
+        painted = item.painted[:, None, None, None]
+        inside |= painted
+        optics = [jnp.where(painted, paint[:, None, None, None], value) for paint, value in zip(item.paint, optics, strict=True)]
+    *channels, extinction = optics
     per_depth = jnp.ones_like(u[:, None, :] * v[:, :, None])
     if perspective:
         per_depth = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2)

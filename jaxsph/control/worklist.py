@@ -1,0 +1,51 @@
+"""The list of work: which slabs of samples every bundle is to march, how widely spaced, and with which particles.
+
+Flow: cells -> (bounds -> levels -> merge) -> [worklist] -> cast.
+
+At full rate there is an item for every slab that a particle can touch. Error control replaces items by wider spaced ones, and
+by super-pixels, that need no particles. One cast serves both, so that where control asks for full rate the image is the
+reference image bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.cells import Cells
+
+COARSEST = 4  # level at which a cell of 16 samples has one: log2 D_z
+
+
+@dataclasses.dataclass(frozen=True)
+class Worklist:
+    """Items by the slab that they begin at; a slab that begins none is not `filled`.
+
+    Attributes:
+        filled: whether an item begins here.
+        level: its samples are `2**level` fine samples apart; a super-pixel is one sample of the coarsest level.
+        begin, length: windows of the bundle's list, for each class of supports.
+        count: sum of `length` over classes; 0 for super-pixels.
+        paint: red, green, blue and extinction of super-pixels, where `painted`; None where there can be none.
+    """
+
+    filled: Bool[Array, "slabs bundles"]
+    level: Int[Array, "slabs bundles"]
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+    count: Int[Array, "slabs bundles"]
+    painted: Bool[Array, "slabs bundles"] | None = None
+    paint: Float[Array, "4 slabs bundles"] | None = None
+
+
+def full_rate(cells: Cells) -> Worklist:
+    """Every filled slab at level 0: the reference image."""
+    return Worklist(cells.count > 0, jnp.zeros_like(cells.count), cells.begin, cells.length, cells.count)
+
+
+jax.tree_util.register_dataclass(
+    Worklist, data_fields=[field.name for field in dataclasses.fields(Worklist)], meta_fields=[]
+)
