@@ -21,6 +21,7 @@ from jaxsph.access.footprint import pixel_ranges
 from jaxsph.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.access.ordering import order_particles
 from jaxsph.cast.points import CastPlan
+from jaxsph.control.adapt import ControlPlan
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene
@@ -50,6 +51,7 @@ class Plan:
         lists: sizes of the lists of one band.
         cast: sizes of the march.
         bytes: estimate of the working memory, in bytes.
+        control: static choices of error control; None renders at full rate.
     """
 
     width: int
@@ -61,6 +63,7 @@ class Plan:
     lists: ListPlan
     cast: CastPlan
     bytes: int
+    control: ControlPlan | None = None
 
     @property
     def band_height(self) -> int:
@@ -78,6 +81,19 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
+        wanted = control_plan(settings)
+        if wanted != self.control:
+            raise ValueError(
+                f"`plan` was made for error control {self.control}, but settings ask for {wanted}; make a new one with "
+                "`jaxsph.plan`"
+            )
+
+
+def control_plan(settings: Settings) -> ControlPlan | None:
+    """What of `settings` is fixed when a program is compiled; None without a tolerance."""
+    if settings.tolerance is None:
+        return None
+    return ControlPlan(settings.super_pixels, settings.merge, settings.allocation)
 
 
 def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
@@ -140,9 +156,15 @@ def _for_bands(
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
         + cast.chunk * cast.slab_samples * BUNDLE * BUNDLE * number * 16
         + camera.width * camera.height * 8 * number
+        + (settings.tolerance is not None) * _bytes_of_control(lists, slabs, num_classes, number)
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
-    return Plan(*size, num_classes, bands, lists, cast, int(memory))
+    return Plan(*size, num_classes, bands, lists, cast, int(memory), control_plan(settings))
+
+
+def _bytes_of_control(lists: ListPlan, slabs: int, num_classes: int, number: int) -> int:
+    """Of the tables of all candidates of all cells, and of the windows of coarser slabs."""
+    return lists.num_bundles * slabs * (64 * number // 4 + num_classes * 32)
 
 
 def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:

@@ -1,10 +1,11 @@
 """The verb: particles in, image out.
 
-Flow: order_particles -> build_lists -> find_cells -> cast_points -> Image, band by band.
+Flow: order_particles -> build_lists -> find_cells -> adapt -> cast_points -> Image, band by band.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Hashable
@@ -19,7 +20,8 @@ from jaxtyping import Array, Int
 from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
-from jaxsph.cast.points import Rays, cast_points
+from jaxsph.cast.points import Rays, cast_points, evaluations
+from jaxsph.control.adapt import adapt
 from jaxsph.control.worklist import Worklist, full_rate
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -70,13 +72,13 @@ def render(
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
     """
     settings = settings or Settings()
-    if is_traced(scene, camera):
+    if is_traced(scene, camera, settings):
         if plan is None:
             raise ValueError(
                 "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`"
             )
         plan.check(scene, camera, settings)
-        return _render_traced(scene, camera, plan)
+        return _render_traced(scene, camera, settings, plan)
     return _render_eager(scene, camera, settings, plan, progress)
 
 
@@ -88,62 +90,89 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     clock.mark("plan")
     ordered = clock.run("grid", _order, (scene.particles, camera), plan=plan)
     bands, words = [], [_input_faults(scene, camera) | ordered.faults]
-    cells_found = pairs = 0
+    counts = np.zeros(3)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
         lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
-        seen = (ordered, lists, full_rate(cells), camera, scene.transfer, first_row)
+        view = (camera, scene.transfer, first_row)
+        decided = clock.run("adapt", _adapt, (ordered, lists, cells, *view, _limits(settings, ordered)), plan=plan)
+        seen = (ordered, lists, decided.work, *view)
         rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
         words.append(lists.faults)
-        cells_found += int((cells.count > 0).sum())
-        pairs += int(lists.start[-1])
-        bands.append(_unbundle(rays, plan))
+        counts += [float(count) for count in _counts(lists, cells, plan)]
+        bands.append(_unbundle(rays, decided, plan))
         if progress is not None:
             progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
     _raise(word, planned)
     image = _assemble(_stack(bands), camera, plan, jnp.int32(word))
     clock.mark("image")
-    total = int(np.asarray(image.evaluations, np.float64).sum())
+    spent = int(np.asarray(image.evaluations, np.float64).sum())
+    full = spent if plan.control is None else int(counts[2])
     stats = {
-        "evaluations": total,
-        "evaluations_full": total,
-        "cells": cells_found,
-        "pairs": pairs,
+        "evaluations": spent,
+        "evaluations_full": full,
+        "cells": int(counts[0]),
+        "pairs": int(counts[1]),
         "seconds": clock.seconds,
     }
-    return Image(
-        image.color,
-        image.transmittance,
-        image.depth,
-        image.error_bound,
-        image.evaluations,
-        True,
-        word,
-        stats,
-        _metadata(camera),
-    )
+    certified = plan.control is None or float(settings.relax) == 0
+    metadata = _metadata(camera, settings, certified)
+    return dataclasses.replace(image, certified=certified, faults=word, stats=stats, metadata=metadata)
 
 
-def _render_traced(scene: Scene, camera: Camera, plan: Plan) -> Image:
+def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
     ordered = _order(scene.particles, camera, plan=plan)
 
     def one_band(band: Int[Array, ""]) -> Any:
         first_row = band * plan.band_height
         lists, cells = _grid(ordered, camera, first_row, plan=plan)
-        rays = _cast(ordered, lists, full_rate(cells), camera, scene.transfer, first_row, plan=plan, kernel=scene.particles.kernel)
-        return _unbundle(rays, plan), lists.faults, (cells.count > 0).sum(), lists.start[-1]
+        view = (camera, scene.transfer, first_row)
+        decided = _adapt(ordered, lists, cells, *view, _limits(settings, ordered), plan=plan)
+        rays = _cast(ordered, lists, decided.work, *view, plan=plan, kernel=scene.particles.kernel)
+        return _unbundle(rays, decided, plan), lists.faults, _counts(lists, cells, plan)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
-    layers, words, cells_found, pairs = results
+    layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
     word |= _input_faults(scene, camera) | ordered.faults
     image = _assemble(layers, camera, plan, word)
-    total = image.evaluations.sum()
-    stats = {"evaluations": total, "evaluations_full": total, "cells": cells_found.sum(), "pairs": pairs.sum()}
-    certified = jnp.asarray(True)
-    return Image(image.color, image.transmittance, image.depth, image.error_bound, image.evaluations, certified, word, stats)
+    cells_found, pairs, full = (count.sum() for count in counts)
+    spent = image.evaluations.sum()
+    full = spent if plan.control is None else full
+    stats = {"evaluations": spent, "evaluations_full": full, "cells": cells_found, "pairs": pairs}
+    certified = jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0)
+    return dataclasses.replace(image, certified=certified, stats=stats)
+
+
+def _counts(lists: BundleLists, cells: Cells, plan: Plan) -> tuple[Array, Array, Array]:
+    """Filled slabs, (particle, bundle) pairs, and the kernel evaluations of the reference image, of one band."""
+    full = evaluations(full_rate(cells), plan.samples, plan.cast).sum() * BUNDLE * BUNDLE
+    return (cells.count > 0).sum(), lists.start[-1], full
+
+
+def _limits(settings: Settings, like: Ordered) -> tuple[Array, Array] | None:
+    """Tolerance and relaxation in the dtype of the particles, the tolerance rounded down; None at full rate."""
+    if settings.tolerance is None:
+        return None
+    dtype = like.x.dtype
+    tolerance = jnp.asarray(settings.tolerance, dtype)
+    if not is_traced(settings.tolerance) and float(tolerance) > float(settings.tolerance):
+        tolerance = jnp.nextafter(tolerance, jnp.zeros_like(tolerance))
+    return tolerance, jnp.asarray(settings.relax, dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Decided:
+    """What is to be marched, how wrong the pixels of each bundle can be, and what each cell was given."""
+
+    work: Worklist
+    bound: Array
+    levels: Array | None
+
+
+jax.tree_util.register_dataclass(_Decided, data_fields=["work", "bound", "levels"], meta_fields=[])
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -156,6 +185,27 @@ def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
 def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> tuple[BundleLists, Cells]:
     lists = build_lists(ordered, camera, _half_steps(camera, ordered.x, plan)[1::2], plan.lists, first_row)
     return lists, find_cells(ordered, lists)
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def _adapt(
+    ordered: Ordered,
+    lists: BundleLists,
+    cells: Cells,
+    camera: Camera,
+    transfer: TransferFunction,
+    first_row: Int[Array, ""],
+    limits: tuple[Array, Array] | None,
+    *,
+    plan: Plan,
+) -> _Decided:
+    if limits is None or plan.control is None:
+        return _Decided(full_rate(cells), jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
+    half_steps = _half_steps(camera, ordered.x, plan)
+    origins = bundle_origins(plan.lists, first_row)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
+    grid = (ordered, lists, cells, origins, camera, transfer, half_steps)
+    return _Decided(*adapt(*grid, *limits, plan.cast.slab_samples, plan.control))
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
@@ -182,17 +232,22 @@ def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
     return camera.depth(u, plan.samples).astype(like.dtype)
 
 
-def _unbundle(rays: Rays, plan: Plan) -> tuple[Array, ...]:
-    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations (h, w)."""
+def _unbundle(rays: Rays, decided: _Decided, plan: Plan) -> tuple[Array, ...]:
+    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound (h, w); and of bundles."""
     rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
 
     def lay_out(value: Array) -> Array:
-        value = value.reshape(rows, columns, 2, 2, BUNDLE, BUNDLE, *value.shape[3:])
+        """(bundles, 8, 8, ...) or (bundles, 1, 1, ...) to rows and columns."""
+        down, across = value.shape[1:3]
+        value = value.reshape(rows, columns, 2, 2, *value.shape[1:])
         value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
-        return value.reshape(rows * 2 * BUNDLE, columns * 2 * BUNDLE, *value.shape[6:])
+        return value.reshape(rows * 2 * down, columns * 2 * across, *value.shape[6:])
 
-    evaluations = jnp.broadcast_to(rays.evaluations[:, None, None], rays.transmittance.shape)
-    return tuple(lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, evaluations))
+    spent, bound = (
+        jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in (rays.evaluations, decided.bound)
+    )
+    layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, bound)]
+    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in [decided.levels] if v is not None))
 
 
 def _stack(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:
@@ -201,9 +256,13 @@ def _stack(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:
 
 def _assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array) -> Image:
     """Join the bands, cut off what lies beyond the image."""
-    joined = [layer.reshape(-1, *layer.shape[2:])[: camera.height, : camera.width] for layer in layers]
-    color, transmittance, depth, evaluations = joined
-    return Image(color, transmittance, depth, jnp.zeros_like(transmittance), evaluations, True, word, {})
+    joined = [layer.reshape(-1, *layer.shape[2:]) for layer in layers]
+    color, transmittance, depth, spent, bound = (layer[: camera.height, : camera.width] for layer in joined[:5])
+    image = Image(color, transmittance, depth, bound, spent, True, word, {})
+    if len(joined) == 5:
+        return image
+    rows, columns = (-(-size // BUNDLE) for size in (camera.height, camera.width))
+    return dataclasses.replace(image, levels=jnp.moveaxis(joined[5][:rows, :columns], -1, 0))
 
 
 @jax.jit
@@ -227,14 +286,16 @@ def _raise(word: int, planned: bool) -> None:
         raise ValueError(f"this frame cannot be rendered: {faults.describe(word)}")
 
 
-def _metadata(camera: Camera) -> tuple[tuple[str, Any], ...]:
+def _metadata(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     from jaxsph import __version__
 
+    exact = settings.tolerance is None
     return (
         ("jaxsph.version", __version__),
-        ("jaxsph.tolerance", "none"),
-        ("jaxsph.estimator", "none"),
-        ("jaxsph.certified", 1.0),
+        ("jaxsph.tolerance", "none" if exact else float(settings.tolerance)),
+        ("jaxsph.estimator", "none" if exact else settings.estimator),
+        ("jaxsph.relax", "none" if exact else float(settings.relax)),
+        ("jaxsph.certified", float(certified)),
         ("jaxsph.camera", camera.describe()),
     )
 

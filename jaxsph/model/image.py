@@ -30,6 +30,8 @@ class Image:
         stats: `evaluations`, `evaluations_full`, `cells` (slabs of bundles that a particle can touch), `pairs` (particles of
             all bundle lists) and, from an eager render, `seconds`.
         metadata: strings and numbers for the file header.
+        levels: what error control gave each cell of 8 x 8 pixels and 16 samples, front to back: sampling level 0 (full rate)
+            to 4, 5 for a super-pixel, -1 for an empty cell; None at full rate.
     """
 
     color: Float[Array, "height width 3"]
@@ -41,6 +43,7 @@ class Image:
     faults: Int[Array, ""] | int
     stats: dict[str, Any]
     metadata: tuple[tuple[str, Any], ...] = ()
+    levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
 
     @property
     def alpha(self) -> Float[Array, "height width"]:
@@ -73,6 +76,6 @@ class Image:
 
 jax.tree_util.register_dataclass(
     Image,
-    data_fields=["color", "transmittance", "depth", "error_bound", "evaluations", "certified", "faults", "stats"],
+    data_fields=["color", "transmittance", "depth", "error_bound", "evaluations", "certified", "faults", "stats", "levels"],
     meta_fields=["metadata"],
 )

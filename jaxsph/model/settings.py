@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,19 +11,35 @@ import numpy as np
 GIBIBYTE = 1 << 30
 
 
+ESTIMATORS = ("interval",)
+ALLOCATIONS = ("budget", "greedy", "independent")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Choices of the user; hashable where they fix a shape.
+    """Choices of the user; hashable where they fix a shape. `tolerance` and `relax` are leaves: changing them compiles nothing.
 
     Attributes:
         samples: fine samples N along every ray, at least 1.
-        tolerance: `None` renders at full rate: the reference image. A number would ask for error control, which this
-            version does not have and refuses.
+        tolerance: largest absolute difference to the reference image that any colour channel or alpha of any pixel may have;
+            `None` renders that reference image, at full rate.
+        estimator: how errors are foreseen; `"interval"` bounds them (first paper, sections 4 and 5).
+        relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
+            certificate; anything more an estimate.
+        super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
+        merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
+        allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
+            does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
         memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it.
     """
 
     samples: int = 256
-    tolerance: float | None = None
+    tolerance: Any = None
+    estimator: str = "interval"
+    relax: Any = 0.0
+    super_pixels: bool = True
+    merge: bool = True
+    allocation: str = "budget"
     memory_limit: int = 4 * GIBIBYTE
 
     def __post_init__(self) -> None:
@@ -30,12 +47,27 @@ class Settings:
             raise ValueError(f"`samples` must be an integer of at least 1, got {self.samples!r}")
         if self.samples > 1 << 20:
             raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
-        if self.tolerance is not None:
-            raise ValueError(
-                f"`tolerance` = {self.tolerance}: error control is not part of this version; use tolerance=None (full rate)"
-            )
+        if _is_number(self.tolerance) and not (np.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise ValueError(f"`tolerance` must be >= 0 and finite, got {self.tolerance}; None renders at full rate")
+        if _is_number(self.relax) and not 0 <= self.relax <= 1:
+            raise ValueError(f"`relax` must lie in [0, 1], got {self.relax}; 0 keeps the certificate")
+        if self.estimator not in ESTIMATORS:
+            raise ValueError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
+        if self.allocation not in ALLOCATIONS:
+            raise ValueError(f"`allocation` must be one of {', '.join(ALLOCATIONS)}, got {self.allocation!r}")
         if not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
 
-jax.tree_util.register_dataclass(Settings, data_fields=[], meta_fields=["samples", "tolerance", "memory_limit"])
+def _is_number(value: Any) -> bool:
+    """Whether `value` can be looked at: a number, not a tracer nor what a transformation puts in a leaf's place."""
+    if isinstance(value, jax.core.Tracer) or value is None:
+        return False
+    return isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and np.ndim(value) == 0
+
+
+jax.tree_util.register_dataclass(
+    Settings,
+    data_fields=["tolerance", "relax"],
+    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "memory_limit"],
+)

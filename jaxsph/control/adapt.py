@@ -1,0 +1,82 @@
+"""Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
+
+Flow: cells -> [adapt: analysis -> levels -> merge] -> worklist -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsph.access.cells import Cells
+from jaxsph.access.lists import BundleLists
+from jaxsph.access.ordering import Ordered
+from jaxsph.control.analysis import analyse
+from jaxsph.control.errors import CELL
+from jaxsph.control.levels import Offer, bound, choose
+from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels
+from jaxsph.control.worklist import Worklist
+from jaxsph.model.camera import Camera
+from jaxsph.model.transfer import TransferFunction
+
+
+EMPTY = -1  # what a cell without particles is given
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlPlan:
+    """Static choices of error control.
+
+    Attributes:
+        super_pixels: whether a cell may be given one colour for all of its rays (first paper, section 5.2).
+        merge: whether coarse cells are merged along depth (6.2).
+        allocation: how a bundle's tolerance is shared among its cells, see `levels.choose`.
+    """
+
+    super_pixels: bool
+    merge: bool
+    allocation: str
+
+
+def adapt(
+    ordered: Ordered,
+    lists: BundleLists,
+    cells: Cells,
+    origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
+    camera: Camera,
+    transfer: TransferFunction,
+    half_steps: Float[Array, " two_samples_and_one"],
+    tolerance: Float[Array, ""],
+    relax: Float[Array, ""],
+    slab_samples: int,
+    plan: ControlPlan,
+) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
+    r"""Decide how every cell is sampled.
+
+    Two images of a bundle whose samples agree differ by rounding. With n samples, each step of compositing rounds the
+    transmittance once and a colour's sum once, the differences and products of a colour another two times its share: less
+    than (n + 1) eps a pixel, and twice that for two images. Only where all cells stay at level 0 are the images the same bits.
+
+    Returns:
+        The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
+        each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
+    """
+    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, relax, slab_samples)
+    num_cells, bundles = analysis.error.shape[1:]
+    samples = half_steps.shape[0] // 2
+    whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
+    windows = coarser_windows(cells, slab_samples)
+    costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
+    full = costs[0] if costs[0] is not None else jnp.zeros((num_cells, bundles))
+    saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
+    on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
+    rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * (full > 0).sum(0) + 2).astype(half_steps.dtype)
+    offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
+    chosen = choose(analysis, offer, tolerance, plan.allocation)
+    final = merged_levels(chosen, (full == 0) & whole, slab_samples)
+    work = coarse_work(windows, final, analysis.paint if plan.super_pixels else None, slab_samples)
+    final = jnp.where(full > 0, final, 0)
+    return work, bound(analysis.error, final, rounding), jnp.where(full > 0, final, EMPTY)
+

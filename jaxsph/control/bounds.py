@@ -1,0 +1,168 @@
+r"""What the samples of a bundle can see: certified bounds of the quantity and of the optics at every depth.
+
+Flow: cells -> [bounds] -> errors -> levels -> merge -> cast -> image.
+
+CSPH values are affine combinations of the quantities of the particles whose supports hold the sample, so the least and the
+greatest quantity among the particles whose spheres meet a *sample slab* (the footprint of the bundle, between two borders of
+fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border (first
+paper, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its sub-rectangles lies
+inside the support of a single particle; in any other, a sample may be empty.
+
+Why the bounds hold in floating point: a sphere counts as meeting the slab with its `reach`, outside which computed weights are
+zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle
+is `SOLID` enough for that not to underflow. Boxes are made of the very numbers that the cast multiplies, and rounding is
+monotone. A quotient of two computed sums of n terms leaves the particles' range by less than (n + 4) eps of its largest
+magnitude.
+
+Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.lists import BUNDLE
+from jaxsph.access.ordering import Ordered
+from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.numerics.staging import computed_once
+
+PARTICLES = 4  # unrolled in the inner loop; longer chains do not vectorise
+PARTS = 2  # sub-rectangles on each side of the footprint, for the test of coverage
+SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
+
+
+@dataclasses.dataclass(frozen=True)
+class Footprint:
+    """Where a bundle's rays lie between two borders: ray coordinates ascend along the first axis."""
+
+    columns: Float[Array, "8 bundles"]
+    rows: Float[Array, "8 bundles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleBounds:
+    """Bounds over each sample slab, for all rays of a bundle.
+
+    Attributes:
+        touched: whether a particle meets the slab; if not, every sample in it is empty.
+        covered: whether no sample in it can be empty.
+        lo, hi: red, green, blue and extinction of samples that are not empty.
+    """
+
+    touched: Bool[Array, "samples bundles"]
+    covered: Bool[Array, "samples bundles"]
+    lo: list[Float[Array, "samples bundles"]]
+    hi: list[Float[Array, "samples bundles"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spheres:
+    """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities."""
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    outer: Float[Array, " particles"]
+    inner: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+
+
+def spheres(ordered: Ordered) -> Spheres:
+    """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive."""
+    outer = jnp.where(ordered.size > 0, 1 / ordered.reach, jnp.inf)
+    inner = 2 * ordered.size / jnp.where(ordered.scale > 0, ordered.scale, 1) - ordered.reach
+    solid = (ordered.size > SOLID) & (inner > 0)
+    inner = jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
+    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantity)
+
+
+def sample_bounds(
+    balls: Spheres,
+    rank: Int[Array, " pairs"],
+    window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
+    footprint: Footprint,
+    borders: Float[Array, "samples_and_one bundles"],
+    tables: RangeTables,
+    perspective: bool,
+) -> SampleBounds:
+    """Bounds for the samples between `borders`, from the particles of a window."""
+    spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
+    blocks = (window[1].sum(0).max() + PARTICLES - 1) // PARTICLES
+    samples, bundles = borders.shape[0] - 1, borders.shape[1]
+    dtype = borders.dtype
+    outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
+    farthest = jnp.full((samples, PARTS, PARTS, bundles), jnp.inf, dtype)
+    boxes = _boxes(footprint.columns, spread), _boxes(footprint.rows, spread)
+
+    def add_block(block: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        outermost, farthest = found
+        index = block * PARTICLES + jnp.arange(PARTICLES, dtype=jnp.int32)
+        ball = computed_once(block >= 0, _fetch, balls, rank, window, index)
+        near, near_depth, column, row, depth = computed_once(block >= 0, _squares, ball, boxes, borders)
+        sides = jnp.asarray([-1, 1], dtype)[:, None, None]
+        for k in range(PARTICLES):
+            meets = near[k] + near_depth[k] <= 1
+            outermost = jnp.maximum(outermost, jnp.where(meets, sides * ball.quantity[k], -jnp.inf))
+            farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
+        return outermost, farthest
+
+    outermost, farthest = lax.fori_loop(0, blocks, add_block, (outermost, farthest))
+    touched = outermost[1] > -jnp.inf
+    lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
+    rounding = (window[1].sum(0) + 4) * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
+    least, greatest = transfer_ranges(tables, lo - rounding, hi + rounding)
+    return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
+
+
+def _boxes(rays: Array, spread: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Least and greatest view coordinate of each part of the footprint, (parts, bundles)."""
+    first, last = rays[:: BUNDLE // PARTS], rays[BUNDLE // PARTS - 1 :: BUNDLE // PARTS]
+    return jnp.minimum(spread[0] * first, spread[1] * first), jnp.maximum(spread[0] * last, spread[1] * last)
+
+
+def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
+    """A block of particles of each bundle's windows; past the last they do not count."""
+    begin, length = window
+    index = index[:, None]
+    position, before = begin[0] + index, length[0]
+    for k in range(1, begin.shape[0]):
+        position = jnp.where(index >= before, (begin[k] - before) + index, position)
+        before = before + length[k]
+    place = jnp.clip(position, 0, rank.shape[0] - 1)
+    particle = computed_once(index[0, 0] >= 0, lambda at: rank.at[at].get(mode="promise_in_bounds"), place)
+    found = jax.tree.map(lambda column: column.at[particle].get(mode="promise_in_bounds"), balls)
+    inside = index < before
+    outer, inner = (jnp.where(inside, inverse, jnp.inf) for inverse in (found.outer, found.inner))
+    return dataclasses.replace(found, outer=outer, inner=inner)
+
+
+def _squares(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, ...]:
+    """Parts of squared distances, in radii, from a block of particles to the nearest and farthest points of slabs.
+
+    Returns:
+        Nearest across (particles, bundles) and along depth (particles, samples, bundles); farthest across columns and across
+        rows of the sub-rectangles (particles, parts, bundles) and along depth.
+    """
+    nearest, farthest = [], []
+    for place, (low, high) in zip((ball.x, ball.y), boxes, strict=True):
+        nearest.append(_square(jnp.maximum(jnp.maximum(low[0] - place, place - high[-1]), 0), ball.outer))
+        farthest.append(_square(jnp.maximum(place[:, None] - low, high - place[:, None]), ball.inner[:, None]))
+    front, back = borders[:-1] - ball.z[:, None], ball.z[:, None] - borders[1:]
+    near_depth = _square(jnp.maximum(jnp.maximum(front, back), 0), ball.outer[:, None])
+    far_depth = _square(jnp.maximum(-front, -back), ball.inner[:, None])
+    return nearest[0] + nearest[1], near_depth, farthest[0], farthest[1], far_depth
+
+
+def _square(distance: Array, inverse: Array) -> Array:
+    """(distance / radius)^2, infinite where the particle does not count."""
+    share = distance * jnp.minimum(inverse, jnp.finfo(inverse.dtype).max)
+    return jnp.where(inverse < jnp.inf, share * share, jnp.inf)
+
+
+for _kind in (Footprint, SampleBounds, Spheres):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

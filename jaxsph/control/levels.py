@@ -1,0 +1,117 @@
+r"""Which candidate every cell gets: as much work saved as the tolerance allows.
+
+Flow: errors -> [levels] -> merge -> cast -> image.
+
+Errors of cells add up (`errors`), so a bundle has a budget to spend: choose a candidate for each cell such that the errors'
+sum stays within the tolerance and the evaluations saved are most. The multiplier rule does that up to one cell: for a price
+$\lambda$, each cell takes what maximises saving $- \lambda$ error; the least price that keeps the tolerance is found by
+bisection. A smaller tolerance has a higher price, at which no cell takes more error: it never spends less.
+
+The paper's order (section 4.4) spends the budget back to front, each cell taking the highest level that still fits.
+
+Decisions carry no gradient.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.control.analysis import Analysis
+from jaxsph.control.errors import CANDIDATES
+
+CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
+HALVINGS = 20
+ALLOCATIONS = ("budget", "greedy", "independent")
+
+
+@dataclasses.dataclass(frozen=True)
+class Offer:
+    """What can be chosen for each cell.
+
+    Attributes:
+        saving: kernel evaluations a ray that a candidate saves against level 0.
+        allowed: whether it is on offer; level 0 always is.
+        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
+    """
+
+    saving: Float[Array, "candidates cells bundles"]
+    allowed: Bool[Array, "candidates cells bundles"]
+    rounding: Float[Array, " bundles"]
+
+
+def choose(
+    analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str
+) -> Int[Array, "cells bundles"]:
+    """The candidate of every cell: level 0 to 4, or super-pixel.
+
+    Args:
+        analysis: errors of all candidates.
+        offer: what they save, and which can be had.
+        tolerance: largest error of a pixel.
+        allocation: `"budget"`, `"greedy"` (back to front), or `"independent"` (each cell as if it were alone: the paper's
+            l_max without its greedy, whose sum may break the tolerance).
+    """
+    keeps = analysis.strict + offer.rounding <= tolerance
+    allowed = (offer.allowed & keeps).at[0].set(True)
+    left = tolerance - offer.rounding
+    if allocation == "independent":
+        return lax.stop_gradient(_best(offer.saving, allowed))
+    if allocation == "greedy":
+        return lax.stop_gradient(_back_to_front(analysis.error, offer.saving, allowed, left))
+    return lax.stop_gradient(_at_best_price(analysis.error, offer, allowed, tolerance))
+
+
+def errors_of(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"]) -> Array:
+    """The error of the chosen candidates, (cells, bundles)."""
+    taken = error[0]
+    for candidate in range(1, CANDIDATES):
+        taken = jnp.where(chosen == candidate, error[candidate], taken)
+    return taken
+
+
+def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
+    """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
+    return jnp.where((chosen > 0).any(0), errors_of(error, chosen).sum(0) + rounding, 0)
+
+
+def _best(worth: Array, allowed: Array) -> Array:
+    """The allowed candidate of most worth; of equals the first."""
+    best, chosen = worth[0], jnp.zeros(worth.shape[1:], jnp.int32)
+    for candidate in range(1, CANDIDATES):
+        better = allowed[candidate] & (worth[candidate] > best)
+        best, chosen = jnp.where(better, worth[candidate], best), jnp.where(better, candidate, chosen)
+    return chosen
+
+
+def _at_best_price(error: Array, offer: Offer, allowed: Array, tolerance: Array) -> Array:
+    def at(price: Array) -> Array:
+        return _best(offer.saving - price * error, allowed)
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        keeps = bound(error, at(jnp.exp2(middle)), offer.rounding) <= tolerance
+        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
+
+    low, high = (jnp.full_like(offer.rounding, end) for end in (CHEAPEST, DEAREST))
+    _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
+    chosen = at(jnp.exp2(high))
+    return jnp.where(bound(error, chosen, offer.rounding) <= tolerance, chosen, 0)
+
+
+def _back_to_front(error: Array, saving: Array, allowed: Array, left: Array) -> Array:
+    def step(left: Array, cell: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        error, saving, allowed = cell
+        chosen = _best(saving, allowed & (error <= left))
+        return left - errors_of(error, chosen), chosen
+
+    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (error, saving, allowed))
+    return lax.scan(step, left, cells, reverse=True)[1]
+
+
+jax.tree_util.register_dataclass(Offer, data_fields=["saving", "allowed", "rounding"], meta_fields=[])

@@ -1,0 +1,117 @@
+"""Turn choices into work: coarse slabs with the particles that they need, cells merged until they are full.
+
+Flow: levels -> [merge] -> worklist -> cast -> image.
+
+A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
+one depth-ordered list, so nothing is copied and nothing is referenced twice (first paper, section 6.2). As long as it fits
+into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of them
+allow it. A cell whose neighbours do not falls back to the last level that fits, which costs the same and errs less.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxsph.access.cells import Cells
+from jaxsph.control.errors import CELL, LEVELS, SUPER_PIXEL
+from jaxsph.control.worklist import COARSEST, Worklist
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Windows of the bundle's list, for each class of supports, of slabs 2^l times as deep as those of the grid."""
+
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+
+
+def coarser_windows(cells: Cells, slab_samples: int) -> list[Window]:
+    """Unions of the windows of 1, 2, 4, 8 and 16 slabs; the number of slabs is rounded up to a multiple of 16."""
+    missing = -cells.count.shape[0] % (1 << COARSEST)
+    pad = ((0, 0), (0, missing), (0, 0))
+    windows = [Window(jnp.pad(cells.begin, pad), jnp.pad(cells.length, pad))]
+    for _ in range(COARSEST):
+        begin, length = windows[-1].begin, windows[-1].length
+        none = jnp.iinfo(begin.dtype).max
+        first = jnp.where(length > 0, begin, none)
+        end = jnp.where(length > 0, begin + length, 0)
+        first = jnp.minimum(first[:, ::2], first[:, 1::2])
+        length = jnp.maximum(jnp.maximum(end[:, ::2], end[:, 1::2]) - first, 0)
+        windows.append(Window(jnp.where(length > 0, first, 0), length))
+    return windows
+
+
+def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
+    """Kernel evaluations a ray and cell at every level, (cells, bundles); None where a level does not fit without merging."""
+    costs: list[Array | None] = []
+    fits = _fits(slab_samples)
+    for level, window in enumerate(windows):
+        count = window.length.sum(0).astype(jnp.float32) * slab_samples
+        if level <= fits:
+            groups = CELL // slab_samples >> level
+            costs.append(count.reshape(-1, groups, count.shape[1]).sum(1)[:num_cells])
+        else:
+            share = 1 << (level - fits)
+            costs.append(jnp.repeat(count / share, share, 0)[:num_cells] if merge else None)
+    return costs
+
+
+def merged_levels(
+    chosen: Int[Array, "cells bundles"], free: Bool[Array, "cells bundles"], slab_samples: int
+) -> Int[Array, "cells bundles"]:
+    """Levels that neighbours agree on: above what fits into a cell, the highest that all of an aligned group allow.
+
+    Args:
+        chosen: candidate of every cell.
+        free: empty cells, that allow any level.
+        slab_samples: samples of a slab.
+    """
+    fits, num_cells = _fits(slab_samples), chosen.shape[0]
+    lateral = chosen == SUPER_PIXEL
+    final = jnp.where(lateral, SUPER_PIXEL, jnp.minimum(chosen, fits))
+    able = jnp.where(free, COARSEST, jnp.where(lateral, 0, chosen))
+    for level in range(fits + 1, LEVELS):
+        share = 1 << (level - fits)
+        groups = jnp.pad(able, ((0, -num_cells % share), (0, 0))).reshape(-1, share, able.shape[1])
+        final = jnp.where(jnp.repeat((groups >= level).all(1), share, 0)[:num_cells], level, final)
+    return final
+
+
+def _fits(slab_samples: int) -> int:
+    """The level at which a cell is one slab."""
+    return (CELL // slab_samples).bit_length() - 1
+
+
+def coarse_work(
+    windows: list[Window], levels: Int[Array, "cells bundles"], paint: Array | None, slab_samples: int
+) -> Worklist:
+    """The list of work for the `levels` of cells, as `merged_levels` gives them.
+
+    Args:
+        paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
+    """
+    per_cell = CELL // slab_samples
+    classes, slabs, bundles = windows[0].begin.shape
+    level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, slabs - levels.shape[0] * per_cell), (0, 0)))
+    place = jnp.arange(slabs, dtype=jnp.int32)[:, None]
+    painted = (level == SUPER_PIXEL) & (place % per_cell == 0)
+    begin, length = (jnp.zeros((classes, slabs, bundles), jnp.int32) for _ in range(2))
+    for step, window in enumerate(windows):
+        here = (level == step) & (place % (1 << step) == 0)
+        begin, length = (
+            jnp.where(here, jnp.repeat(union, 1 << step, 1), value)
+            for union, value in ((window.begin, begin), (window.length, length))
+        )
+    count = length.sum(0).astype(jnp.int32)
+    level = jnp.where(level == SUPER_PIXEL, COARSEST, level)
+    if paint is None:
+        return Worklist(count > 0, level, begin, length, count)
+    colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
+    return Worklist((count > 0) | painted, level, begin, length, count, painted, colors)
+
+
+jax.tree_util.register_dataclass(Window, data_fields=["begin", "length"], meta_fields=[])
