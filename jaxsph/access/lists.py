@@ -5,6 +5,9 @@ Flow: ordering -> footprint -> [lists] -> cells -> cast -> image.
 Expanding to (particle, bundle) pairs and sorting them all is the bottleneck of a CPU, so the sort runs on the four times
 coarser *tiles* of 2 x 2 bundles; each tile's sorted list is then split among its bundles by the exact sphere-against-pyramid
 test, with prefix sums and a scatter that keep the order. Lists hold ranks, so they ascend by class and depth.
+
+Memory that is touched for the first time costs more here than arithmetic. So flags are packed into words, whose prefix sums
+are short, and what is as long as the pairs is made run by run.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from jaxsph.numerics.staging import computed_once
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
 RUNS = 16  # sorts that run side by side
+WORD = 32  # flags in a word
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
 
@@ -85,9 +89,8 @@ def build_lists(
     """The lists of all bundles of the band that starts at pixel row `first_row`."""
     ranges = bundle_ranges(ordered, camera, depths, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
-    touch = functools.partial(_touched_children, plan=plan)
-    touched = computed_once(pairs.start[0, 0] >= 0, touch, ordered, camera, first_row, ranges, pairs)
-    return _split(pairs, touched, plan)
+    touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
+    return _split(pairs, lax.map(touch, (pairs.rank, pairs.tile)), plan)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,87 +119,110 @@ def bundle_ranges(
 class _Pairs:
     """(Particle, tile) pairs in runs, each sorted by (tile, rank); a run's ranks all precede those of the next run.
 
-    `start[run, tile]` is where a run's pairs of a tile begin; tile `num_tiles` collects unused slots.
+    `start[run, tile]` is where a tile's pairs begin within the run; tile `num_tiles` collects unused slots.
     """
 
-    rank: Int[Array, " pairs"]
-    tile: Int[Array, " pairs"]
-    run: Int[Array, " pairs"]
+    rank: Int[Array, "runs slots"]
+    tile: Int[Array, "runs slots"]
     start: Int[Array, "runs tiles_and_one"]
     faults: Int[Array, ""]
 
 
 def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
     """Expand particles to the tiles that they can touch."""
-    capacity, num_particles = plan.tile_capacity, ranges.left.shape[0]
+    words = RUNS * -(-plan.tile_capacity // (RUNS * WORD))
+    rectangles = functools.partial(_rectangles, plan=plan, words=words)
+    seen, last, total = computed_once(ranges.left[0] >= 0, rectangles, ranges)
+    nth = _set_before(last[:, None], _counted(last)[:, None], jnp.arange(WORD))
+    slots = jnp.arange(words * WORD, dtype=jnp.int32).reshape(words, WORD)
+    rank, begin, corner, columns = (column[nth] for column in seen)
+    # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
+    row = ((slots - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)
+    tile = corner + row.astype(jnp.int32) * (plan.tile_columns - columns) + slots - begin
+    tile = jnp.where(slots < jnp.minimum(total, plan.tile_capacity), tile, plan.num_tiles)
+    overflow = faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity)
+    return _sorted_runs(tile, rank, plan, ranges.left.shape[0], overflow)
+
+
+def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Array, ...], Array, Array]:
+    """Particles that can touch a tile (rank, first slot, first tile, columns), flags of their last slots, slots in all."""
+    num_particles = ranges.left.shape[0]
     left, top = ranges.left >> 1, ranges.top >> 1
     columns = jnp.where(ranges.right > ranges.left, ((ranges.right + 1) >> 1) - left, 0)
     count = columns * (((ranges.bottom + 1) >> 1) - top)
-    end = lax.associative_scan(jnp.add, count)
-    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], capacity + 1)
-    slots = jnp.arange(capacity, dtype=jnp.int32)
-    begin = jnp.where(count > 0, end - count, capacity)
-    particle = jnp.zeros(capacity, jnp.int32).at[begin].set(jnp.arange(num_particles, dtype=jnp.int32), mode="drop")
-    particle = lax.associative_scan(jnp.maximum, particle)
-    within = slots - begin[particle]
-    # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
-    row = ((within.astype(jnp.float32) + 0.5) / columns[particle].astype(jnp.float32)).astype(jnp.int32)
-    tile = (top * plan.tile_columns + left)[particle] + row * (plan.tile_columns - columns[particle]) + within
-    tile = jnp.where(slots < total, tile, plan.num_tiles)
-    overflow = faults.raised(faults.TILE_OVERFLOW, total > capacity)
-    return _sorted_runs(tile, particle, plan, num_particles, overflow)
+    end, nth = lax.associative_scan(jnp.add, count), lax.associative_scan(jnp.add, (count > 0).astype(jnp.int32))
+    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], plan.tile_capacity + 1)
+    flag = jnp.where(count > 0, jnp.uint32(1) << ((end - 1) & (WORD - 1)).astype(jnp.uint32), 0)
+    last = jnp.zeros(words, jnp.uint32).at[(end - 1) // WORD].add(flag, mode="drop")
+    place = jnp.where(count > 0, nth - 1, num_particles)  # always in bounds, as a dropped entry is a branch mispredicted
+    seen = jnp.zeros(num_particles + 1, jnp.int32).at[place].set(jnp.arange(num_particles, dtype=jnp.int32))
+    first = (end - count, top * plan.tile_columns + left, columns)
+    return (seen, *(column[seen] for column in first)), last, total
+
+
+def _counted(word: Int[Array, "*some words"]) -> Int[Array, "*some words"]:
+    """Flags that are set in the words before each."""
+    number = lax.population_count(word).astype(jnp.int32)
+    return lax.associative_scan(jnp.add, number, axis=-1) - number
+
+
+def _set_before(word: Array, counted: Array, lane: Array) -> Array:
+    """Flags that are set before a flag: those before its word, and those in it."""
+    return counted + lax.population_count(word & ((jnp.uint32(1) << lane.astype(jnp.uint32)) - 1)).astype(jnp.int32)
 
 
 def _sorted_runs(tile: Array, rank: Array, plan: ListPlan, num_particles: int, overflow: Array) -> _Pairs:
     """Sort by (tile, rank) through one packed key, in runs that are independent, so that XLA sorts them side by side."""
     bits = max(num_particles - 1, 1).bit_length()
     wide = bits + plan.num_tiles.bit_length() > 32
-    runs = RUNS if plan.tile_capacity % RUNS == 0 else 1
     with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
         kind = jnp.uint64 if wide else jnp.uint32
-        key = (tile.astype(kind) << bits) | rank.astype(kind)
-        key = jnp.concatenate([lax.sort(part) for part in jnp.split(key, runs)])
+        key = ((tile.astype(kind) << bits) | rank.astype(kind)).reshape(RUNS, -1)
+        key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
         tile = (key >> bits).astype(jnp.int32)
     wanted = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)
-    starts = jax.vmap(lambda part: jnp.searchsorted(part, wanted))(tile.reshape(runs, -1)).astype(jnp.int32)
-    length = plan.tile_capacity // runs
-    run = jnp.arange(plan.tile_capacity, dtype=jnp.int32) // length
-    return _Pairs(rank, tile, run, starts + jnp.arange(runs, dtype=jnp.int32)[:, None] * length, overflow)
+    starts = jax.vmap(lambda run: jnp.searchsorted(run, wanted))(tile).astype(jnp.int32)
+    return _Pairs(rank, tile, starts, overflow)
 
 
-def _split(pairs: _Pairs, touched: Int[Array, " pairs"], plan: ListPlan) -> BundleLists:
+def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> BundleLists:
     """Split each tile's pairs among its four bundles: lists are ordered by tile, bundle, run, rank."""
-    counts, befores = [], []
-    for child in range(4):
-        flag = (touched >> child) & 1
-        upto = lax.associative_scan(jnp.add, flag)
-        at_start = jnp.where(pairs.start > 0, upto[jnp.maximum(pairs.start - 1, 0)], 0)
-        counts.append(at_start[:, 1:] - at_start[:, :-1])
-        befores.append((upto - flag, at_start[:, :-1]))
-    count = jnp.stack(counts, 2)
-    ordered_count = jnp.moveaxis(count, 0, 2).reshape(-1)
+    runs, slots = touched.shape
+    lane, child = jnp.arange(WORD, dtype=jnp.uint32), jnp.arange(4, dtype=jnp.uint32)[:, None, None]
+    flag = (touched.reshape(-1, WORD).astype(jnp.uint32) >> child) & 1
+    word = jnp.pad((flag << lane).sum(2, dtype=jnp.uint32), ((0, 0), (0, 1)))
+    counted = _counted(word)
+    start = pairs.start + jnp.arange(runs, dtype=jnp.int32)[:, None] * slots
+    at_start = _set_before(word[:, start // WORD], counted[:, start // WORD], start % WORD)
+    count = at_start[:, :, 1:] - at_start[:, :, :-1]
     overflow = pairs.faults | faults.raised(faults.LIST_OVERFLOW, count.astype(jnp.float32).sum() > plan.list_capacity)
-    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(ordered_count)])
-    runs = count.shape[0]
-    run_begins = jnp.moveaxis(begins[:-1].reshape(plan.num_tiles, 4, runs), 2, 0)
-    rank = jnp.zeros(plan.list_capacity, jnp.int32)
-    segment = pairs.run * plan.num_tiles + jnp.minimum(pairs.tile, plan.num_tiles - 1)
-    for child, (before, at_start) in enumerate(befores):
-        shift = (run_begins[:, :, child] - at_start).reshape(-1)
-        target = jnp.where((touched >> child) & 1 > 0, before + shift[segment], plan.list_capacity)
-        rank = rank.at[target].set(pairs.rank, mode="drop", unique_indices=True)
+    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jnp.moveaxis(count, 2, 0).ravel())])
+    shift = jnp.moveaxis(begins[:-1].reshape(plan.num_tiles, 4, runs), 0, 2) - at_start[:, :, :-1]
+    word, counted = (value[:, :-1].reshape(4, runs, -1, 1) for value in (word, counted))
+
+    def place(run: Array, rank: Array) -> Array:
+        tile = jnp.minimum(pairs.tile[run], plan.num_tiles - 1).reshape(-1, WORD)
+        for child in range(4):
+            flags = word[child, run]
+            target = _set_before(flags, counted[child, run], lane) + shift[child, run][tile]
+            target = jnp.where((flags >> lane) & 1 > 0, target, plan.list_capacity)
+            rank = rank.at[target.ravel()].set(pairs.rank[run], mode="drop")
+        return rank
+
+    # the last entry takes what belongs to no list: to drop half of the entries is to mispredict half of the branches
+    rank = lax.fori_loop(0, runs, place, jnp.zeros(plan.list_capacity + 1, jnp.int32))
     return BundleLists(rank, jnp.minimum(begins[::runs], plan.list_capacity), overflow)
 
 
 def _touched_children(
-    ordered: Ordered, camera: Camera, first_row: Any, ranges: Ranges, pairs: _Pairs, *, plan: ListPlan
+    ordered: Ordered, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
-    rank = pairs.rank
+    rank, tile = pairs
     x, y, z, reach = (column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
     tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
-    down, across = ((2 * place)[pairs.tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
+    down, across = ((2 * place)[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
     columns: list[tuple[Array, tuple[Array, Array]]] = []
     rows: list[tuple[Array, tuple[Array, Array]]] = []
     for half in range(2):
@@ -207,12 +233,12 @@ def _touched_children(
         sides = side_distances(y, z, _of(x, camera.row(low)), _of(x, camera.row(high)), camera.is_perspective)
         rows.append(((ranges.top[rank] <= down + half) & (down + half < ranges.bottom[rank]), sides))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
-    mask = jnp.zeros_like(rank)
+    mask = jnp.zeros(rank.shape, jnp.uint8)
     for child in range(4):
         (inside_column, x_side), (inside_row, y_side) = columns[child & 1], rows[child >> 1]
         touched = inside_column & inside_row & touches(x_side, y_side, reach, size)
-        mask |= touched.astype(jnp.int32) << child
-    return jnp.where(pairs.tile < plan.num_tiles, mask, 0)
+        mask |= touched.astype(jnp.uint8) << child
+    return jnp.where(tile < plan.num_tiles, mask, 0)
 
 
 def _of(like: Array, value: Array) -> Array:
