@@ -129,19 +129,44 @@ class _Pairs:
 
 
 def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
-    """Expand particles to the tiles that they can touch."""
+    """Expand particles to the tiles that they can touch, and sort by (tile, rank).
+
+    Each run is sorted by itself through one packed key; XLA sorts them side by side.
+    """
     words = RUNS * -(-plan.tile_capacity // (RUNS * WORD))
     rectangles = functools.partial(_rectangles, plan=plan, words=words)
     seen, last, total = computed_once(ranges.left[0] >= 0, rectangles, ranges)
-    nth = _set_before(last[:, None], _counted(last)[:, None], jnp.arange(WORD))
-    slots = jnp.arange(words * WORD, dtype=jnp.int32).reshape(words, WORD)
+    bits = max(ranges.left.shape[0] - 1, 1).bit_length()
+    wide = bits + plan.num_tiles.bit_length() > 32
+    used = jnp.minimum(total, plan.tile_capacity)
+    flags = [value.reshape(RUNS, -1) for value in (last, _counted(last), jnp.arange(words, dtype=jnp.int32) * WORD)]
+    with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
+        kind = jnp.uint64 if wide else jnp.uint32
+
+        def packed(flags: list[Array]) -> Array:
+            tile, rank = _expanded(seen, flags, used, plan)
+            return (tile.astype(kind) << bits) | rank.astype(kind)
+
+        key = lax.map(packed, flags)
+        key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
+        rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
+        tile = (key >> bits).astype(jnp.uint16 if plan.num_tiles < 1 << 16 else jnp.int32)
+    wanted = jnp.arange(plan.num_tiles + 1, dtype=tile.dtype)
+    start = jax.vmap(lambda run: jnp.searchsorted(run, wanted))(tile).astype(jnp.int32)
+    return _Pairs(rank, tile, start, faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity))
+
+
+def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: ListPlan) -> tuple[Array, Array]:
+    """Tile and rank of each slot of a run."""
+    last, counted, slot = (value[:, None] for value in flags)
+    lane = jnp.arange(WORD, dtype=jnp.int32)
+    nth = _set_before(last, counted, lane).ravel()
+    slot = (slot + lane).ravel()
     rank, begin, corner, columns = (column[nth] for column in seen)
     # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
-    row = ((slots - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)
-    tile = corner + row.astype(jnp.int32) * (plan.tile_columns - columns) + slots - begin
-    tile = jnp.where(slots < jnp.minimum(total, plan.tile_capacity), tile, plan.num_tiles)
-    overflow = faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity)
-    return _sorted_runs(tile, rank, plan, ranges.left.shape[0], overflow)
+    row = ((slot - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)
+    tile = corner + row.astype(jnp.int32) * (plan.tile_columns - columns) + slot - begin
+    return jnp.where(slot < used, tile, plan.num_tiles), rank
 
 
 def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Array, ...], Array, Array]:
@@ -171,21 +196,6 @@ def _set_before(word: Array, counted: Array, lane: Array) -> Array:
     return counted + lax.population_count(word & ((jnp.uint32(1) << lane.astype(jnp.uint32)) - 1)).astype(jnp.int32)
 
 
-def _sorted_runs(tile: Array, rank: Array, plan: ListPlan, num_particles: int, overflow: Array) -> _Pairs:
-    """Sort by (tile, rank) through one packed key, in runs that are independent, so that XLA sorts them side by side."""
-    bits = max(num_particles - 1, 1).bit_length()
-    wide = bits + plan.num_tiles.bit_length() > 32
-    with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
-        kind = jnp.uint64 if wide else jnp.uint32
-        key = ((tile.astype(kind) << bits) | rank.astype(kind)).reshape(RUNS, -1)
-        key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
-        rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
-        tile = (key >> bits).astype(jnp.int32)
-    wanted = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)
-    starts = jax.vmap(lambda run: jnp.searchsorted(run, wanted))(tile).astype(jnp.int32)
-    return _Pairs(rank, tile, starts, overflow)
-
-
 def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> BundleLists:
     """Split each tile's pairs among its four bundles: lists are ordered by tile, bundle, run, rank."""
     runs, slots = touched.shape
@@ -202,7 +212,7 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
     word, counted = (value[:, :-1].reshape(4, runs, -1, 1) for value in (word, counted))
 
     def place(run: Array, rank: Array) -> Array:
-        tile = jnp.minimum(pairs.tile[run], plan.num_tiles - 1).reshape(-1, WORD)
+        tile = jnp.minimum(pairs.tile[run].astype(jnp.int32), plan.num_tiles - 1).reshape(-1, WORD)
         for child in range(4):
             flags = word[child, run]
             target = _set_before(flags, counted[child, run], lane) + shift[child, run][tile]
