@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -90,7 +91,12 @@ def build_lists(
     ranges = bundle_ranges(ordered, camera, depths, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
     touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
-    return _split(pairs, lax.map(touch, (pairs.rank, pairs.tile)), plan)
+    return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
+
+
+def _run_by_run(always: Array, function: Callable[[Any], Array], runs: Any) -> Array:
+    """`lax.map`; a result that XLA fuses with its being stored would be computed on one thread, so it is kept apart."""
+    return lax.map(lambda run: computed_once(always, function, run), runs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +153,7 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
             tile, rank = _expanded(seen, flags, used, plan)
             return (tile.astype(kind) << bits) | rank.astype(kind)
 
-        key = lax.map(packed, flags)
+        key = _run_by_run(total >= 0, packed, flags)
         key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
         tile = (key >> bits).astype(jnp.uint16 if plan.num_tiles < 1 << 16 else jnp.int32)
