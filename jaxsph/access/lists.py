@@ -68,7 +68,10 @@ class ListPlan:
 
 @dataclasses.dataclass(frozen=True)
 class BundleLists:
-    """Ranks of the particles that can touch each bundle: `rank[start[b] : start[b + 1]]`, ascending."""
+    """Ranks of the particles that can touch each bundle: `rank[start[b] : start[b + 1]]`, ascending.
+
+    What `rank` holds past the last list is of no meaning.
+    """
 
     rank: Int[Array, " pairs"]
     start: Int[Array, " bundles_and_one"]
@@ -141,7 +144,8 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
     """
     words = RUNS * -(-plan.tile_capacity // (RUNS * WORD))
     rectangles = functools.partial(_rectangles, plan=plan, words=words)
-    seen, last, total = computed_once(ranges.left[0] >= 0, rectangles, ranges)
+    always = ranges.left[0] >= 0
+    seen, last, total = computed_once(always, rectangles, ranges)
     bits = max(ranges.left.shape[0] - 1, 1).bit_length()
     wide = bits + plan.num_tiles.bit_length() > 32
     used = jnp.minimum(total, plan.tile_capacity)
@@ -153,13 +157,14 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
             tile, rank = _expanded(seen, flags, used, plan)
             return (tile.astype(kind) << bits) | rank.astype(kind)
 
-        key = _run_by_run(total >= 0, packed, flags)
+        key = _run_by_run(always, packed, flags)
         key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
         tile = (key >> bits).astype(jnp.uint16 if plan.num_tiles < 1 << 16 else jnp.int32)
     wanted = jnp.arange(plan.num_tiles + 1, dtype=tile.dtype)
     start = jax.vmap(lambda run: jnp.searchsorted(run, wanted))(tile).astype(jnp.int32)
-    return _Pairs(rank, tile, start, faults.raised(faults.TILE_OVERFLOW, total > plan.tile_capacity))
+    overflow = faults.raised(faults.TILE_OVERFLOW, (total < 0) | (total > plan.tile_capacity))
+    return _Pairs(rank, tile, start, overflow)
 
 
 def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: ListPlan) -> tuple[Array, Array]:
@@ -176,13 +181,16 @@ def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: Li
 
 
 def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Array, ...], Array, Array]:
-    """Particles that can touch a tile (rank, first slot, first tile, columns), flags of their last slots, slots in all."""
+    """Particles that can touch a tile: (rank, first slot, first tile, columns), flags of their last slots, slots in all.
+
+    Where the slots are too many to be counted, they are -1 in all.
+    """
     num_particles = ranges.left.shape[0]
     left, top = ranges.left >> 1, ranges.top >> 1
     columns = jnp.where(ranges.right > ranges.left, ((ranges.right + 1) >> 1) - left, 0)
     count = columns * (((ranges.bottom + 1) >> 1) - top)
     end, nth = lax.associative_scan(jnp.add, count), lax.associative_scan(jnp.add, (count > 0).astype(jnp.int32))
-    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], plan.tile_capacity + 1)
+    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], -1)
     flag = jnp.where(count > 0, jnp.uint32(1) << ((end - 1) & (WORD - 1)).astype(jnp.uint32), 0)
     last = jnp.zeros(words, jnp.uint32).at[(end - 1) // WORD].add(flag, mode="drop")
     place = jnp.where(count > 0, nth - 1, num_particles)  # always in bounds, as a dropped entry is a branch mispredicted
