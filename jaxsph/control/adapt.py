@@ -14,10 +14,9 @@ from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.analysis import analyse
-from jaxsph.control.errors import CELL
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels
-from jaxsph.control.worklist import Worklist
+from jaxsph.control.worklist import CELL, Worklist
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 
@@ -63,7 +62,7 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, relax, slab_samples)
+    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, tolerance, relax, slab_samples)
     num_cells, bundles = analysis.error.shape[1:]
     samples = half_steps.shape[0] // 2
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]

@@ -1,8 +1,9 @@
-"""The error analysis of a band: what every cell's candidates would cost in light, front to back.
+"""The error analysis of a band: what every cell's candidates would cost in light.
 
-Flow: cells -> [analysis: bounds -> errors] -> levels -> merge -> cast -> image.
+Flow: cells -> [analysis: probe -> bounds -> errors] -> levels -> merge -> cast -> image.
 
-Filled cells are stacked and marched layer by layer, as the cast does, so that empty space costs nothing.
+Cells are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So promising
+cells can be taken in any order: fullest first, `CHUNK` at a time, wherever they are.
 """
 
 from __future__ import annotations
@@ -13,25 +14,27 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
-from jaxsph.access.stacks import stack
 from jaxsph.control.bounds import Footprint, sample_bounds, spheres
-from jaxsph.control.errors import CANDIDATES, CELL, cell_errors
+from jaxsph.control.errors import CANDIDATES, cell_errors
+from jaxsph.control.probe import promising
 from jaxsph.control.ranges import range_tables
+from jaxsph.control.worklist import CELL
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
 
-CHUNK = 512  # bundles analysed together: operands of their cells stay in the second-level cache
+CHUNK = 256  # cells analysed together: operands stay in the second-level cache
+SIZE_BITS = 5  # of a sort key: how full a cell is, in quarters of octaves
 
 
 @dataclasses.dataclass(frozen=True)
 class Analysis:
-    """Errors of all candidates of all cells: levels 0 to 4, super-pixel. Empty cells have none.
+    """Errors of all candidates of all cells: levels 0 to 4, super-pixel. Infinite where nothing was analysed.
 
     Attributes:
         error: bound (an estimate if relaxed) of the change of the bundle's pixels.
@@ -52,12 +55,14 @@ def analyse(
     camera: Camera,
     transfer: TransferFunction,
     half_steps: Float[Array, " two_samples_and_one"],
+    tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
 ) -> Analysis:
-    """Analyse all filled cells of a band; the arguments are those of `cast_points`.
+    """Analyse the cells of a band that `probe` finds promising; the first arguments are those of `cast_points`.
 
     Args:
+        tolerance: largest error of a pixel.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
         slab_samples: samples of each slab of `cells`.
     """
@@ -65,44 +70,58 @@ def analyse(
     dtype = ordered.x.dtype
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
-    chunk = min(CHUNK, -(-bundles // 16) * 16)
+    chunk = min(CHUNK, -(-num_cells * bundles // 16) * 16)
     tables, balls = range_tables(transfer), spheres(ordered)
-    missing = num_cells * per_cell - slabs
-    count = jnp.pad(cells.count, ((0, missing), (0, 0))).reshape(num_cells, per_cell, bundles).sum(1)
-    stacks = stack(count > 0, count, 1, chunk)
-    row, column = (jnp.append(origin, 0) for origin in origins)
-    begin, length = (jnp.pad(window, ((0, 0), (0, missing + per_cell), (0, 1))) for window in (cells.begin, cells.length))
-    borders = jnp.pad(half_steps[::2], (0, (num_cells + 1) * CELL - half_steps.shape[0] // 2), mode="edge")
-
+    missing = ((0, num_cells * per_cell - slabs), (0, 0))
+    borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - half_steps.shape[0] // 2), mode="edge")
+    wanted = promising(ordered.quantity, lists.rank, cells, borders, tables, tolerance, slab_samples)
+    count = jnp.pad(cells.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
+    order, number = _fullest_first(wanted.ravel(), count.ravel(), chunk)
+    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (cells.begin, cells.length))
     pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]
 
-    def analyse_layer(layer: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        def analyse_chunk(step: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            front, table = state
-            bundle = lax.dynamic_slice(stacks.order, (layer, step * chunk), (1, chunk))[0]
-            cell = stacks.place[layer, bundle]
-            u = camera.column((column[bundle] + pixel).astype(dtype) + 0.5)
-            v = camera.row((row[bundle] + pixel).astype(dtype) + 0.5)
-            slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
-            window = tuple(side[:, slab, jnp.tile(bundle, per_cell)] for side in (begin, length))
-            edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
-            footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
-            of_slabs = sample_bounds(balls, lists.rank, window, footprint, edges, tables, camera.is_perspective)
-            bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
-            edges = borders[cell * CELL + jnp.arange(CELL + 1, dtype=jnp.int32)[:, None]]
-            paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)
-            if camera.is_perspective:
-                paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
-            path = paths.min((0, 1)), paths.max((0, 1))
-            found = computed_once(step >= 0, cell_errors, bounds, edges, *path, front[bundle], relax)
-            entry = jnp.concatenate([found.error, found.strict, found.paint])
-            return front.at[bundle].set(found.front), table.at[:, cell, bundle].set(entry)
+    def analyse_chunk(step: Array, table: Array) -> Array:
+        at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
+        cell, bundle, real = at // bundles, at % bundles, step * chunk + jnp.arange(chunk) < number
+        u = camera.column((origins[1][bundle] + pixel).astype(dtype) + 0.5)
+        v = camera.row((origins[0][bundle] + pixel).astype(dtype) + 0.5)
+        slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
+        across, alive = jnp.tile(bundle, per_cell), jnp.tile(real, per_cell)
+        window = begin[:, slab, across], jnp.where(alive, length[:, slab, across], 0)
+        edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
+        footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
+        of_slabs = sample_bounds(balls, lists.rank, window, footprint, edges, tables, camera.is_perspective)
+        bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
+        edges = borders[cell * CELL + jnp.arange(CELL + 1, dtype=jnp.int32)[:, None]]
+        paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)
+        if camera.is_perspective:
+            paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
+        found = computed_once(step >= 0, cell_errors, bounds, edges, paths.min((0, 1)), paths.max((0, 1)), relax)
+        entry = jnp.concatenate([found.error, found.strict, found.paint, found.thin[None]])
+        return table.at[:, jnp.where(real, at, table.shape[1])].set(entry, mode="drop", unique_indices=True)
 
-        return lax.fori_loop(0, stacks.num_chunks[layer], analyse_chunk, state)
+    # what is not analysed stays at level 0: the only candidate without an infinite error
+    blank = jnp.full(2 * CANDIDATES + 5, jnp.inf, dtype).at[jnp.asarray([0, CANDIDATES, -1])].set(0)[:, None]
+    table = jnp.broadcast_to(blank, (blank.shape[0], num_cells * bundles))
+    table = lax.fori_loop(0, (number + chunk - 1) // chunk, analyse_chunk, table).reshape(-1, num_cells, bundles)
+    error, strict, paint, thin = jnp.split(table, [CANDIDATES, 2 * CANDIDATES, 2 * CANDIDATES + 4])
+    front = _transmitted(thin[0])
+    return Analysis(front * error, front * strict, paint)
 
-    state = jnp.ones(bundles + 1, dtype), jnp.zeros((2 * CANDIDATES + 4, num_cells + 1, bundles + 1), dtype)
-    _, table = lax.fori_loop(0, (stacks.num_chunks > 0).sum(), analyse_layer, state)
-    return Analysis(*jnp.split(table[:, :-1, :-1], [CANDIDATES, 2 * CANDIDATES]))
+
+def _fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
+    """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
+    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 16), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
+    bits = 32 - SIZE_BITS
+    key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
+    order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
+
+
+def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
+    """At least what the cells in front let through; the sum is rounded down."""
+    total = lax.associative_scan(jnp.add, thin) * (1 - thin.shape[0] * jnp.finfo(thin.dtype).eps)
+    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])])
 
 
 def _by_cell(value: Array, per_cell: int) -> Array:

@@ -29,9 +29,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.control.bounds import SampleBounds
-from jaxsph.control.worklist import COARSEST
+from jaxsph.control.worklist import CELL, COARSEST
 
-CELL = 1 << COARSEST  # fine samples of a cell
 LEVELS = COARSEST + 1
 SUPER_PIXEL = LEVELS  # the candidate after the last level
 CANDIDATES = LEVELS + 1
@@ -42,20 +41,20 @@ EVALUATION = 512  # roundings, at most, between the bounds and an error; all ter
 
 @dataclasses.dataclass(frozen=True)
 class CellErrors:
-    """Of a layer of cells.
+    """Of single cells, as seen from right in front of them.
 
     Attributes:
-        error: for every candidate (levels 0 to 4, super-pixel), how much the pixels of the bundle can change; ascends with
-            the level.
+        error: for every candidate (levels 0 to 4, super-pixel), how much the light that leaves the cell can change;
+            ascends with the level.
         strict: the same without relaxation.
         paint: red, green, blue and extinction of the super-pixel.
-        front: bound of the transmittance behind the cell.
+        thin: least optical thickness.
     """
 
     error: Float[Array, "candidates bundles"]
     strict: Float[Array, "candidates bundles"]
     paint: Float[Array, "4 bundles"]
-    front: Float[Array, " bundles"]
+    thin: Float[Array, " bundles"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,16 +75,14 @@ def cell_errors(
     borders: Float[Array, "samples_and_one bundles"],
     shortest: Float[Array, " bundles"],
     longest: Float[Array, " bundles"],
-    front: Float[Array, " bundles"],
     relax: Float[Array, ""],
 ) -> CellErrors:
-    """Errors of all candidates of a layer of cells.
+    """Errors of all candidates of cells.
 
     Args:
         bounds: of the 16 sample slabs of each cell.
         borders: depths of their borders.
         shortest, longest: path length a unit of depth of the bundle's rays.
-        front: bound of the transmittance in front of the cells.
         relax: share of the lateral variation that is taken off (section 5.1); 0 for a certificate.
     """
     optics = _optics(bounds, borders, shortest, longest)
@@ -93,14 +90,14 @@ def cell_errors(
     paint, lateral = _super_pixel(optics, longest)
 
     def of_levels(share: Array) -> Array:
-        errors = [jnp.zeros_like(front)]
+        errors = [jnp.zeros_like(lateral)]
         for level in range(1, LEVELS):
             errors.append(jnp.maximum(errors[-1], _coarser(level, optics, shortest, longest, share)))
         return jnp.stack([*errors, lateral]) * outward
 
     strict = of_levels(jnp.zeros_like(relax))
     error = lax.cond(relax > 0, of_levels, lambda _: strict, relax)
-    return CellErrors(error * front, strict * front, paint, front * jnp.exp(-optics.thin.sum(0)))
+    return CellErrors(error, strict, paint, optics.thin.sum(0))
 
 
 def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Array) -> _Optics:

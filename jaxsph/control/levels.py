@@ -44,9 +44,7 @@ class Offer:
     rounding: Float[Array, " bundles"]
 
 
-def choose(
-    analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str
-) -> Int[Array, "cells bundles"]:
+def choose(analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str) -> Int[Array, "cells bundles"]:
     """The candidate of every cell: level 0 to 4, or super-pixel.
 
     Args:
@@ -56,61 +54,57 @@ def choose(
         allocation: `"budget"`, `"greedy"` (back to front), or `"independent"` (each cell as if it were alone: the paper's
             l_max without its greedy, whose sum may break the tolerance).
     """
-    keeps = analysis.strict + offer.rounding <= tolerance
-    allowed = (offer.allowed & keeps).at[0].set(True)
-    left = tolerance - offer.rounding
+    allowed = offer.allowed & (analysis.strict + offer.rounding <= tolerance)
+    error = jnp.where(allowed, analysis.error, jnp.inf).at[0].set(0)
     if allocation == "independent":
-        return lax.stop_gradient(_best(offer.saving, allowed))
-    if allocation == "greedy":
-        return lax.stop_gradient(_back_to_front(analysis.error, offer.saving, allowed, left))
-    return lax.stop_gradient(_at_best_price(analysis.error, offer, allowed, tolerance))
-
-
-def errors_of(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"]) -> Array:
-    """The error of the chosen candidates, (cells, bundles)."""
-    taken = error[0]
-    for candidate in range(1, CANDIDATES):
-        taken = jnp.where(chosen == candidate, error[candidate], taken)
-    return taken
+        chosen = _best(offer.saving, error, 0)[0]
+    elif allocation == "greedy":
+        chosen = _back_to_front(offer.saving, error, tolerance - offer.rounding)
+    else:
+        chosen = _at_best_price(offer, error, tolerance)
+    return lax.stop_gradient(chosen)
 
 
 def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
     """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
-    return jnp.where((chosen > 0).any(0), errors_of(error, chosen).sum(0) + rounding, 0)
-
-
-def _best(worth: Array, allowed: Array) -> Array:
-    """The allowed candidate of most worth; of equals the first."""
-    best, chosen = worth[0], jnp.zeros(worth.shape[1:], jnp.int32)
+    taken = error[0]
     for candidate in range(1, CANDIDATES):
-        better = allowed[candidate] & (worth[candidate] > best)
-        best, chosen = jnp.where(better, worth[candidate], best), jnp.where(better, candidate, chosen)
-    return chosen
+        taken = jnp.where(chosen == candidate, error[candidate], taken)
+    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0)
 
 
-def _at_best_price(error: Array, offer: Offer, allowed: Array, tolerance: Array) -> Array:
-    def at(price: Array) -> Array:
-        return _best(offer.saving - price * error, allowed)
+def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Array]:
+    """The candidate of most `saving - price * error`, the first of equals, and its error; none with an infinite error."""
+    best, taken, chosen = saving[0], error[0], jnp.zeros(saving.shape[1:], jnp.int32)
+    for candidate in range(1, CANDIDATES):
+        possible = error[candidate] < jnp.inf
+        worth = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
+        better = possible & (worth > best)
+        best, taken = jnp.where(better, worth, best), jnp.where(better, error[candidate], taken)
+        chosen = jnp.where(better, candidate, chosen)
+    return chosen, taken
 
+
+def _at_best_price(offer: Offer, error: Array, tolerance: Array) -> Array:
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        keeps = bound(error, at(jnp.exp2(middle)), offer.rounding) <= tolerance
+        keeps = _best(offer.saving, error, jnp.exp2(middle))[1].sum(0) + offer.rounding <= tolerance
         return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
 
     low, high = (jnp.full_like(offer.rounding, end) for end in (CHEAPEST, DEAREST))
     _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
-    chosen = at(jnp.exp2(high))
-    return jnp.where(bound(error, chosen, offer.rounding) <= tolerance, chosen, 0)
+    chosen, taken = _best(offer.saving, error, jnp.exp2(high))
+    return jnp.where(taken.sum(0) + offer.rounding <= tolerance, chosen, 0)
 
 
-def _back_to_front(error: Array, saving: Array, allowed: Array, left: Array) -> Array:
-    def step(left: Array, cell: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        error, saving, allowed = cell
-        chosen = _best(saving, allowed & (error <= left))
-        return left - errors_of(error, chosen), chosen
+def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
+    def step(left: Array, cell: tuple[Array, Array]) -> tuple[Array, Array]:
+        saving, error = cell
+        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
+        return left - taken, chosen
 
-    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (error, saving, allowed))
+    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
     return lax.scan(step, left, cells, reverse=True)[1]
 
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jaxsph.access.cells import Cells
-from jaxsph.control.errors import CELL, LEVELS, SUPER_PIXEL
-from jaxsph.control.worklist import COARSEST, Worklist
+from jaxsph.control.errors import LEVELS, SUPER_PIXEL
+from jaxsph.control.worklist import CELL, COARSEST, Worklist
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import Cells
 
-COARSEST = 4  # level at which a cell of 16 samples has one: log2 D_z
+COARSEST = 4  # level at which a cell has one sample
+CELL = 1 << COARSEST  # fine samples of a cell along depth: D_z of the first paper
 
 
 @dataclasses.dataclass(frozen=True)

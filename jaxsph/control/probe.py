@@ -1,0 +1,98 @@
+r"""Where the error analysis can pay: a cheap look at a few particles of every cell.
+
+Flow: cells -> [probe] -> analysis -> levels -> merge -> cast -> image.
+
+Bounds need every particle of a cell, and most cells of a mixed fluid then turn out to vary too much. A few particles from the
+middle of a slab's window vary less than all of them, so where even their quantities would change the image by more than the
+tolerance, nothing is lost by leaving the cell at full rate without looking further. The probe decides nothing else: whatever
+it says, what is analysed is bounded with care.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.cells import Cells
+from jaxsph.access.stacks import stack
+from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.control.worklist import CELL
+from jaxsph.numerics.staging import computed_once
+
+CHUNK = 1024  # bundles probed together
+PROBES = 8  # particles of each slab, from the middle half of its window
+
+
+def promising(
+    quantity: Float[Array, " particles"],
+    rank: Int[Array, " pairs"],
+    cells: Cells,
+    borders: Float[Array, " borders"],
+    tables: RangeTables,
+    tolerance: Float[Array, ""],
+    slab_samples: int,
+) -> Bool[Array, "cells bundles"]:
+    """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
+
+    Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
+
+    Args:
+        quantity: of the particles, in rank order.
+        borders: depths of the borders of fine samples, padded to whole slabs.
+        tables: of the transfer function.
+    """
+    slabs, bundles = cells.count.shape
+    per_cell = CELL // slab_samples
+    num_cells = -(-slabs // per_cell)
+    chunk = min(CHUNK, -(-bundles // 16) * 16)
+    pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 1))
+    begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
+    count = length.sum(0).reshape(num_cells + 1, per_cell, -1)[:-1, :, :-1].sum(1)
+    stacks = stack(count > 0, count, 1, chunk)
+    steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
+
+    def probe_layer(layer: Array, table: Array) -> Array:
+        def probe_chunk(step: Array, table: Array) -> Array:
+            bundle = lax.dynamic_slice(stacks.order, (layer, step * chunk), (1, chunk))[0]
+            cell = stacks.place[layer, bundle]
+            slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
+            window = begin[:, slab, bundle], length[:, slab, bundle]
+            lo, hi = computed_once(step >= 0, _extremes, quantity, rank, window)
+            entry = computed_once(step >= 0, _varies, lo, hi, steps[slab], tables)
+            return table.at[:, cell, bundle].set(entry)
+
+        return lax.fori_loop(0, stacks.num_chunks[layer], probe_chunk, table)
+
+    table = jnp.zeros((2, num_cells + 1, bundles + 1), quantity.dtype)
+    change, depth = lax.fori_loop(0, (stacks.num_chunks > 0).sum(), probe_layer, table)[:, :-1, :-1]
+    behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
+    front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
+    return (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
+
+
+def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Least and greatest quantity of the probes of slabs; of none, infinite and negative infinite."""
+    begin, length = window
+    total = length.sum(0)
+    lo, hi = jnp.full(total.shape, jnp.inf, quantity.dtype), jnp.full(total.shape, -jnp.inf, quantity.dtype)
+    for k in range(PROBES):
+        index = (total * (2 * k + 1 + PROBES)) // (4 * PROBES)
+        position, before = begin[0] + index, length[0]
+        for c in range(1, begin.shape[0]):
+            position = jnp.where(index >= before, (begin[c] - before) + index, position)
+            before = before + length[c]
+        value = quantity[rank[jnp.clip(position, 0, rank.shape[0] - 1)]]
+        lo, hi = jnp.minimum(lo, value), jnp.maximum(hi, value)
+    return jnp.where(total > 0, lo, jnp.inf), jnp.where(total > 0, hi, -jnp.inf)
+
+
+def _varies(lo: Array, hi: Array, steps: Array, tables: RangeTables) -> Array:
+    """How much cells could change under a super-pixel, and their least optical thickness, as far as probes can tell."""
+    filled = hi >= lo
+    least, greatest = transfer_ranges(tables, jnp.where(filled, lo, 0), jnp.where(filled, hi, 0))
+    thin, thick = least[3] * steps, greatest[3] * steps
+    off = jnp.stack([high - low for low, high in zip(least[:3], greatest[:3], strict=True)]).max(0)
+    middle = 0.5 * (thin + thick)
+    change = jnp.exp(-middle) * -jnp.expm1(-0.5 * (thick - thin)) - 0.5 * off * jnp.expm1(-middle)
+    return jnp.stack([jnp.where(filled, change, 0).sum(0), jnp.where(filled, thin, 0).sum(0)])
