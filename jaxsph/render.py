@@ -22,7 +22,7 @@ from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.cast.points import Rays, cast_points, evaluations
 from jaxsph.control.adapt import adapt
-from jaxsph.control.worklist import Worklist, full_rate
+from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
@@ -148,7 +148,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
 
 def _counts(lists: BundleLists, cells: Cells, plan: Plan) -> tuple[Array, Array, Array]:
     """Filled slabs, (particle, bundle) pairs, and the kernel evaluations of the reference image, of one band."""
-    full = evaluations(full_rate(cells), plan.samples, plan.cast).sum() * BUNDLE * BUNDLE
+    full = evaluations(full_rate(cells, jnp.zeros_like(cells.count)), plan.samples, plan.cast).sum() * BUNDLE * BUNDLE
     return (cells.count > 0).sum(), lists.start[-1], full
 
 
@@ -199,12 +199,13 @@ def _adapt(
     *,
     plan: Plan,
 ) -> _Decided:
+    origin = origins(cells, lists.rank, ordered.quantity)
     if limits is None or plan.control is None:
-        return _Decided(full_rate(cells), jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
+        return _Decided(full_rate(cells, origin), jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
     half_steps = _half_steps(camera, ordered.x, plan)
-    origins = bundle_origins(plan.lists, first_row)
+    corners = bundle_origins(plan.lists, first_row)
     transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
-    grid = (ordered, lists, cells, origins, camera, transfer, half_steps)
+    grid = (ordered, lists, cells, corners, camera, transfer, half_steps, origin)
     return _Decided(*adapt(*grid, *limits, plan.cast.slab_samples, plan.control))
 
 

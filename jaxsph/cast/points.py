@@ -115,8 +115,7 @@ def cast_points(
                 slab = stacks.place[layer * plan.slabs_per_cell + k, bundle]
                 item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
                 s, border = _sample_depths(item, slab, half_steps, plan)
-                window = item.begin, item.length
-                sums = _gather_field(ordered, lists.rank, window, (u, v, s), camera.is_perspective, kernel)
+                sums = _gather_field(ordered, lists.rank, item, (u, v, s), camera.is_perspective, kernel)
                 shade = functools.partial(_shade, perspective=camera.is_perspective)
                 shaded = computed_once(k >= 0, shade, *sums, (u, v, border), segments, item)
                 return _composite(rays, shaded, border)
@@ -156,17 +155,17 @@ def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPla
 def _gather_field(
     ordered: Ordered,
     rank: Int[Array, " pairs"],
-    window: tuple[Int[Array, "classes chunk"], Int[Array, "classes chunk"]],
+    item: Worklist,
     rays: tuple[Array, Array, Array],
     perspective: bool,
     kernel: str,
 ) -> tuple[Array, Array]:
-    """Sums of V W and q V W (up to one common factor) at every sample of the chunk's cells.
+    """Sums of V W and (q - origin) V W (up to one common factor) at every sample of the chunk's items.
 
     The two sums travel as one complex number: of a pair XLA makes two kernels, and each evaluates every weight again.
     """
     u, v, s = rays
-    begin, length = window
+    begin, length = item.begin, item.length
     total = length.sum(0)
     spread = s if perspective else jnp.ones_like(s)
     su, sv = u[:, None, :] * spread[:, :, None], v[:, None, :] * spread[:, :, None]
@@ -193,7 +192,7 @@ def _gather_field(
         x, y, z, scale = (value[:, :, None, None] for value in (x, y, z, scale))
         across = ((su[:, None] - x) * scale) ** 2
         along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
-        return across, smooth.prepare(along, size[:, :, None, None]), size, quantity
+        return across, smooth.prepare(along, size[:, :, None, None]), size, quantity - item.origin[:, None]
 
     zero = jnp.zeros((*su.shape[:2], BUNDLE, BUNDLE), su.dtype)
     blocks = (total.max() + BLOCK - 1) // BLOCK
@@ -223,7 +222,7 @@ def _shade(
     """Red, green, blue, optical thickness and transmittance of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
     inside = weight > 0
-    quantity = jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
+    quantity = item.origin[:, None, None, None] + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
     optics = look_up(segments, quantity)
     if item.paint is not None and item.painted is not None:
         painted = item.painted[:, None, None, None]

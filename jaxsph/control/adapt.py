@@ -47,6 +47,7 @@ def adapt(
     camera: Camera,
     transfer: TransferFunction,
     half_steps: Float[Array, " two_samples_and_one"],
+    origin: Float[Array, "slabs bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
@@ -62,7 +63,7 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, tolerance, relax, slab_samples)
+    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, origin, tolerance, relax, slab_samples)
     num_cells, bundles = analysis.error.shape[1:]
     samples = half_steps.shape[0] // 2
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
@@ -75,7 +76,7 @@ def adapt(
     offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
     chosen = choose(analysis, offer, tolerance, plan.allocation)
     final = merged_levels(chosen, (full == 0) & whole, slab_samples)
-    work = coarse_work(windows, final, analysis.paint if plan.super_pixels else None, slab_samples)
+    work = coarse_work(windows, final, origin, analysis.paint if plan.super_pixels else None, slab_samples)
     final = jnp.where(full > 0, final, 0)
     return work, bound(analysis.error, final, rounding), jnp.where(full > 0, final, EMPTY)
 

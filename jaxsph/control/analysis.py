@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
-from jaxsph.control.bounds import Footprint, sample_bounds, spheres
-from jaxsph.control.errors import CANDIDATES, cell_errors
+from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
+from jaxsph.control.errors import CANDIDATES, cell_errors, fits
 from jaxsph.control.probe import promising
 from jaxsph.control.ranges import range_tables
 from jaxsph.control.worklist import CELL
@@ -55,6 +55,7 @@ def analyse(
     camera: Camera,
     transfer: TransferFunction,
     half_steps: Float[Array, " two_samples_and_one"],
+    origin: Float[Array, "slabs bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
@@ -62,6 +63,7 @@ def analyse(
     """Analyse the cells of a band that `probe` finds promising; the first arguments are those of `cast_points`.
 
     Args:
+        origin: quantity that each slab's sums are taken relative to.
         tolerance: largest error of a pixel.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
         slab_samples: samples of each slab of `cells`.
@@ -78,6 +80,8 @@ def analyse(
     count = jnp.pad(cells.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
     order, number = _fullest_first(wanted.ravel(), count.ravel(), chunk)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (cells.begin, cells.length))
+    origin = jnp.pad(origin, missing)
+    quantities = _extremes(ordered.quantity, ordered.live)
     pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]
 
     def analyse_chunk(step: Array, table: Array) -> Array:
@@ -90,13 +94,19 @@ def analyse(
         window = begin[:, slab, across], jnp.where(alive, length[:, slab, across], 0)
         edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
         footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
-        of_slabs = sample_bounds(balls, lists.rank, window, footprint, edges, tables, camera.is_perspective)
+        places = _extremes(origin[slab, across].reshape(per_cell, chunk), window[1].sum(0).reshape(per_cell, chunk) > 0)
+        places = tuple(jnp.tile(end, per_cell) for end in places)
+        of_slabs = sample_bounds(balls, lists.rank, window, footprint, edges, places, tables, camera.is_perspective)
         bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
         edges = borders[cell * CELL + jnp.arange(CELL + 1, dtype=jnp.int32)[:, None]]
         paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)
         if camera.is_perspective:
             paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
-        found = computed_once(step >= 0, cell_errors, bounds, edges, paths.min((0, 1)), paths.max((0, 1)), relax)
+        misplaced = sum_rounding(count.ravel()[at], dtype) * (quantities[1] - quantities[0])
+        merging = tables.steepest[:, None] * misplaced
+        errors = functools.partial(cell_errors, fitting=fits(slab_samples))
+        path = paths.min((0, 1)), paths.max((0, 1))
+        found = computed_once(step >= 0, errors, bounds, edges, *path, (merging[:3].max(0), merging[3]), relax)
         entry = jnp.concatenate([found.error, found.strict, found.paint, found.thin[None]])
         return table.at[:, jnp.where(real, at, table.shape[1])].set(entry, mode="drop", unique_indices=True)
 
@@ -122,6 +132,11 @@ def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bun
     """At least what the cells in front let through; the sum is rounded down."""
     total = lax.associative_scan(jnp.add, thin) * (1 - thin.shape[0] * jnp.finfo(thin.dtype).eps)
     return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])])
+
+
+def _extremes(value: Array, where: Array) -> tuple[Array, Array]:
+    """Least and greatest along the first axis of those that count."""
+    return jnp.where(where, value, jnp.inf).min(0), jnp.where(where, value, -jnp.inf).max(0)
 
 
 def _by_cell(value: Array, per_cell: int) -> Array:

@@ -11,8 +11,8 @@ inside the support of a single particle; in any other, a sample may be empty.
 Why the bounds hold in floating point: a sphere counts as meeting the slab with its `reach`, outside which computed weights are
 zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle
 is `SOLID` enough for that not to underflow. Boxes are made of the very numbers that the cast multiplies, and rounding is
-monotone. A quotient of two computed sums of n terms leaves the particles' range by less than (n + 4) eps of its largest
-magnitude.
+monotone. Sums are taken of quantities relative to that of a particle near by: a quotient of two computed sums of n terms is
+off by less than (n + 6) eps of how far quantities are from that origin, and adding it rounds once more.
 
 Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises.
 """
@@ -20,6 +20,7 @@ Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -87,10 +88,15 @@ def sample_bounds(
     window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
     footprint: Footprint,
     borders: Float[Array, "samples_and_one bundles"],
+    origin: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
     tables: RangeTables,
     perspective: bool,
 ) -> SampleBounds:
-    """Bounds for the samples between `borders`, from the particles of a window."""
+    """Bounds for the samples between `borders`, from the particles of a window.
+
+    Args:
+        origin: least and greatest quantity that the sums of these samples may be taken relative to.
+    """
     spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
     blocks = (window[1].sum(0).max() + PARTICLES - 1) // PARTICLES
     samples, bundles = borders.shape[0] - 1, borders.shape[1]
@@ -114,9 +120,16 @@ def sample_bounds(
     outermost, farthest = lax.fori_loop(0, blocks, add_block, (outermost, farthest))
     touched = outermost[1] > -jnp.inf
     lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
-    rounding = (window[1].sum(0) + 4) * jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
+    eps = jnp.finfo(dtype).eps
+    farthest_off = jnp.maximum(jnp.maximum(hi - origin[0], origin[1] - lo), 0)
+    rounding = sum_rounding(window[1].sum(0), dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
     least, greatest = transfer_ranges(tables, lo - rounding, hi + rounding)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
+
+
+def sum_rounding(terms: Array, dtype: Any) -> Array:
+    """How far a computed mean of `terms` can be off, as a share of the largest."""
+    return (terms + 6) * jnp.finfo(dtype).eps
 
 
 def _boxes(rays: Array, spread: tuple[Array, Array]) -> tuple[Array, Array]:

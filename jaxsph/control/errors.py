@@ -39,6 +39,11 @@ DEPTH_ROUNDING = 32  # eps that a sum of 16 optical thicknesses, each three roun
 EVALUATION = 512  # roundings, at most, between the bounds and an error; all terms are >= 0, so that they stay relative
 
 
+def fits(slab_samples: int) -> int:
+    """The level at which a cell is one slab; beyond it, cells are merged."""
+    return (CELL // slab_samples).bit_length() - 1
+
+
 @dataclasses.dataclass(frozen=True)
 class CellErrors:
     """Of single cells, as seen from right in front of them.
@@ -75,7 +80,10 @@ def cell_errors(
     borders: Float[Array, "samples_and_one bundles"],
     shortest: Float[Array, " bundles"],
     longest: Float[Array, " bundles"],
+    merging: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
     relax: Float[Array, ""],
+    *,
+    fitting: int,
 ) -> CellErrors:
     """Errors of all candidates of cells.
 
@@ -83,20 +91,27 @@ def cell_errors(
         bounds: of the 16 sample slabs of each cell.
         borders: depths of their borders.
         shortest, longest: path length a unit of depth of the bundle's rays.
-        relax: share of the lateral variation that is taken off (section 5.1); 0 for a certificate.
+        merging: by how much colour and extinction of a sample can be rounded otherwise when cells are merged.
+        relax: share of the lateral variation that is taken off (section 5.1), in cells that are nowhere partly empty; 0 for
+            a certificate.
+        fitting: level beyond which cells are merged.
     """
     optics = _optics(bounds, borders, shortest, longest)
     outward = 1 + EVALUATION * jnp.finfo(borders.dtype).eps
     paint, lateral = _super_pixel(optics, longest)
 
+    rounding = merging[0] * optics.dark_hi.sum(0) + merging[1] * optics.steps.sum(0) * longest
+    whole = (bounds.covered | ~bounds.touched).all(0)
+
     def of_levels(share: Array) -> Array:
         errors = [jnp.zeros_like(lateral)]
         for level in range(1, LEVELS):
-            errors.append(jnp.maximum(errors[-1], _coarser(level, optics, shortest, longest, share)))
+            error = _coarser(level, optics, shortest, longest, share) + (rounding if level > fitting else 0)
+            errors.append(jnp.maximum(errors[-1], error))
         return jnp.stack([*errors, lateral]) * outward
 
     strict = of_levels(jnp.zeros_like(relax))
-    error = lax.cond(relax > 0, of_levels, lambda _: strict, relax)
+    error = jnp.where(whole, lax.cond(relax > 0, of_levels, lambda _: strict, relax), strict)
     return CellErrors(error, strict, paint, optics.thin.sum(0))
 
 

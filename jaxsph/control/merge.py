@@ -14,10 +14,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import Cells
-from jaxsph.control.errors import LEVELS, SUPER_PIXEL
+from jaxsph.control.errors import LEVELS, SUPER_PIXEL, fits
 from jaxsph.control.worklist import CELL, COARSEST, Worklist
 
 
@@ -48,14 +48,14 @@ def coarser_windows(cells: Cells, slab_samples: int) -> list[Window]:
 def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
     """Kernel evaluations a ray and cell at every level, (cells, bundles); None where a level does not fit without merging."""
     costs: list[Array | None] = []
-    fits = _fits(slab_samples)
+    fitting = fits(slab_samples)
     for level, window in enumerate(windows):
         count = window.length.sum(0).astype(jnp.float32) * slab_samples
-        if level <= fits:
+        if level <= fitting:
             groups = CELL // slab_samples >> level
             costs.append(count.reshape(-1, groups, count.shape[1]).sum(1)[:num_cells])
         else:
-            share = 1 << (level - fits)
+            share = 1 << (level - fitting)
             costs.append(jnp.repeat(count / share, share, 0)[:num_cells] if merge else None)
     return costs
 
@@ -70,28 +70,28 @@ def merged_levels(
         free: empty cells, that allow any level.
         slab_samples: samples of a slab.
     """
-    fits, num_cells = _fits(slab_samples), chosen.shape[0]
+    fitting, num_cells = fits(slab_samples), chosen.shape[0]
     lateral = chosen == SUPER_PIXEL
-    final = jnp.where(lateral, SUPER_PIXEL, jnp.minimum(chosen, fits))
+    final = jnp.where(lateral, SUPER_PIXEL, jnp.minimum(chosen, fitting))
     able = jnp.where(free, COARSEST, jnp.where(lateral, 0, chosen))
-    for level in range(fits + 1, LEVELS):
-        share = 1 << (level - fits)
+    for level in range(fitting + 1, LEVELS):
+        share = 1 << (level - fitting)
         groups = jnp.pad(able, ((0, -num_cells % share), (0, 0))).reshape(-1, share, able.shape[1])
         final = jnp.where(jnp.repeat((groups >= level).all(1), share, 0)[:num_cells], level, final)
     return final
 
 
-def _fits(slab_samples: int) -> int:
-    """The level at which a cell is one slab."""
-    return (CELL // slab_samples).bit_length() - 1
-
-
 def coarse_work(
-    windows: list[Window], levels: Int[Array, "cells bundles"], paint: Array | None, slab_samples: int
+    windows: list[Window],
+    levels: Int[Array, "cells bundles"],
+    origin: Float[Array, "slabs bundles"],
+    paint: Array | None,
+    slab_samples: int,
 ) -> Worklist:
     """The list of work for the `levels` of cells, as `merged_levels` gives them.
 
     Args:
+        origin: of the slabs at full rate; coarser ones take that of the first filled slab they span.
         paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
     """
     per_cell = CELL // slab_samples
@@ -107,11 +107,22 @@ def coarse_work(
             for union, value in ((window.begin, begin), (window.length, length))
         )
     count = length.sum(0).astype(jnp.int32)
+    origin = _shared_origins(origin, windows, level)
     level = jnp.where(level == SUPER_PIXEL, COARSEST, level)
     if paint is None:
-        return Worklist(count > 0, level, begin, length, count)
+        return Worklist(count > 0, level, begin, length, count, origin)
     colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
-    return Worklist((count > 0) | painted, level, begin, length, count, painted, colors)
+    return Worklist((count > 0) | painted, level, begin, length, count, origin, painted, colors)
+
+
+def _shared_origins(origin: Array, windows: list[Window], level: Array) -> Array:
+    """Of every item, that of the first filled slab that it spans."""
+    first = shared = jnp.pad(origin, ((0, level.shape[0] - origin.shape[0]), (0, 0)))
+    for step in range(1, LEVELS):
+        filled = windows[step - 1].length.sum(0) > 0
+        first = jnp.where(filled[::2], first[::2], first[1::2])
+        shared = jnp.where(level == step, jnp.repeat(first, 1 << step, 0), shared)
+    return shared
 
 
 jax.tree_util.register_dataclass(Window, data_fields=["begin", "length"], meta_fields=[])

@@ -32,6 +32,7 @@ class RangeTables:
         lo, hi: of control points `i ... i + 2**k - 1` at entry `k * points + i`; red, green, blue, extinction.
         fuzz: how far, in quantity, a looked up value can be misplaced.
         scale: largest value of each channel, for rounding.
+        steepest: largest slope of each channel, a unit of quantity; infinite with jumps.
     """
 
     segments: Segments
@@ -40,6 +41,7 @@ class RangeTables:
     hi: Float[Array, "4 entries"]
     fuzz: Float[Array, ""]
     scale: Float[Array, " 4"]
+    steepest: Float[Array, " 4"]
 
 
 def range_tables(transfer: TransferFunction) -> RangeTables:
@@ -47,7 +49,9 @@ def range_tables(transfer: TransferFunction) -> RangeTables:
     table = jnp.concatenate([transfer.colors, transfer.extinction[:, None]], 1).T
     fuzz = ROUNDING_OF_PLACE * jnp.finfo(table.dtype).eps * jnp.maximum(jnp.abs(transfer.values[0]), jnp.abs(transfer.values[-1]))
     lo, hi = _sparse(table, jnp.minimum), _sparse(table, jnp.maximum)
-    return RangeTables(transfer.segments(), transfer.values, lo, hi, fuzz, table.max(1))
+    rise, run = jnp.abs(table[:, 1:] - table[:, :-1]), transfer.values[1:] - transfer.values[:-1]
+    steepest = jnp.where(rise > 0, rise / run, 0).max(1, initial=0)
+    return RangeTables(transfer.segments(), transfer.values, lo, hi, fuzz, table.max(1), steepest)
 
 
 def _sparse(row: Float[Array, "4 points"], extreme: Callable[[Array, Array], Array]) -> Float[Array, "4 entries"]:

@@ -30,6 +30,8 @@ class Worklist:
         level: its samples are `2**level` fine samples apart; a super-pixel is one sample of the coarsest level.
         begin, length: windows of the bundle's list, for each class of supports.
         count: sum of `length` over classes; 0 for super-pixels.
+        origin: quantity that the item's sums are taken relative to, that of a particle near by: so that their rounding is a
+            share of how much quantities differ, and a constant is rendered as that constant.
         paint: red, green, blue and extinction of super-pixels, where `painted`; None where there can be none.
     """
 
@@ -38,13 +40,26 @@ class Worklist:
     begin: Int[Array, "classes slabs bundles"]
     length: Int[Array, "classes slabs bundles"]
     count: Int[Array, "slabs bundles"]
+    origin: Float[Array, "slabs bundles"]
     painted: Bool[Array, "slabs bundles"] | None = None
     paint: Float[Array, "4 slabs bundles"] | None = None
 
 
-def full_rate(cells: Cells) -> Worklist:
+def full_rate(cells: Cells, origin: Float[Array, "slabs bundles"]) -> Worklist:
     """Every filled slab at level 0: the reference image."""
-    return Worklist(cells.count > 0, jnp.zeros_like(cells.count), cells.begin, cells.length, cells.count)
+    return Worklist(cells.count > 0, jnp.zeros_like(cells.count), cells.begin, cells.length, cells.count, origin)
+
+
+def origins(
+    cells: Cells, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]
+) -> Float[Array, "slabs bundles"]:
+    """The quantity of the particle in the middle of each slab's window; 0 where there is none."""
+    middle, position, before = cells.count // 2, cells.begin[0], cells.length[0]
+    position = position + middle
+    for k in range(1, cells.begin.shape[0]):
+        position = jnp.where(middle >= before, cells.begin[k] - before + middle, position)
+        before = before + cells.length[k]
+    return jnp.where(cells.count > 0, quantity[rank[jnp.clip(position, 0, rank.shape[0] - 1)]], 0)
 
 
 jax.tree_util.register_dataclass(
