@@ -35,6 +35,7 @@ CELL_SAMPLES = 16  # D_z of the first paper
 SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 CHUNKS_A_LAYER = 12
+FINE_DIAMETER = 24  # pixels: supports that are smaller cannot cover a quarter of a footprint
 SMALLEST_CHUNK = 64
 
 
@@ -81,7 +82,7 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
-        wanted = control_plan(settings)
+        wanted = control_plan(settings, self.control.parts if self.control else 1)
         if wanted != self.control:
             raise ValueError(
                 f"`plan` was made for error control {self.control}, but settings ask for {wanted}; make a new one with "
@@ -89,11 +90,16 @@ class Plan:
             )
 
 
-def control_plan(settings: Settings) -> ControlPlan | None:
+def control_plan(settings: Settings, parts: int) -> ControlPlan | None:
     """What of `settings` is fixed when a program is compiled; None without a tolerance."""
     if settings.tolerance is None:
         return None
-    return ControlPlan(settings.super_pixels, settings.merge, settings.allocation)
+    return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, parts)
+
+
+def _choose_parts(diameter: float) -> int:
+    """A sub-rectangle is covered only by a support a few times as wide as itself."""
+    return 2 if diameter >= FINE_DIAMETER else 4
 
 
 def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
@@ -112,15 +118,16 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     particles = scene.particles
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
-    tiles, bundles, depth_extent, covered = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
+    tiles, bundles, depth_extent, diameter, covered = (np.asarray(v) for v in _count(particles, camera, settings.samples, tile_rows))
     num_classes = _num_classes(particles)
+    control = control_plan(settings, _choose_parts(float(diameter)))
     slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
     bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
         chunk = _choose_chunk(int(covered), rows * columns, slab_samples)
         cast = CastPlan(chunk, slab_samples, CELL_SAMPLES // slab_samples)
-        made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast)
+        made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast, control)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
         if fits or rows == 1:
             break
@@ -141,6 +148,7 @@ def _for_bands(
     pairs_a_row: tuple[np.ndarray, np.ndarray],
     num_classes: int,
     cast: CastPlan,
+    control: ControlPlan | None,
 ) -> Plan:
     rows = tiles_a_band[0]
     bands = _ceil(len(pairs_a_row[0]), rows)
@@ -159,7 +167,7 @@ def _for_bands(
         + (settings.tolerance is not None) * _bytes_of_control(lists, slabs, num_classes, number)
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
-    return Plan(*size, num_classes, bands, lists, cast, int(memory), control_plan(settings))
+    return Plan(*size, num_classes, bands, lists, cast, int(memory), control)
 
 
 def _bytes_of_control(lists: ListPlan, slabs: int, num_classes: int, number: int) -> int:
@@ -205,11 +213,11 @@ def _choose_chunk(covered: int, tiles: int, slab_samples: int) -> int:
 
 
 @functools.partial(jax.jit, static_argnames=("samples", "tile_rows"))
-def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -> tuple[Array, Array, Array, Array]:
+def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -> tuple[Array, ...]:
     """What a plan is made from.
 
-    Pairs in each row of tiles (with tiles, and at most with bundles); the median diameter of a support in samples; and the
-    number of bundles that particles stand in.
+    Pairs in each row of tiles (with tiles, and at most with bundles); the median diameter of a support in samples, and in
+    pixels; and the number of bundles that particles stand in.
     """
     depths = camera.depth(jnp.arange(samples, dtype=camera.dtype) + 0.5, samples).astype(particles.dtype)
     ordered = order_particles(particles, camera, depths, samples, 1)
@@ -230,4 +238,5 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
     place = (top + bottom) // (2 * BUNDLE) * across + (left + right) // (2 * BUNDLE)
     stood = jnp.zeros(everywhere + 1, bool).at[jnp.where(seen, place, everywhere)].set(True)[:-1]
     median = jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
-    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, stood.sum()
+    wide = jnp.nanmedian(jnp.where(seen, right - left + 1, jnp.nan))
+    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, wide, stood.sum()

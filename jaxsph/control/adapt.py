@@ -32,11 +32,13 @@ class ControlPlan:
         super_pixels: whether a cell may be given one colour for all of its rays (first paper, section 5.2).
         merge: whether coarse cells are merged along depth (6.2).
         allocation: how a bundle's tolerance is shared among its cells, see `levels.choose`.
+        parts: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
     """
 
     super_pixels: bool
     merge: bool
     allocation: str
+    parts: int = 2
 
 
 def adapt(
@@ -63,7 +65,7 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, origin, tolerance, relax, slab_samples)
+    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, origin, tolerance, relax, slab_samples, plan.parts)
     num_cells, bundles = analysis.error.shape[1:]
     samples = half_steps.shape[0] // 2
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]

@@ -59,6 +59,7 @@ def analyse(
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
+    parts: int,
 ) -> Analysis:
     """Analyse the cells of a band that `probe` finds promising; the first arguments are those of `cast_points`.
 
@@ -67,6 +68,7 @@ def analyse(
         tolerance: largest error of a pixel.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
         slab_samples: samples of each slab of `cells`.
+        parts: sub-rectangles on each side of a footprint, for the test of coverage.
     """
     slabs, bundles = cells.count.shape
     dtype = ordered.x.dtype
@@ -96,7 +98,8 @@ def analyse(
         footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
         places = _extremes(origin[slab, across].reshape(per_cell, chunk), window[1].sum(0).reshape(per_cell, chunk) > 0)
         places = tuple(jnp.tile(end, per_cell) for end in places)
-        of_slabs = sample_bounds(balls, lists.rank, window, footprint, edges, places, tables, camera.is_perspective)
+        look = functools.partial(sample_bounds, tables=tables, perspective=camera.is_perspective, parts=parts)
+        of_slabs = look(balls, lists.rank, window, footprint, edges, places)
         bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
         edges = borders[cell * CELL + jnp.arange(CELL + 1, dtype=jnp.int32)[:, None]]
         paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)

@@ -33,7 +33,6 @@ from jaxsph.control.ranges import RangeTables, transfer_ranges
 from jaxsph.numerics.staging import computed_once
 
 PARTICLES = 4  # unrolled in the inner loop; longer chains do not vectorise
-PARTS = 2  # sub-rectangles on each side of the footprint, for the test of coverage
 SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
 
 
@@ -91,19 +90,21 @@ def sample_bounds(
     origin: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
     tables: RangeTables,
     perspective: bool,
+    parts: int,
 ) -> SampleBounds:
     """Bounds for the samples between `borders`, from the particles of a window.
 
     Args:
         origin: least and greatest quantity that the sums of these samples may be taken relative to.
+        parts: sub-rectangles on each side of the footprint, for the test of coverage.
     """
     spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
     blocks = (window[1].sum(0).max() + PARTICLES - 1) // PARTICLES
     samples, bundles = borders.shape[0] - 1, borders.shape[1]
     dtype = borders.dtype
     outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
-    farthest = jnp.full((samples, PARTS, PARTS, bundles), jnp.inf, dtype)
-    boxes = _boxes(footprint.columns, spread), _boxes(footprint.rows, spread)
+    farthest = jnp.full((samples, parts, parts, bundles), jnp.inf, dtype)
+    boxes = _boxes(footprint.columns, spread, parts), _boxes(footprint.rows, spread, parts)
 
     def add_block(block: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
         outermost, farthest = found
@@ -132,9 +133,9 @@ def sum_rounding(terms: Array, dtype: Any) -> Array:
     return (terms + 6) * jnp.finfo(dtype).eps
 
 
-def _boxes(rays: Array, spread: tuple[Array, Array]) -> tuple[Array, Array]:
+def _boxes(rays: Array, spread: tuple[Array, Array], parts: int) -> tuple[Array, Array]:
     """Least and greatest view coordinate of each part of the footprint, (parts, bundles)."""
-    first, last = rays[:: BUNDLE // PARTS], rays[BUNDLE // PARTS - 1 :: BUNDLE // PARTS]
+    first, last = rays[:: BUNDLE // parts], rays[BUNDLE // parts - 1 :: BUNDLE // parts]
     return jnp.minimum(spread[0] * first, spread[1] * first), jnp.maximum(spread[0] * last, spread[1] * last)
 
 
