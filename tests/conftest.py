@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import hypothesis
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -73,9 +74,46 @@ class Frames:
         return js.Camera.orthographic(eye, target, up, 2.5, **size)
 
 
+@dataclasses.dataclass(frozen=True)
+class Adversary:
+    """Draws scenes that are hard to bound."""
+
+    frames: Frames
+
+    def scene(self, rng: np.random.Generator, kernel: str, dtype) -> js.Scene:
+        """Supports over four decades, clumps, constants, transfer functions with bands, jumps, nothing and a wall."""
+        scene = self.frames.scene(rng, kernel, decades=rng.choice([0.3, 1, 4]), count=rng.integers(0, 25), dtype=dtype)
+        particles = scene.particles
+        quantity = np.asarray(particles.quantity)
+        style = rng.integers(3)
+        if style == 0:
+            quantity = np.where(np.asarray(particles.position)[:, 0] > 0, 0.7, 0.2)
+        if style == 1:
+            quantity = 0.4 + 0.01 * quantity
+        support = np.asarray(particles.support) * (4 if rng.uniform() < 0.5 else 1)
+        particles = dataclasses.replace(particles, quantity=jnp.asarray(quantity, dtype), support=jnp.asarray(support, dtype))
+        values = np.sort(rng.uniform(0, 1, 5))
+        if rng.uniform() < 0.3:
+            values[3] = values[2]
+        extinction = rng.choice([0, 0.1, 1, 30, 1e6], 5) * rng.uniform(0, 1, 5)
+        colors = np.round(rng.uniform(0, 1, (5, 3)) * rng.choice([1, 3])) / 3
+        given = (values, np.clip(colors, 0, 1), extinction)
+        transfer = js.TransferFunction.from_points(*(value.astype(dtype) for value in given))
+        return js.Scene(particles=particles, transfer=transfer)
+
+    def camera(self, rng: np.random.Generator, projection: str, dtype) -> js.Camera:
+        """From outside, or among the particles."""
+        return self.frames.camera(rng, projection, distance=float(rng.choice([0.2, 1.5, 3.0])), dtype=dtype)
+
+
 @pytest.fixture(scope="session")
 def frames() -> Frames:
     return Frames()
+
+
+@pytest.fixture(scope="session")
+def adversary(frames) -> Adversary:
+    return Adversary(frames)
 
 
 @pytest.fixture

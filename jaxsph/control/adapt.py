@@ -20,7 +20,6 @@ from jaxsph.control.worklist import CELL, Worklist
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 
-
 EMPTY = -1  # what a cell without particles is given
 
 
@@ -65,7 +64,8 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    analysis = analyse(ordered, lists, cells, origins, camera, transfer, half_steps, origin, tolerance, relax, slab_samples, plan.parts)
+    grid = (ordered, lists, cells, origins, camera, transfer, half_steps, origin)
+    analysis = analyse(*grid, tolerance, relax, slab_samples, plan.parts)
     num_cells, bundles = analysis.error.shape[1:]
     samples = half_steps.shape[0] // 2
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
@@ -81,4 +81,3 @@ def adapt(
     work = coarse_work(windows, final, origin, analysis.paint if plan.super_pixels else None, slab_samples)
     final = jnp.where(full > 0, final, 0)
     return work, bound(analysis.error, final, rounding), jnp.where(full > 0, final, EMPTY)
-

@@ -97,7 +97,7 @@ def analyse(
         edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
         footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
         places = _extremes(origin[slab, across].reshape(per_cell, chunk), window[1].sum(0).reshape(per_cell, chunk) > 0)
-        places = tuple(jnp.tile(end, per_cell) for end in places)
+        places = jnp.tile(places[0], per_cell), jnp.tile(places[1], per_cell)
         look = functools.partial(sample_bounds, tables=tables, perspective=camera.is_perspective, parts=parts)
         of_slabs = look(balls, lists.rank, window, footprint, edges, places)
         bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)

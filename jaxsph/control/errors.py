@@ -146,7 +146,7 @@ def _opacity(depth: Array) -> Array:
 
 def _rounding(like: Array) -> Array:
     """How far a computed transmittance may be off."""
-    return EXPONENTIAL * jnp.finfo(like.dtype).eps
+    return jnp.asarray(EXPONENTIAL * jnp.finfo(like.dtype).eps, like.dtype)
 
 
 def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax: Array) -> Array:

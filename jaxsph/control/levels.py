@@ -99,7 +99,7 @@ def _at_best_price(offer: Offer, error: Array, tolerance: Array) -> Array:
 
 
 def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
-    def step(left: Array, cell: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
         saving, error = cell
         chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
         return left - taken, chosen

@@ -50,9 +50,7 @@ def full_rate(cells: Cells, origin: Float[Array, "slabs bundles"]) -> Worklist:
     return Worklist(cells.count > 0, jnp.zeros_like(cells.count), cells.begin, cells.length, cells.count, origin)
 
 
-def origins(
-    cells: Cells, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]
-) -> Float[Array, "slabs bundles"]:
+def origins(cells: Cells, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]) -> Float[Array, "slabs bundles"]:
     """The quantity of the particle in the middle of each slab's window; 0 where there is none."""
     middle, position, before = cells.count // 2, cells.begin[0], cells.length[0]
     position = position + middle
@@ -62,6 +60,4 @@ def origins(
     return jnp.where(cells.count > 0, quantity[rank[jnp.clip(position, 0, rank.shape[0] - 1)]], 0)
 
 
-jax.tree_util.register_dataclass(
-    Worklist, data_fields=[field.name for field in dataclasses.fields(Worklist)], meta_fields=[]
-)
+jax.tree_util.register_dataclass(Worklist, data_fields=[field.name for field in dataclasses.fields(Worklist)], meta_fields=[])

@@ -12,7 +12,11 @@ import jaxsph as js
         ({"samples": 2.5}, "`samples` must be an integer"),
         ({"samples": 1 << 21}, "cannot be told apart"),
         ({"memory_limit": 0}, "`memory_limit` must be > 0"),
-        ({"tolerance": 0.004}, "error control is not part of this version"),
+        ({"tolerance": -0.004}, "`tolerance` must be >= 0 and finite, got -0.004"),
+        ({"tolerance": float("nan")}, "`tolerance` must be >= 0"),
+        ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
+        ({"estimator": "pilot"}, "`estimator` must be one of interval, got 'pilot'"),
+        ({"allocation": "fair"}, "`allocation` must be one of budget, greedy, independent"),
     ],
 )
 def test_bad_settings_are_refused(change, message):

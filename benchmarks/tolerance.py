@@ -1,0 +1,170 @@
+"""Claim: error control keeps its word and never costs much.
+
+A certified pixel is off by no more than its bound, and its bound is within the tolerance; no frame is slower than full rate by
+more than 15 % plus noise; and the analysis takes at most 15 % of the time of casting at full rate.
+
+All contenders render a scene in one process, in turns; compile time is apart. A first frame of each is compared with the image
+at full rate, later ones are timed: grid + adapt + cast. 'greedy' is the first paper's order, strict; 'relaxed' the paper's
+setting, an estimate; 'certificate' the default; the others are the default with one thing changed, and 'independent' breaks the
+tolerance by design. Writes `results/tolerance.json`; ends in asserts on bounds and, with --check, on ratios of medians.
+
+    python benchmarks/tolerance.py [--repeats 5] [--size 512] [--scenes mixer radial] [--check]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import statistics
+import sys
+
+import numpy as np
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import peers
+
+import jaxsph as js
+
+SCENES = ("mixer", "radial", "checker_board", "dam_break")
+UNMIXED = {"particles": 1_000_000, "frame": 0}  # a checker board whose unmixed regions are large against a support
+TOLERANCES = (0.001, 0.004, 0.01)
+VARIANTS = {
+    "greedy": {"allocation": "greedy", "super_pixels": False},
+    "relaxed": {"allocation": "greedy", "relax": 1.0, "super_pixels": True},
+    "certificate": {},
+}
+ABLATIONS = {
+    "independent": {"allocation": "independent"},
+    "along the ray": {"super_pixels": False},
+    "no merging": {"merge": False},
+}
+ABLATED_AT = 0.004
+FULL_RATE = "full rate"
+MOST_SLOWER = 0.15  # share of a full-rate frame
+MOST_ANALYSIS = 0.15  # share of full-rate casting
+STAGES = ("grid", "adapt", "cast")
+COLUMNS = {
+    "tolerance": "g",
+    **{"max error": ".6f", "max bound": ".6f", "bound/error": ".3g", "% over": ".3f", " G eval": ".3f", "saved": ".2f"},
+    **{" grid": ".3f", "adapt": ".3f", "cast s": ".3f", "total s": ".3f", "of full": ".2f", "noise": ".2f", "adapt/cast": ".2f"},
+}
+HEADER = f"{'scene':21s} {'variant':13s} " + " ".join(COLUMNS)
+RESULTS = peers.RESULTS.with_name("tolerance.json")
+
+
+def contenders() -> dict[tuple[str, float | None], js.Settings]:
+    """Settings by variant and tolerance, full rate first."""
+    named = {(FULL_RATE, None): js.Settings()}
+    for tolerance in TOLERANCES:
+        variants = VARIANTS | (ABLATIONS if tolerance == ABLATED_AT else {})
+        named |= {(name, tolerance): js.Settings(tolerance=tolerance, **chosen) for name, chosen in variants.items()}
+    return named
+
+
+def measure(label: str, scene: js.Scene, camera: js.Camera, repeats: int) -> list[dict]:
+    """One record for each contender."""
+    given = {name: (settings, js.plan(scene, camera, settings)) for name, settings in contenders().items()}
+    times: dict[tuple, list[dict[str, float]]] = {name: [] for name in given}
+    quality = {}
+    for name, (settings, plan) in given.items():
+        image = js.render(scene, camera, settings, plan=plan)
+        if name == (FULL_RATE, None):
+            reference = image
+        quality[name] = compare(image, reference, settings) | {"compile": image.stats["seconds"]["compile"]}
+    for _ in range(repeats):
+        for name, (settings, plan) in given.items():
+            seconds = js.render(scene, camera, settings, plan=plan).stats["seconds"]
+            times[name].append({stage: seconds[stage] for stage in STAGES} | {"total": sum(seconds[stage] for stage in STAGES)})
+    full, full_noise = medians(times[FULL_RATE, None])
+    records = []
+    for (variant, tolerance), turns in times.items():
+        middle, noise = medians(turns)
+        record = {"scene": label, "particles": scene.particles.capacity, "variant": variant, "tolerance": tolerance}
+        record |= quality[variant, tolerance] | middle
+        record |= {"total_to_full": middle["total"] / full["total"], "noise": noise + full_noise}
+        records.append(record | {"adapt_to_full_cast": middle["adapt"] / full["cast"]})
+    return records
+
+
+def compare(image: js.Image, reference: js.Image, settings: js.Settings) -> dict:
+    """How wrong the pixels are, how wrong they were said to be at most, and the work it took."""
+    error = np.abs(layers(image) - layers(reference)).max(-1)
+    bound = np.asarray(image.error_bound, np.float64)
+    tolerance = settings.tolerance or 0.0
+    spent = image.stats["evaluations"]
+    return {
+        "certified": bool(image.certified),
+        "allocation": settings.allocation,
+        "max_error": float(error.max()),
+        "max_bound": float(bound.max()),
+        "bound_to_error": float(bound.max() / error.max()) if error.max() > 0 else None,
+        "pixels_over_bound": float((~(error <= bound)).mean()),
+        "pixels_over_tolerance": float((~(error <= tolerance)).mean()),
+        "evaluations": spent,
+        "evaluations_saved": reference.stats["evaluations"] / spent if spent else None,
+    }
+
+
+def layers(image: js.Image) -> np.ndarray:
+    """Colour and transmittance; alpha is off by as much as the latter."""
+    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.transmittance, np.float64)[..., None]], -1)
+
+
+def medians(turns: list[dict[str, float]]) -> tuple[dict[str, float], float]:
+    """Of every stage; and the noise of the total, its median deviation from the median as a share of it."""
+    middle = {stage: statistics.median(turn[stage] for turn in turns) for stage in turns[0]}
+    deviation = statistics.median(abs(turn["total"] - middle["total"]) for turn in turns)
+    return middle, deviation / middle["total"]
+
+
+def row(record: dict) -> str:
+    """Of the printed table, under HEADER."""
+    shown = [record["tolerance"], record["max_error"], record["max_bound"], record["bound_to_error"]]
+    shown += [100 * record["pixels_over_tolerance"], record["evaluations"] / 1e9, record["evaluations_saved"]]
+    shown += [record[stage] for stage in (*STAGES, "total", "total_to_full", "noise", "adapt_to_full_cast")]
+    cells = ("-" if value is None else format(value, form) for value, form in zip(shown, COLUMNS.values(), strict=True))
+    return f"{record['scene']:21s} {record['variant']:13s} " + " ".join(map(str.rjust, cells, map(len, COLUMNS)))
+
+
+def keeps_its_word(record: dict) -> bool:
+    within = record["allocation"] == "independent" or record["max_bound"] <= (record["tolerance"] or 0)
+    return within and record["pixels_over_bound"] == 0
+
+
+def costs_little(record: dict) -> bool:
+    fast = record["total_to_full"] <= 1 + MOST_SLOWER + record["noise"]
+    return fast and record["adapt_to_full_cast"] <= MOST_ANALYSIS
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--size", type=int, default=512, help="pixels on a side")
+    parser.add_argument("--particles", type=int, help="instead of each scene's own number")
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
+    unmixed = "with checker_board, also its frame 0 with 1,000,000 particles"
+    parser.add_argument("--unmixed", action=argparse.BooleanOptionalAction, default=True, help=unmixed)
+    parser.add_argument("--check", action="store_true", help="fail where a frame or its analysis takes too long")
+    arguments = parser.parse_args()
+    loads = {name: (name, {"particles": arguments.particles}) for name in arguments.scenes}
+    if arguments.unmixed and "checker_board" in loads:
+        loads["checker_board unmixed"] = ("checker_board", UNMIXED)
+    records = []
+    print(HEADER)
+    for label, (name, options) in loads.items():
+        scene, camera = js.scenes.load(name, width=arguments.size, height=arguments.size, **options)
+        found = measure(label, scene, camera, arguments.repeats)
+        print("\n".join(row(record) for record in found), flush=True)
+        records += found
+    shape = {"size": arguments.size, "samples": js.Settings().samples, "repeats": arguments.repeats}
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps({"machine": peers.machine(), **shape, "records": records}, indent=1) + "\n")
+    broken = [row(r) for r in records if r["certified"] and not keeps_its_word(r)]
+    assert not broken, "\n".join(["no certificate:", HEADER, *broken])
+    slow = [row(r) for r in records if r["tolerance"] is not None and not costs_little(r)]
+    assert not (arguments.check and slow), "\n".join(["too slow:", HEADER, *slow])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""The guarantee: error <= error_bound <= tolerance on every pixel, whatever the scene; where nothing is saved, the same bits."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.control.adapt import ControlPlan
+
+ADAPTIVE = {
+    "budget": ControlPlan(True, True, "budget"),
+    "greedy": ControlPlan(False, True, "greedy", 4),
+}
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def draw(scene, camera, settings, *, plan):
+    return js.render(scene, camera, settings, plan=plan)
+
+
+def error_of(image, truth):
+    """Largest difference of a colour channel or of alpha, each pixel."""
+    color = np.abs(np.asarray(image.color, np.float64) - np.asarray(truth.color, np.float64)).max(-1)
+    return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
+
+
+def wide(scene, rng):
+    """Particles that fill the view: cells that are covered, and vary little, so that something can be saved."""
+    particles = scene.particles
+    support = particles.support * float(rng.choice([2, 6]))
+    quantity = 0.3 + float(rng.choice([0, 1e-3, 0.03])) * particles.quantity
+    return dataclasses.replace(scene, particles=dataclasses.replace(particles, support=support, quantity=quantity))
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize(("dtype", "kernel", "how"), [
+    (np.float64, "poly6", "budget"), (np.float32, "poly6", "budget"),
+    (np.float64, "wendland_c2", "greedy"),
+])  # fmt: skip
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), digits=st.floats(1, 5), smooth=st.booleans())
+def test_errors_keep_to_their_bound_and_the_bound_to_the_tolerance(
+    frames, adversary, dtype, kernel, how, projection, seed, digits, smooth
+):
+    rng = np.random.default_rng(seed)
+    with jax.enable_x64(dtype is np.float64):
+        scene, camera = adversary.scene(rng, kernel, dtype), adversary.camera(rng, projection, dtype)
+        scene = wide(scene, rng) if smooth else scene
+        plan, tolerance = frames.plan(), float(dtype(10**-digits))
+        control = ADAPTIVE[how]
+        asked = dataclasses.replace(
+            frames.settings, tolerance=tolerance, super_pixels=control.super_pixels, allocation=control.allocation
+        )
+        truth = draw(scene, camera, frames.settings, plan=plan)
+        image = draw(scene, camera, asked, plan=dataclasses.replace(plan, control=control))
+        bound, error = np.asarray(image.error_bound), error_of(image, truth)
+    assert image.certified
+    assert (error <= bound).all(), f"{error.max()} > {bound[error > bound].max()}"
+    assert (bound <= tolerance).all()
+    assert float(image.stats["evaluations"]) <= float(image.stats["evaluations_full"])
+    assert int(image.faults) == 0
+
+
+@pytest.mark.parametrize("relax", [0.0, 1.0])
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_smaller_tolerance_never_spends_less_and_more_relaxation_never_more(frames, adversary, relax, seed):
+    rng = np.random.default_rng(seed)
+    scene, camera = wide(adversary.scene(rng, "poly6", np.float32), rng), adversary.camera(rng, "perspective", np.float32)
+    plan = dataclasses.replace(frames.plan(), control=ADAPTIVE["budget"])
+
+    def spent(tolerance, relax):
+        asked = dataclasses.replace(frames.settings, tolerance=tolerance, relax=relax)
+        return np.asarray(draw(scene, camera, asked, plan=plan).evaluations)
+
+    work = [spent(tolerance, relax) for tolerance in (1e-5, 1e-3, 1e-2, 0.1, 1.0)]
+    assert all((more >= less).all() for more, less in itertools.pairwise(work))
+    relaxed = [spent(1e-2, share).sum() for share in (0.0, 0.5, 1.0)]
+    assert relaxed[0] >= relaxed[1] >= relaxed[2]
+
+
+def test_something_is_saved_where_the_fluid_is_smooth(frames):
+    rng = np.random.default_rng(3)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    particles = dataclasses.replace(scene.particles, support=scene.particles.support * 0 + 2.5)
+    scene = dataclasses.replace(scene, particles=dataclasses.replace(particles, quantity=0.3 + 1e-3 * particles.quantity))
+    for control, least in ((ADAPTIVE["budget"], 0.3), (ADAPTIVE["greedy"], 0.2)):
+        asked = dataclasses.replace(
+            frames.settings, tolerance=0.02, super_pixels=control.super_pixels, allocation=control.allocation
+        )
+        image = draw(scene, camera, asked, plan=dataclasses.replace(frames.plan(), control=control))
+        assert 1 - float(image.stats["evaluations"]) / float(image.stats["evaluations_full"]) > least
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-12])
+def test_full_rate_asked_for_is_the_reference_image_bit_for_bit(frames, tolerance):
+    rng = np.random.default_rng(1)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    truth = js.render(scene, camera, frames.settings, plan=frames.plan())
+    asked = dataclasses.replace(frames.settings, tolerance=tolerance, super_pixels=False)
+    image = js.render(scene, camera, asked)
+    assert np.array_equal(image.color, truth.color) and np.array_equal(image.transmittance, truth.transmittance)
+    assert not np.asarray(image.error_bound).any() and image.certified
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_a_constant_quantity_costs_nothing_inside_and_errs_by_rounding_only(frames, projection):
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng), frames.camera(rng, projection)
+    particles = scene.particles
+    constant, support = jnp.full_like(particles.quantity, 0.61), jnp.full_like(particles.support, 2)
+    particles = dataclasses.replace(particles, quantity=constant, support=support)
+    scene = dataclasses.replace(scene, particles=particles)
+    truth = js.render(scene, camera, frames.settings)
+    image = js.render(scene, camera, dataclasses.replace(frames.settings, tolerance=1e-3))
+    assert image.stats["evaluations"] < 0.6 * image.stats["evaluations_full"]
+    error = error_of(image, truth)
+    assert (error <= np.asarray(image.error_bound)).all() and error.max() < 1e-4
+
+
+def test_relaxing_gives_up_the_certificate(frames):
+    rng = np.random.default_rng(1)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    image = js.render(scene, camera, dataclasses.replace(frames.settings, tolerance=0.01, relax=0.5))
+    assert image.certified is False
+
+
+def test_changing_tolerance_and_relaxation_compiles_nothing(frames):
+    rng = np.random.default_rng(1)
+    scene, camera, traces = frames.scene(rng), frames.camera(rng), []
+    plan = dataclasses.replace(frames.plan(), control=ADAPTIVE["budget"])
+
+    @jax.jit
+    def render(settings):
+        traces.append(1)
+        return js.render(scene, camera, settings, plan=plan).color
+
+    for tolerance, relax in ((0.1, 0.0), (0.01, 0.5), (1e-3, 1.0)):
+        render(dataclasses.replace(frames.settings, tolerance=tolerance, relax=relax))
+    assert len(traces) == 1
