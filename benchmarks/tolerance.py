@@ -30,8 +30,8 @@ SCENES = ("mixer", "radial", "checker_board", "dam_break")
 UNMIXED = {"particles": 1_000_000, "frame": 0}  # a checker board whose unmixed regions are large against a support
 TOLERANCES = (0.001, 0.004, 0.01)
 VARIANTS = {
-    "greedy": {"allocation": "greedy", "super_pixels": False},
-    "relaxed": {"allocation": "greedy", "relax": 1.0, "super_pixels": True},
+    "paper strict": {"allocation": "paper", "super_pixels": False},
+    "paper relaxed": {"allocation": "paper", "relax": 1.0, "super_pixels": True},
     "certificate": {},
 }
 ABLATIONS = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.access.cells import Cells
@@ -16,6 +17,8 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels
+from jaxsph.control.probe import promising
+from jaxsph.control.ranges import range_tables
 from jaxsph.control.worklist import CELL, Worklist
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
@@ -54,7 +57,7 @@ def adapt(
     slab_samples: int,
     plan: ControlPlan,
 ) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
-    r"""Decide how every cell is sampled.
+    r"""Decide how every cell is sampled. Where nothing is promising, that takes no more than a look.
 
     Two images of a bundle whose samples agree differ by rounding. With n samples, each step of compositing rounds the
     transmittance once and a colour's sum once, the differences and products of a colour another two times its share: less
@@ -64,20 +67,32 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    grid = (ordered, lists, cells, origins, camera, transfer, half_steps, origin)
-    analysis = analyse(*grid, tolerance, relax, slab_samples, plan.parts)
-    num_cells, bundles = analysis.error.shape[1:]
-    samples = half_steps.shape[0] // 2
+    bundles, samples = cells.count.shape[1], half_steps.shape[0] // 2
+    num_cells = -(-cells.count.shape[0] * slab_samples // CELL)
+    tables = range_tables(transfer)
+    borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - samples), mode="edge")
+    wanted = promising(ordered.quantity, lists.rank, cells, borders, tables, tolerance, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
     windows = coarser_windows(cells, slab_samples)
     costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
-    full = costs[0] if costs[0] is not None else jnp.zeros((num_cells, bundles))
-    saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
-    on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-    rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * (full > 0).sum(0) + 2).astype(half_steps.dtype)
-    offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
-    chosen = choose(analysis, offer, tolerance, plan.allocation)
-    final = merged_levels(chosen, (full == 0) & whole, slab_samples)
-    work = coarse_work(windows, final, origin, analysis.paint if plan.super_pixels else None, slab_samples)
-    final = jnp.where(full > 0, final, 0)
-    return work, bound(analysis.error, final, rounding), jnp.where(full > 0, final, EMPTY)
+    full = next(cost for cost in costs if cost is not None)
+
+    def decide() -> tuple[Array, Array, Array]:
+        saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
+        on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
+        rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * (full > 0).sum(0) + 2).astype(half_steps.dtype)
+        offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
+        grid = (ordered, lists, cells, origins, camera, borders, origin)
+        analysis = analyse(*grid, wanted, tables, relax, slab_samples, plan.parts)
+        chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
+        final = merged_levels(chosen, (full == 0) & whole, slab_samples)
+        return final, analysis.paint, bound(analysis.error, jnp.where(full > 0, final, 0), rounding)
+
+    def leave() -> tuple[Array, Array, Array]:
+        dtype = half_steps.dtype
+        blank = jnp.zeros((num_cells, bundles), jnp.int32), jnp.zeros((4, num_cells, bundles), dtype)
+        return *blank, jnp.zeros(bundles, dtype)
+
+    final, paint, largest = lax.cond(wanted.any(), decide, leave)
+    work = coarse_work(windows, final, origin, paint if plan.super_pixels else None, slab_samples)
+    return work, largest, jnp.where(full > 0, final, EMPTY)

@@ -1,6 +1,6 @@
 """The error analysis of a band: what every cell's candidates would cost in light.
 
-Flow: cells -> [analysis: probe -> bounds -> errors] -> levels -> merge -> cast -> image.
+Flow: cells -> probe -> [analysis: bounds -> errors] -> levels -> merge -> cast -> image.
 
 Cells are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So promising
 cells can be taken in any order: fullest first, `CHUNK` at a time, wherever they are.
@@ -21,11 +21,9 @@ from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
 from jaxsph.control.errors import CANDIDATES, cell_errors, fits
-from jaxsph.control.probe import promising
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import RangeTables
 from jaxsph.control.worklist import CELL
 from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
 
 CHUNK = 256  # cells analysed together: operands stay in the second-level cache
@@ -53,19 +51,20 @@ def analyse(
     cells: Cells,
     origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
     camera: Camera,
-    transfer: TransferFunction,
-    half_steps: Float[Array, " two_samples_and_one"],
+    borders: Float[Array, " borders"],
     origin: Float[Array, "slabs bundles"],
-    tolerance: Float[Array, ""],
+    wanted: Bool[Array, "cells bundles"],
+    tables: RangeTables,
     relax: Float[Array, ""],
     slab_samples: int,
     parts: int,
 ) -> Analysis:
-    """Analyse the cells of a band that `probe` finds promising; the first arguments are those of `cast_points`.
+    """Analyse the `wanted` cells of a band; the first arguments are those of `cast_points`.
 
     Args:
+        borders: depths of the borders of fine samples, padded to whole cells.
         origin: quantity that each slab's sums are taken relative to.
-        tolerance: largest error of a pixel.
+        tables: of the transfer function.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
         slab_samples: samples of each slab of `cells`.
         parts: sub-rectangles on each side of a footprint, for the test of coverage.
@@ -75,10 +74,8 @@ def analyse(
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
     chunk = min(CHUNK, -(-num_cells * bundles // 16) * 16)
-    tables, balls = range_tables(transfer), spheres(ordered)
+    balls = spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
-    borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - half_steps.shape[0] // 2), mode="edge")
-    wanted = promising(ordered.quantity, lists.rank, cells, borders, tables, tolerance, slab_samples)
     count = jnp.pad(cells.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
     order, number = _fullest_first(wanted.ravel(), count.ravel(), chunk)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (cells.begin, cells.length))

@@ -22,6 +22,7 @@ from jaxsph.numerics.staging import computed_once
 
 CHUNK = 1024  # bundles probed together
 PROBES = 8  # particles of each slab, from the middle half of its window
+WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
 
 def promising(
@@ -36,6 +37,7 @@ def promising(
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
+    Where all of them together hold little of the work, none is worth the analysis. What is promising grows with `tolerance`.
 
     Args:
         quantity: of the particles, in rank order.
@@ -68,7 +70,9 @@ def promising(
     change, depth = lax.fori_loop(0, (stacks.num_chunks > 0).sum(), probe_layer, table)[:, :-1, :-1]
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
-    return (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
+    found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
+    held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
+    return found & (held >= WORTHWHILE * all_held)
 
 
 def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:

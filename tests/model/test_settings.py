@@ -16,7 +16,7 @@ import jaxsph as js
         ({"tolerance": float("nan")}, "`tolerance` must be >= 0"),
         ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
         ({"estimator": "pilot"}, "`estimator` must be one of interval, got 'pilot'"),
-        ({"allocation": "fair"}, "`allocation` must be one of budget, greedy, independent"),
+        ({"allocation": "fair"}, "`allocation` must be one of budget, greedy, paper, independent"),
     ],
 )
 def test_bad_settings_are_refused(change, message):
