@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
@@ -72,3 +73,12 @@ def dam_break(**size: int) -> Workload:
     half = 0.52 * extent / near
     quantity = np.asarray(particles.quantity)
     return Workload("dam break", position, support, quantity, _table(4 / extent), eye, half, near, far, **size)
+
+
+def blocks(particles: int, size: int) -> tuple[js.Scene, js.Camera]:
+    """The checker board's view of a unit cube whose eight blocks hold four constants: mixed nowhere but at their faces."""
+    scene, camera = js.scenes.load("checker_board", particles, 0, width=size, height=size)
+    octant = (np.asarray(scene.particles.position) > 0.5) @ np.array([1, 2, 3])
+    quantity = np.array([0.1, 0.4, 0.7, 1.0], np.float32)[octant % 4]
+    held = dataclasses.replace(scene.particles, quantity=jnp.asarray(quantity))
+    return dataclasses.replace(scene, particles=held), camera

@@ -35,7 +35,7 @@ CELL_SAMPLES = 16  # D_z of the first paper
 SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 CHUNKS_A_LAYER = 12
-FINE_DIAMETER = 24  # pixels: supports that are smaller cannot cover a quarter of a footprint
+FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 SMALLEST_CHUNK = 64
 
 

@@ -26,7 +26,7 @@ from jaxsph.control.worklist import CELL
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.staging import computed_once
 
-CHUNK = 256  # cells analysed together: operands stay in the second-level cache
+CHUNK = 512  # cells analysed together: operands stay in the second-level cache
 SIZE_BITS = 5  # of a sort key: how full a cell is, in quarters of octaves
 
 

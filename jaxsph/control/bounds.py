@@ -32,7 +32,8 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.control.ranges import RangeTables, transfer_ranges
 from jaxsph.numerics.staging import computed_once
 
-PARTICLES = 4  # unrolled in the inner loop; longer chains do not vectorise
+PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
+COVERERS = 96  # particles in the middle of a window, that is nearest in depth, among which coverage is sought
 SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
 
 
@@ -99,31 +100,41 @@ def sample_bounds(
         parts: sub-rectangles on each side of the footprint, for the test of coverage.
     """
     spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
-    blocks = (window[1].sum(0).max() + PARTICLES - 1) // PARTICLES
+    total = window[1].sum(0)
     samples, bundles = borders.shape[0] - 1, borders.shape[1]
     dtype = borders.dtype
-    outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
-    farthest = jnp.full((samples, parts, parts, bundles), jnp.inf, dtype)
+    box = _boxes(footprint.columns, spread, 1), _boxes(footprint.rows, spread, 1)
     boxes = _boxes(footprint.columns, spread, parts), _boxes(footprint.rows, spread, parts)
+    sides = jnp.asarray([-1, 1], dtype)[:, None, None]
+    one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
-    def add_block(block: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        outermost, farthest = found
-        index = block * PARTICLES + jnp.arange(PARTICLES, dtype=jnp.int32)
-        ball = computed_once(block >= 0, _fetch, balls, rank, window, index)
-        near, near_depth, column, row, depth = computed_once(block >= 0, _squares, ball, boxes, borders)
-        sides = jnp.asarray([-1, 1], dtype)[:, None, None]
+    def add_nearest(block: Array, outermost: Array) -> Array:
+        ball = computed_once(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
+        near, near_depth = computed_once(block >= 0, _nearest, ball, box, borders)
         for k in range(PARTICLES):
             meets = near[k] + near_depth[k] <= 1
             outermost = jnp.maximum(outermost, jnp.where(meets, sides * ball.quantity[k], -jnp.inf))
-            farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
-        return outermost, farthest
+        return outermost
 
-    outermost, farthest = lax.fori_loop(0, blocks, add_block, (outermost, farthest))
+    def add_farthest(block: Array, farthest: Array) -> Array:
+        index = jnp.maximum(total // 2 - COVERERS // 2, 0) + block * PARTICLES + one_block
+        ball = computed_once(block >= 0, _fetch, balls, rank, window, index)
+        column, row, depth = computed_once(block >= 0, _farthest, ball, boxes, borders)
+        for k in range(PARTICLES):
+            farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
+        return farthest
+
+    fullest = total.max()
+    outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
+    outermost = lax.fori_loop(0, (fullest + PARTICLES - 1) // PARTICLES, add_nearest, outermost)
+    farthest = jnp.full((samples, parts, parts, bundles), jnp.inf, dtype)
+    enough = jnp.minimum(fullest, COVERERS)
+    farthest = lax.fori_loop(0, (enough + PARTICLES - 1) // PARTICLES, add_farthest, farthest)
     touched = outermost[1] > -jnp.inf
     lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
     eps = jnp.finfo(dtype).eps
     farthest_off = jnp.maximum(jnp.maximum(hi - origin[0], origin[1] - lo), 0)
-    rounding = sum_rounding(window[1].sum(0), dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
+    rounding = sum_rounding(total, dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
     least, greatest = transfer_ranges(tables, lo - rounding, hi + rounding)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
 
@@ -142,7 +153,6 @@ def _boxes(rays: Array, spread: tuple[Array, Array], parts: int) -> tuple[Array,
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
     """A block of particles of each bundle's windows; past the last they do not count."""
     begin, length = window
-    index = index[:, None]
     position, before = begin[0] + index, length[0]
     for k in range(1, begin.shape[0]):
         position = jnp.where(index >= before, (begin[k] - before) + index, position)
@@ -155,21 +165,22 @@ def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Arra
     return dataclasses.replace(found, outer=outer, inner=inner)
 
 
-def _squares(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, ...]:
-    """Parts of squared distances, in radii, from a block of particles to the nearest and farthest points of slabs.
+def _nearest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, Array]:
+    """Squared distances, in outer radii, to the nearest points of slabs: across (particles, bundles) and along depth."""
+    (left, right), (bottom, top) = boxes
+    x = jnp.maximum(jnp.maximum(left - ball.x, ball.x - right), 0)
+    y = jnp.maximum(jnp.maximum(bottom - ball.y, ball.y - top), 0)
+    z = ball.z[:, None]
+    z = jnp.maximum(jnp.maximum(borders[:-1] - z, z - borders[1:]), 0)
+    return _square(x, ball.outer) + _square(y, ball.outer), _square(z, ball.outer[:, None])
 
-    Returns:
-        Nearest across (particles, bundles) and along depth (particles, samples, bundles); farthest across columns and across
-        rows of the sub-rectangles (particles, parts, bundles) and along depth.
-    """
-    nearest, farthest = [], []
-    for place, (low, high) in zip((ball.x, ball.y), boxes, strict=True):
-        nearest.append(_square(jnp.maximum(jnp.maximum(low[0] - place, place - high[-1]), 0), ball.outer))
-        farthest.append(_square(jnp.maximum(place[:, None] - low, high - place[:, None]), ball.inner[:, None]))
-    front, back = borders[:-1] - ball.z[:, None], ball.z[:, None] - borders[1:]
-    near_depth = _square(jnp.maximum(jnp.maximum(front, back), 0), ball.outer[:, None])
-    far_depth = _square(jnp.maximum(-front, -back), ball.inner[:, None])
-    return nearest[0] + nearest[1], near_depth, farthest[0], farthest[1], far_depth
+
+def _farthest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, ...]:
+    """Squared distances, in inner radii, to the farthest points of parts of slabs: across columns, rows, and along depth."""
+    places = [(ball.x, *boxes[0]), (ball.y, *boxes[1]), (ball.z, borders[:-1], borders[1:])]
+    inner = ball.inner[:, None]
+    column, row, depth = (_square(jnp.maximum(place[:, None] - low, high - place[:, None]), inner) for place, low, high in places)
+    return column, row, depth
 
 
 def _square(distance: Array, inverse: Array) -> Array:
