@@ -29,8 +29,8 @@ class Settings:
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
-            does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict form
-            does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
+            does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict
+            form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
         memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it.
     """
 
