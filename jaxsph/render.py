@@ -90,7 +90,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     clock.mark("plan")
     ordered = clock.run("grid", _order, (scene.particles, camera), plan=plan)
     bands, words = [], [_input_faults(scene, camera) | ordered.faults]
-    counts = np.zeros(3)
+    counts = np.zeros(2)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
         lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
@@ -99,19 +99,17 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         seen = (ordered, lists, decided.work, *view)
         rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
         words.append(lists.faults)
-        counts += [float(count) for count in _counts(lists, cells, plan)]
+        counts += [float(count) for count in _counts(lists, cells)]
         bands.append(_unbundle(rays, decided, plan))
         if progress is not None:
             progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
     _raise(word, planned)
-    image = _assemble(_stack(bands), camera, plan, jnp.int32(word))
+    image, full = _assemble(_stack(bands), camera, plan, jnp.int32(word))
     clock.mark("image")
-    spent = int(np.asarray(image.evaluations, np.float64).sum())
-    full = spent if plan.control is None else int(counts[2])
     stats = {
-        "evaluations": spent,
-        "evaluations_full": full,
+        "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
+        "evaluations_full": int(np.asarray(full, np.float64).sum()),
         "cells": int(counts[0]),
         "pairs": int(counts[1]),
         "seconds": clock.seconds,
@@ -130,26 +128,24 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         view = (camera, scene.transfer, first_row)
         decided = _adapt(ordered, lists, cells, *view, _limits(settings, ordered), plan=plan)
         rays = _cast(ordered, lists, decided.work, *view, plan=plan, kernel=scene.particles.kernel)
-        return _unbundle(rays, decided, plan), lists.faults, _counts(lists, cells, plan)
+        return _unbundle(rays, decided, plan), lists.faults, _counts(lists, cells)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
     word |= _input_faults(scene, camera) | ordered.faults
-    image = _assemble(layers, camera, plan, word)
-    cells_found, pairs, full = (count.sum() for count in counts)
+    image, full = _assemble(layers, camera, plan, word)
+    cells_found, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
-    full = spent if plan.control is None else full
-    stats = {"evaluations": spent, "evaluations_full": full, "cells": cells_found, "pairs": pairs}
+    stats = {"evaluations": spent, "evaluations_full": full.sum(), "cells": cells_found, "pairs": pairs}
     certified = jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
-def _counts(lists: BundleLists, cells: Cells, plan: Plan) -> tuple[Array, Array, Array]:
-    """Filled slabs, (particle, bundle) pairs, and the kernel evaluations of the reference image, of one band."""
-    full = evaluations(full_rate(cells, jnp.zeros_like(cells.count)), plan.samples, plan.cast).sum() * BUNDLE * BUNDLE
-    return (cells.count > 0).sum(), lists.start[-1], full
+def _counts(lists: BundleLists, cells: Cells) -> tuple[Array, Array]:
+    """Filled slabs, and (particle, bundle) pairs, of one band."""
+    return (cells.count > 0).sum(), lists.start[-1]
 
 
 def _limits(settings: Settings, like: Ordered) -> tuple[Array, Array] | None:
@@ -165,14 +161,15 @@ def _limits(settings: Settings, like: Ordered) -> tuple[Array, Array] | None:
 
 @dataclasses.dataclass(frozen=True)
 class _Decided:
-    """What is to be marched, how wrong the pixels of each bundle can be, and what each cell was given."""
+    """What is to be marched, what would be at full rate, how wrong each bundle's pixels can be, what each cell was given."""
 
     work: Worklist
+    full: Array
     bound: Array
     levels: Array | None
 
 
-jax.tree_util.register_dataclass(_Decided, data_fields=["work", "bound", "levels"], meta_fields=[])
+jax.tree_util.register_dataclass(_Decided, data_fields=["work", "full", "bound", "levels"], meta_fields=[])
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -200,13 +197,16 @@ def _adapt(
     plan: Plan,
 ) -> _Decided:
     origin = origins(cells, lists.rank, ordered.quantity)
+    work = full_rate(cells, origin)
+    full = evaluations(work, plan.samples, plan.cast)
     if limits is None or plan.control is None:
-        return _Decided(full_rate(cells, origin), jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
+        return _Decided(work, full, jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
     half_steps = _half_steps(camera, ordered.x, plan)
     corners = bundle_origins(plan.lists, first_row)
     transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
     grid = (ordered, lists, cells, corners, camera, transfer, half_steps, origin)
-    return _Decided(*adapt(*grid, *limits, plan.cast.slab_samples, plan.control))
+    work, bound, levels = adapt(*grid, *limits, plan.cast.slab_samples, plan.control)
+    return _Decided(work, full, bound, levels)
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
@@ -234,7 +234,9 @@ def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
 
 
 def _unbundle(rays: Rays, decided: _Decided, plan: Plan) -> tuple[Array, ...]:
-    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound (h, w); and of bundles."""
+    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
+    and of bundles.
+    """
     rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
 
     def lay_out(value: Array) -> Array:
@@ -244,10 +246,9 @@ def _unbundle(rays: Rays, decided: _Decided, plan: Plan) -> tuple[Array, ...]:
         value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
         return value.reshape(rows * 2 * down, columns * 2 * across, *value.shape[6:])
 
-    spent, bound = (
-        jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in (rays.evaluations, decided.bound)
-    )
-    layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, bound)]
+    of_bundles = (rays.evaluations, decided.bound, decided.full)
+    of_rays = [jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in of_bundles]
+    layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, *of_rays)]
     return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in [decided.levels] if v is not None))
 
 
@@ -255,15 +256,15 @@ def _stack(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:
     return tuple(jnp.stack(layers) for layers in zip(*bands, strict=True))
 
 
-def _assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array) -> Image:
-    """Join the bands, cut off what lies beyond the image."""
+def _assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array) -> tuple[Image, Array]:
+    """Join the bands, cut off what lies beyond the image; and the evaluations that full rate takes."""
     joined = [layer.reshape(-1, *layer.shape[2:]) for layer in layers]
-    color, transmittance, depth, spent, bound = (layer[: camera.height, : camera.width] for layer in joined[:5])
+    color, transmittance, depth, spent, bound, full = (layer[: camera.height, : camera.width] for layer in joined[:6])
     image = Image(color, transmittance, depth, bound, spent, True, word, {})
-    if len(joined) == 5:
-        return image
+    if len(joined) == 6:
+        return image, full
     rows, columns = (-(-size // BUNDLE) for size in (camera.height, camera.width))
-    return dataclasses.replace(image, levels=jnp.moveaxis(joined[5][:rows, :columns], -1, 0))
+    return dataclasses.replace(image, levels=jnp.moveaxis(joined[6][:rows, :columns], -1, 0)), full
 
 
 @jax.jit

@@ -108,6 +108,7 @@ def test_full_rate_asked_for_is_the_reference_image_bit_for_bit(frames, toleranc
     image = js.render(scene, camera, asked)
     assert np.array_equal(image.color, truth.color) and np.array_equal(image.transmittance, truth.transmittance)
     assert not np.asarray(image.error_bound).any() and image.certified
+    assert image.stats["evaluations"] == image.stats["evaluations_full"] == truth.stats["evaluations"]
 
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
