@@ -87,17 +87,18 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     planned = plan is None
     plan = make_plan(scene, camera, settings) if plan is None else plan
     plan.check(scene, camera, settings)
+    shapes = dataclasses.replace(plan, control=None)  # what the grid and the cast are compiled for, with any error control
     clock.mark("plan")
-    ordered = clock.run("grid", _order, (scene.particles, camera), plan=plan)
+    ordered = clock.run("grid", _order, (scene.particles, camera), plan=shapes)
     bands, words = [], [_input_faults(scene, camera) | ordered.faults]
     counts = np.zeros(2)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
-        lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=plan)
+        lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes)
         view = (camera, scene.transfer, first_row)
         decided = clock.run("adapt", _adapt, (ordered, lists, cells, *view, _limits(settings, ordered)), plan=plan)
         seen = (ordered, lists, decided.work, *view)
-        rays = clock.run("cast", _cast, seen, plan=plan, kernel=scene.particles.kernel)
+        rays = clock.run("cast", _cast, seen, plan=shapes, kernel=scene.particles.kernel)
         words.append(lists.faults)
         counts += [float(count) for count in _counts(lists, cells)]
         bands.append(_unbundle(rays, decided, plan))
@@ -324,7 +325,7 @@ class _Clock:
 
 
 _PROGRAMS: dict[Hashable, Any] = {}
-MOST_PROGRAMS = 64  # compiled stages that are kept; the oldest goes first
+MOST_PROGRAMS = 32  # compiled stages that are kept, the oldest goes first: each takes up to 1500 of the 65530 memory maps
 
 
 def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
