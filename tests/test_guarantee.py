@@ -145,3 +145,21 @@ def test_changing_tolerance_and_relaxation_compiles_nothing(frames):
     for tolerance, relax in ((0.1, 0.0), (0.01, 0.5), (1e-3, 1.0)):
         render(dataclasses.replace(frames.settings, tolerance=tolerance, relax=relax))
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize("merge", [True, False])
+def test_a_particle_that_only_a_coarse_sample_would_hit_is_counted(merge):
+    """Supports smaller than a step lie between fine samples, in no slab's window, yet a coarse sample may sit on them."""
+    camera = js.Camera.orthographic((0, 0, 0), (0, 0, 1), view_height=8.0, width=8, height=8, near=0.0, far=64.0)
+    ray = np.array([0.5, 0.5])
+    seen = np.array([[*ray, depth + 0.5] for depth in range(0, 16)])
+    hidden = np.array([[*ray, depth] for depth in (4.0, 8.0, 12.0, 40.0, 56.0)])
+    quantity = np.repeat([0.0, 1.0], [len(seen), len(hidden)])
+    particles = js.Particles.from_arrays(np.concatenate([seen, hidden]), 0.1, quantity)
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [(0, 0, 0), (1, 1, 1)], [1e-5, 50.0])
+    scene = js.Scene(particles=particles, transfer=transfer)
+    asked = js.Settings(samples=64, tolerance=0.01, super_pixels=False, merge=merge)
+    truth, image = js.render(scene, camera, js.Settings(samples=64)), js.render(scene, camera, asked)
+    assert float(truth.alpha.max()) > 0
+    assert (error_of(image, truth) <= np.asarray(image.error_bound)).all()
+    assert float(image.error_bound.max()) <= 0.01

@@ -33,9 +33,26 @@ class Cells:
 
 def find_cells(ordered: Ordered, lists: BundleLists) -> Cells:
     """Bisect every bundle's list for the first and last rank of every slab and class."""
+    return _windows(lists, ordered.first_rank, ordered.last_rank)
+
+
+def cells_with_borders(ordered: Ordered, lists: BundleLists) -> Cells:
+    """The same for slabs with all that lies between their samples and those of the next: for samples of any spacing."""
+    return _windows(lists, ordered.first_beside, ordered.last_beside)
+
+
+def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], length: Int[Array, "classes *any"]) -> Array:
+    """Where the `index`-th particle of each cell stands in the lists: the cell's windows, one class after the other."""
+    place, before = begin[0] + index, length[0]
+    for k in range(1, begin.shape[0]):
+        place = jnp.where(index >= before, (begin[k] - before) + index, place)
+        before = before + length[k]
+    return place
+
+
+def _windows(lists: BundleLists, first: Array, last: Array) -> Cells:
     low, high = lists.start[:-1], lists.start[1:]
-    begin = _bisect(lists.rank, ordered.first_rank, low, high)
-    end = _bisect(lists.rank, ordered.last_rank, low, high)
+    begin, end = (_bisect(lists.rank, wanted, low, high) for wanted in (first, last))
     length = jnp.maximum(end - begin, 0)
     return Cells(begin, length, length.sum(0))
 

@@ -38,6 +38,9 @@ class Ordered:
     `reach` is the support widened by the rounding of coordinates: what lies outside it has weight zero in floating point.
     The particle's strength m = V / H^3 is folded into its lengths: `size = m^(1/n)` and `scale = size / H`, with n the degree
     of its kernel.
+
+    Ranks from `first_rank` up to `last_rank` can touch a sample of the slab; from `first_beside` up to `last_beside` any point
+    between the samples before and after it, where samples of wider spacing lie.
     """
 
     x: Float[Array, " particles"]
@@ -50,6 +53,8 @@ class Ordered:
     live: Bool[Array, " particles"]
     first_rank: Int[Array, "classes slabs"]
     last_rank: Int[Array, "classes slabs"]
+    first_beside: Int[Array, "classes slabs"]
+    last_beside: Int[Array, "classes slabs"]
     faults: Int[Array, ""]
 
 
@@ -66,19 +71,25 @@ def order_particles(
     eps = jnp.finfo(widest.dtype).eps * ROUNDING
 
     slabs = math.ceil(depths.shape[0] / slab_samples)
-    front = depths[::slab_samples]
-    back = depths[jnp.minimum(jnp.arange(1, slabs + 1) * slab_samples, depths.shape[0]) - 1]
+    first = jnp.arange(slabs, dtype=jnp.int32) * slab_samples
+    last = jnp.minimum(first + slab_samples, depths.shape[0]) - 1
     class_key = (jnp.arange(num_classes, dtype=jnp.uint32) << DEPTH_BITS)[:, None]
     widest = widest[:, None]
-    lowest = _depth_key(camera, front[None] - widest * (1 + eps))
-    highest = _depth_key(camera, back[None] + widest * (1 + eps))
-    lowest = class_key | jnp.where(lowest > KEY_MARGIN, lowest - KEY_MARGIN, 0)
-    highest = class_key | jnp.minimum(highest + KEY_MARGIN, (1 << DEPTH_BITS) - 1)
-    first_rank = jnp.searchsorted(key, lowest, side="left").astype(jnp.int32)
-    last_rank = jnp.searchsorted(key, highest, side="right").astype(jnp.int32)
 
+    def ranks(front: Array, back: Array) -> tuple[Array, Array]:
+        lowest = _depth_key(camera, front[None] - widest * (1 + eps))
+        highest = _depth_key(camera, back[None] + widest * (1 + eps))
+        lowest = class_key | jnp.where(lowest > KEY_MARGIN, lowest - KEY_MARGIN, 0)
+        highest = class_key | jnp.minimum(highest + KEY_MARGIN, (1 << DEPTH_BITS) - 1)
+        begin, end = (jnp.searchsorted(key, wanted, side=side) for wanted, side in ((lowest, "left"), (highest, "right")))
+        return begin.astype(jnp.int32), end.astype(jnp.int32)
+
+    at_slab = ranks(depths[first], depths[last])
+    beside = ranks(depths[jnp.maximum(first - 1, 0)], depths[jnp.minimum(last + 1, depths.shape[0] - 1)])
     ranked = {name: column[order] for name, column in columns.items()}
-    return Ordered(**ranked, first_rank=first_rank, last_rank=last_rank, faults=bad)
+    return Ordered(
+        **ranked, first_rank=at_slab[0], last_rank=at_slab[1], first_beside=beside[0], last_beside=beside[1], faults=bad
+    )
 
 
 def _view(

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsph.access.cells import position
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
@@ -186,7 +187,8 @@ def _gather_field(
     def separate(index: Array) -> tuple[Array, ...]:
         """The two parts of the squared distance, sizes and quantities of a block of particles; size 0 past the last."""
         inside = index < total[:, None]
-        particle = rank[jnp.clip(_position(index, begin, length), 0, rank.shape[0] - 1)]
+        place = position(index, begin[..., None], length[..., None])
+        particle = rank[jnp.clip(place, 0, rank.shape[0] - 1)]
         x, y, z, scale, size, quantity = (column[particle] for column in columns)
         scale, size = jnp.where(inside, scale, 0), jnp.where(inside, size, 0)
         x, y, z, scale = (value[:, :, None, None] for value in (x, y, z, scale))
@@ -198,16 +200,6 @@ def _gather_field(
     blocks = (total.max() + BLOCK - 1) // BLOCK
     sums = lax.fori_loop(0, blocks, add_block, lax.complex(zero, zero))
     return sums.real, sums.imag
-
-
-def _position(index: Array, begin: Array, length: Array) -> Array:
-    """Where the `index`-th particle of a cell stands in the lists: the cell's windows, one class after the other."""
-    position = begin[0][:, None] + index
-    before = length[0]
-    for k in range(1, begin.shape[0]):
-        position = jnp.where(index >= before[:, None], (begin[k] - before)[:, None] + index, position)
-        before = before + length[k]
-    return position
 
 
 def _shade(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells
+from jaxsph.access.cells import Cells, cells_with_borders
 from jaxsph.access.lists import BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.analysis import analyse
@@ -82,10 +82,13 @@ def adapt(
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
         rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * (full > 0).sum(0) + 2).astype(half_steps.dtype)
         offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
-        grid = (ordered, lists, cells, origins, camera, borders, origin)
+        beside = cells_with_borders(ordered, lists)
+        empty = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))
+        empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0
+        grid = (ordered, lists, cells, beside, origins, camera, borders, origin)
         analysis = analyse(*grid, wanted, tables, relax, slab_samples, plan.parts)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
-        final = merged_levels(chosen, (full == 0) & whole, slab_samples)
+        final = merged_levels(chosen, empty & whole, slab_samples)
         return final, analysis.paint, bound(analysis.error, jnp.where(full > 0, final, 0), rounding)
 
     def leave() -> tuple[Array, Array, Array]:

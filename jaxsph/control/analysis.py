@@ -20,7 +20,7 @@ from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
-from jaxsph.control.errors import CANDIDATES, cell_errors, fits
+from jaxsph.control.errors import CANDIDATES, EXPONENTIAL, cell_errors, fits
 from jaxsph.control.ranges import RangeTables
 from jaxsph.control.worklist import CELL
 from jaxsph.model.camera import Camera
@@ -49,6 +49,7 @@ def analyse(
     ordered: Ordered,
     lists: BundleLists,
     cells: Cells,
+    beside: Cells,
     origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
     camera: Camera,
     borders: Float[Array, " borders"],
@@ -62,6 +63,7 @@ def analyse(
     """Analyse the `wanted` cells of a band; the first arguments are those of `cast_points`.
 
     Args:
+        beside: windows of the slabs with their borders, as coarse samples lie on those.
         borders: depths of the borders of fine samples, padded to whole cells.
         origin: quantity that each slab's sums are taken relative to.
         tables: of the transfer function.
@@ -76,9 +78,10 @@ def analyse(
     chunk = min(CHUNK, -(-num_cells * bundles // 16) * 16)
     balls = spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
-    count = jnp.pad(cells.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
+    count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
+    filled = jnp.pad(cells.count > 0, missing)
     order, number = _fullest_first(wanted.ravel(), count.ravel(), chunk)
-    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (cells.begin, cells.length))
+    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     origin = jnp.pad(origin, missing)
     quantities = _extremes(ordered.quantity, ordered.live)
     pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]
@@ -93,7 +96,7 @@ def analyse(
         window = begin[:, slab, across], jnp.where(alive, length[:, slab, across], 0)
         edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
         footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
-        places = _extremes(origin[slab, across].reshape(per_cell, chunk), window[1].sum(0).reshape(per_cell, chunk) > 0)
+        places = _extremes(*(value[slab, across].reshape(per_cell, chunk) for value in (origin, filled)))
         places = jnp.tile(places[0], per_cell), jnp.tile(places[1], per_cell)
         look = functools.partial(sample_bounds, tables=tables, perspective=camera.is_perspective, parts=parts)
         of_slabs = look(balls, lists.rank, window, footprint, edges, places)
@@ -129,9 +132,11 @@ def _fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk
 
 
 def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
-    """At least what the cells in front let through; the sum is rounded down."""
-    total = lax.associative_scan(jnp.add, thin) * (1 - thin.shape[0] * jnp.finfo(thin.dtype).eps)
-    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])])
+    """At least what the cells in front let through, as computed: the sum is rounded down, the result up."""
+    eps, cells = jnp.finfo(thin.dtype).eps, thin.shape[0]
+    total = lax.associative_scan(jnp.add, thin) * (1 - (cells + 2) * eps)
+    # each sample's computed transmittance may be larger than the exponential by a few roundings
+    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * (1 + EXPONENTIAL * CELL * cells * eps)
 
 
 def _extremes(value: Array, where: Array) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.access.cells import position
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.ranges import RangeTables, transfer_ranges
@@ -152,15 +153,10 @@ def _boxes(rays: Array, spread: tuple[Array, Array], parts: int) -> tuple[Array,
 
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
     """A block of particles of each bundle's windows; past the last they do not count."""
-    begin, length = window
-    position, before = begin[0] + index, length[0]
-    for k in range(1, begin.shape[0]):
-        position = jnp.where(index >= before, (begin[k] - before) + index, position)
-        before = before + length[k]
-    place = jnp.clip(position, 0, rank.shape[0] - 1)
+    place = jnp.clip(position(index, *window), 0, rank.shape[0] - 1)
     particle = computed_once(index[0, 0] >= 0, lambda at: rank.at[at].get(mode="promise_in_bounds"), place)
     found = jax.tree.map(lambda column: column.at[particle].get(mode="promise_in_bounds"), balls)
-    inside = index < before
+    inside = index < window[1].sum(0)
     outer, inner = (jnp.where(inside, inverse, jnp.inf) for inverse in (found.outer, found.inner))
     return dataclasses.replace(found, outer=outer, inner=inner)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells
+from jaxsph.access.cells import Cells, cells_with_borders
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
@@ -70,7 +70,8 @@ def bundle_bounds(
     tables, balls = range_tables(transfer), spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
     borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - half_steps.shape[0] // 2), mode="edge")
-    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (cells.begin, cells.length))
+    beside = cells_with_borders(ordered, lists)
+    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     least = jnp.where(ordered.live, ordered.quantity, jnp.inf).min()
     greatest = jnp.where(ordered.live, ordered.quantity, -jnp.inf).max()
     pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]

@@ -122,7 +122,7 @@ def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Arra
     rounding = DEPTH_ROUNDING * jnp.finfo(borders.dtype).eps
     thin, thick = extinction[0] * steps * shortest * (1 - rounding), extinction[1] * steps * longest * (1 + rounding)
     before_hi, before_lo = (jnp.exp(-_sum_in_front(depth)) for depth in (thin, thick))
-    dark_hi, dark_lo = before_hi * _opacity(thick), before_lo * jnp.maximum(_opacity(thin) - _rounding(thin), 0)
+    dark_hi, dark_lo = before_hi * _opacity(thick), before_lo * jnp.maximum(_opacity(thin) - 2 * _rounding(thin), 0)
     return _Optics(color, extinction, steps, thin, before_hi, dark_lo, dark_hi)
 
 
@@ -197,7 +197,8 @@ def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
         middle = 0.5 * (lo + hi)
         chosen = jnp.clip((middle * dark).sum(0) / jnp.where(total > 0, total, 1), 0, 1)
         paint.append(chosen)
-        off.append((0.5 * (hi - lo) * optics.dark_hi + jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * dark)).sum(0))
+        uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * dark)
+        off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.dark_hi + uneven).sum(0))
     lost = jnp.exp(-optics.thin.sum(0)) * _opacity(off_depth)
     rounding = (CELL + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
     return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding

@@ -67,7 +67,7 @@ def merged_levels(
 
     Args:
         chosen: candidate of every cell.
-        free: empty cells, that allow any level.
+        free: cells that no particle can touch, nor their borders: they allow any level.
         slab_samples: samples of a slab.
     """
     fitting, num_cells = fits(slab_samples), chosen.shape[0]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import Cells
+from jaxsph.access.cells import Cells, position
 from jaxsph.access.stacks import stack
 from jaxsph.control.ranges import RangeTables, transfer_ranges
 from jaxsph.control.worklist import CELL
@@ -77,16 +77,11 @@ def promising(
 
 def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
     """Least and greatest quantity of the probes of slabs; of none, infinite and negative infinite."""
-    begin, length = window
-    total = length.sum(0)
+    total = window[1].sum(0)
     lo, hi = jnp.full(total.shape, jnp.inf, quantity.dtype), jnp.full(total.shape, -jnp.inf, quantity.dtype)
     for k in range(PROBES):
         index = (total * (2 * k + 1 + PROBES)) // (4 * PROBES)
-        position, before = begin[0] + index, length[0]
-        for c in range(1, begin.shape[0]):
-            position = jnp.where(index >= before, (begin[c] - before) + index, position)
-            before = before + length[c]
-        value = quantity[rank[jnp.clip(position, 0, rank.shape[0] - 1)]]
+        value = quantity[rank[jnp.clip(position(index, *window), 0, rank.shape[0] - 1)]]
         lo, hi = jnp.minimum(lo, value), jnp.maximum(hi, value)
     return jnp.where(total > 0, lo, jnp.inf), jnp.where(total > 0, hi, -jnp.inf)
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import Cells
+from jaxsph.access.cells import Cells, position
 
 COARSEST = 4  # level at which a cell has one sample
 CELL = 1 << COARSEST  # fine samples of a cell along depth: D_z of the first paper
@@ -52,12 +52,8 @@ def full_rate(cells: Cells, origin: Float[Array, "slabs bundles"]) -> Worklist:
 
 def origins(cells: Cells, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]) -> Float[Array, "slabs bundles"]:
     """The quantity of the particle in the middle of each slab's window; 0 where there is none."""
-    middle, position, before = cells.count // 2, cells.begin[0], cells.length[0]
-    position = position + middle
-    for k in range(1, cells.begin.shape[0]):
-        position = jnp.where(middle >= before, cells.begin[k] - before + middle, position)
-        before = before + cells.length[k]
-    return jnp.where(cells.count > 0, quantity[rank[jnp.clip(position, 0, rank.shape[0] - 1)]], 0)
+    place = position(cells.count // 2, cells.begin, cells.length)
+    return jnp.where(cells.count > 0, quantity[rank[jnp.clip(place, 0, rank.shape[0] - 1)]], 0)
 
 
 jax.tree_util.register_dataclass(Worklist, data_fields=[field.name for field in dataclasses.fields(Worklist)], meta_fields=[])
