@@ -8,12 +8,11 @@ Exit codes: 0 done, 1 the work failed, 2 wrong usage; one line on stderr says wh
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,7 +20,8 @@ import numpy as np
 
 import jaxsph
 from jaxsph import scenes
-from jaxsph.model import Camera, Image, Particles, Scene, Settings
+from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
+from jaxsph.model import Camera, Particles, Scene, Settings
 from jaxsph.scenes.view import snug
 
 SCENE = "scene:"
@@ -163,17 +163,17 @@ def _render(options: argparse.Namespace) -> None:
     output = options.output or Path(Path(options.source.removeprefix(SCENE)).stem + ".png")
     _require_writable(output)
     scene, camera = _scene_of_name(options) if options.source.startswith(SCENE) else _scene_of_file(options)
-    _say("camera", _camera_line(camera))
+    say("camera", camera_line(camera))
     started = time.perf_counter()
-    with _progress("render") as progress:
-        image = jaxsph.render(scene, camera, settings, progress=progress)
+    with progress("render") as show:
+        image = jaxsph.render(scene, camera, settings, progress=show)
     elapsed = time.perf_counter() - started
     image.save(output)
-    _say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
+    say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
     if settings.tolerance is not None:
         known = "certified" if image.certified else "estimated"
-        _say("error", f"at most {_largest(image.error_bound):.2g} ({known}), tolerance {settings.tolerance:g}")
-    _say("time", _time_line(image, elapsed))
+        say("error", f"at most {largest(image.error_bound):.2g} ({known}), tolerance {settings.tolerance:g}")
+    say("time", time_line(image, elapsed))
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -205,7 +205,7 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
         scene, camera = scenes.load(name, options.particles, options.frame, width=width, height=height)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    _say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {_span(scene.particles.support)}")
+    say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.support)}")
     if options.command == "render":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
             scene = dataclasses.replace(scene, transfer=_transfer(scene.particles, options, "concentration"))
@@ -226,13 +226,13 @@ def _particles_of_file(options: argparse.Namespace) -> tuple[Particles, str]:
     from jaxsph import io
 
     table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
-    _say("file", f"{options.source}: {table.source}, {len(table):,} particles")
+    say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    _say("support", f"{_span(particles.support)}: {report.support}")
-    _say("volume", report.volume)
-    _say("quantity", f"{report.quantity}, {_span(particles.quantity)}")
+    say("support", f"{span(particles.support)}: {report.support}")
+    say("volume", report.volume)
+    say("quantity", f"{report.quantity}, {span(particles.quantity)}")
     for note in report.notes:
-        _say("note", note)
+        say("note", note)
     return particles, report.quantity
 
 
@@ -243,8 +243,8 @@ def _transfer(particles: Particles, options: argparse.Namespace, quantity: str) 
         transfer = scenes.default_transfer(particles, name, options.range, depth)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    colors, extinction = f"{name} over {quantity} = {_span(transfer.values)}", _span(transfer.extinction)
-    _say("colours", f"{colors}, extinction {extinction} per unit length")
+    colors, extinction = f"{name} over {quantity} = {span(transfer.values)}", span(transfer.extinction)
+    say("colours", f"{colors}, extinction {extinction} per unit length")
     return transfer
 
 
@@ -267,8 +267,8 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
 def _info(options: argparse.Namespace) -> None:
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
-        _say("quantity", f"concentration, {_span(scene.particles.quantity)}")
-        _say("camera", _camera_line(camera))
+        say("quantity", f"concentration, {span(scene.particles.quantity)}")
+        say("camera", camera_line(camera))
         return
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for particle files")
     from jaxsph import io
@@ -280,16 +280,16 @@ def _info(options: argparse.Namespace) -> None:
     print()
     rows = [("attribute", "shape", "type", "range")]
     for name, column in (("position", table.position), *table.columns.items()):
-        rows.append((name, " x ".join(map(str, column.shape)), str(column.dtype), _ranges(column)))
+        rows.append((name, " x ".join(map(str, column.shape)), str(column.dtype), ranges(column)))
     widths = [max(len(row[i]) for row in rows) for i in range(3)]
     for row in rows:
         print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
     print("\n`jaxsph render` would show")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    _say("quantity", f"{report.quantity}, {_span(particles.quantity)}")
-    _say("support", f"{_span(particles.support)}: {report.support}")
-    _say("volume", report.volume)
-    _say("camera", _camera_line(Camera.framing(particles)))
+    say("quantity", f"{report.quantity}, {span(particles.quantity)}")
+    say("support", f"{span(particles.support)}: {report.support}")
+    say("volume", report.volume)
+    say("camera", camera_line(Camera.framing(particles)))
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -299,34 +299,24 @@ def _demo(options: argparse.Namespace) -> None:
         _require_writable(output)
     scene, camera = scenes.load("mixer", width=width, height=height)
     settings = Settings(tolerance=DEMO_TOLERANCE)
-    with _progress("render") as progress:
+    with progress("render") as show:
         started = time.perf_counter()
-        image = jaxsph.render(scene, camera, settings, progress=progress)
+        image = jaxsph.render(scene, camera, settings, progress=show)
         elapsed = time.perf_counter() - started
     for output in outputs:
         image.save(output)
     exact = dataclasses.replace(settings, tolerance=None)
-    error = _largest_difference(image, jaxsph.render(scene, camera, exact))
+    error = largest_difference(image, jaxsph.render(scene, camera, exact))
     small = dataclasses.replace(camera, width=DEMO_CHECK, height=DEMO_CHECK)
     truth = jaxsph.reference.render(scene, small, exact)
-    rounding = _largest_difference(jaxsph.render(scene, small, exact), truth)
-    _say("scene", f"mixer, {scene.particles.num_particles:,} particles")
+    rounding = largest_difference(jaxsph.render(scene, small, exact), truth)
+    say("scene", f"mixer, {scene.particles.num_particles:,} particles")
     for output in outputs:
-        _say("image", str(output.resolve()))
-    _say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {_largest(image.error_bound):.2g}")
-    _say("error", f"{error:.2g}, the largest against full sampling")
-    _say("", f"{rounding:.2g} of full sampling against float64 brute force at {DEMO_CHECK} x {DEMO_CHECK} pixels")
-    _say("time", _time_line(image, elapsed))
-
-
-def _largest(layer: Any) -> float:
-    return float(np.asarray(layer).max(initial=0))
-
-
-def _largest_difference(image: Image, truth: Image) -> float:
-    """Largest difference of any colour channel or alpha of any pixel."""
-    pairs = ((image.color, truth.color), (image.transmittance, truth.transmittance))
-    return max(float(np.abs(np.asarray(one, np.float64) - np.asarray(other)).max()) for one, other in pairs)
+        say("image", str(output.resolve()))
+    say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {largest(image.error_bound):.2g}")
+    say("error", f"{error:.2g}, the largest against full sampling")
+    say("", f"{rounding:.2g} of full sampling against float64 brute force at {DEMO_CHECK} x {DEMO_CHECK} pixels")
+    say("time", time_line(image, elapsed))
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
@@ -344,60 +334,3 @@ def _require_writable(path: Path) -> None:
         raise ValueError(f"{path}: there is no folder {folder} to write it to; make it first")
     if path.is_dir() or not os.access(folder, os.W_OK):
         raise ValueError(f"{path}: cannot be written; choose another place with -o")
-
-
-@contextlib.contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar on stderr where a person watches and tqdm is there, else `None`."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        yield None
-        return
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with tqdm(desc=what, unit=" bands", leave=False, file=sys.stderr) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show
-
-
-def _say(what: str, text: str) -> None:
-    print(f"{what:<10}{text}")
-
-
-def _span(values: Any) -> str:
-    values = np.asarray(values, np.float64)
-    if not values.size:
-        return "nothing"
-    low, high = values.min(), values.max()
-    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
-
-
-def _ranges(column: np.ndarray) -> str:
-    """Range of a scalar, or of each component of a vector; what is not finite is counted, not hidden."""
-    columns = np.atleast_2d(column.T).astype(np.float64)
-    finite = [part[np.isfinite(part)] for part in columns]
-    odd = columns.size - sum(part.size for part in finite)
-    return " | ".join(_span(part) for part in finite) + (f" ({odd} not finite)" if odd else "")
-
-
-def _camera_line(camera: Camera) -> str:
-    eye, axes = np.asarray(camera.eye, np.float64), np.asarray(camera.axes, np.float64)
-    fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
-    near, far = float(camera.near), float(camera.far)
-    target = eye + axes[2] * (near + far) / 2
-    place = " ".join(f"{v:.5g}" for v in eye) + " --target " + " ".join(f"{v:.5g}" for v in target)
-    return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
-
-
-def _time_line(image: Image, elapsed: float) -> str:
-    seconds = {name: value for name, value in image.stats.get("seconds", {}).items() if value >= 0.005}
-    parts = ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
-    spent, full = float(image.stats["evaluations"]), float(image.stats["evaluations_full"])
-    of = "" if spent == full else f" of {full / 1e6:,.1f} M"
-    return f"{elapsed:.2f} s ({parts}); {spent / 1e6:,.1f} M{of} kernel evaluations"

@@ -50,3 +50,15 @@ def test_ranges_are_tight(x64):
     np.testing.assert_allclose(greatest[1], [0, 1, 1, 0], atol=1e-12)
     np.testing.assert_allclose(least[3], [2.5, 20.5, 0, 9.7], atol=1e-12)
     np.testing.assert_allclose(greatest[3], [6.5, 42.5, 100, 15.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_exponentials_err_by_no_more_than_certificates_allow_for(dtype):
+    """`errors.EXPONENTIAL` takes 2 ulp for granted, here counted against long doubles."""
+    depth = np.concatenate([np.linspace(0, 40, 200_001), 10.0 ** np.linspace(-12, 1.5, 50_001)]).astype(dtype)
+    with jax.enable_x64(dtype is np.float64):
+        found = np.asarray(jax.jit(lambda x: jnp.exp(-x))(depth))
+    truth = np.exp(-depth.astype(np.longdouble))
+    ulp = np.spacing(truth.astype(dtype)).astype(np.longdouble)
+    assert (np.abs(found - truth) <= 2 * ulp).all()
+    assert (found <= 1).all()

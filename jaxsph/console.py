@@ -1,0 +1,87 @@
+"""What the command line tells a person: lines of text, and a progress bar.
+
+Flow: particles, camera, image -> [console] -> cli.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxsph.model import Camera, Image
+
+
+def largest(layer: Any) -> float:
+    """Largest number of a layer, 0 of none."""
+    return float(np.asarray(layer).max(initial=0))
+
+
+def largest_difference(image: Image, truth: Image) -> float:
+    """Largest difference of any colour channel or alpha of any pixel."""
+    pairs = ((image.color, truth.color), (image.transmittance, truth.transmittance))
+    return max(float(np.abs(np.asarray(one, np.float64) - np.asarray(other)).max()) for one, other in pairs)
+
+
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A progress bar on stderr where a person watches and tqdm is there, else `None`."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        yield None
+        return
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with tqdm(desc=what, unit=" bands", leave=False, file=sys.stderr) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def say(what: str, text: str) -> None:
+    """Print a line with its subject in front."""
+    print(f"{what:<10}{text}")
+
+
+def span(values: Any) -> str:
+    """Range of numbers as text."""
+    values = np.asarray(values, np.float64)
+    if not values.size:
+        return "nothing"
+    low, high = values.min(), values.max()
+    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+
+
+def ranges(column: np.ndarray) -> str:
+    """Range of a scalar, or of each component of a vector; what is not finite is counted, not hidden."""
+    columns = np.atleast_2d(column.T).astype(np.float64)
+    finite = [part[np.isfinite(part)] for part in columns]
+    odd = columns.size - sum(part.size for part in finite)
+    return " | ".join(span(part) for part in finite) + (f" ({odd} not finite)" if odd else "")
+
+
+def camera_line(camera: Camera) -> str:
+    """The options that give this camera again, and its depths."""
+    eye, axes = np.asarray(camera.eye, np.float64), np.asarray(camera.axes, np.float64)
+    fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
+    near, far = float(camera.near), float(camera.far)
+    target = eye + axes[2] * (near + far) / 2
+    place = " ".join(f"{v:.5g}" for v in eye) + " --target " + " ".join(f"{v:.5g}" for v in target)
+    return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
+
+
+def time_line(image: Image, elapsed: float) -> str:
+    """Seconds by stage, and kernel evaluations."""
+    seconds = {name: value for name, value in image.stats.get("seconds", {}).items() if value >= 0.005}
+    parts = ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
+    spent, full = float(image.stats["evaluations"]), float(image.stats["evaluations_full"])
+    of = "" if spent == full else f" of {full / 1e6:,.1f} M"
+    return f"{elapsed:.2f} s ({parts}); {spent / 1e6:,.1f} M{of} kernel evaluations"
