@@ -31,12 +31,11 @@ from jaxsph.numerics.checks import is_traced
 STEPS_AN_OCTAVE = 4  # capacities are rounded up to 1, 5/4, 6/4, 7/4 times a power of two
 MOST_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 LARGEST_CAPACITY = 1 << 30
-CELL_SAMPLES = 16  # D_z of the first paper
+MOST_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
-SAMPLES_AT_ONCE = 2048  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
-CHUNKS_A_LAYER = 12
+SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
+SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
-SMALLEST_CHUNK = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,17 +118,17 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab
     particles = scene.particles
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
     counts = (np.asarray(count) for count in _count(particles, camera, settings.samples, tile_rows))
-    tiles, bundles, depth_extent, diameter, covered = counts
+    tiles, bundles, depth_extent, diameter = counts
     num_classes = _num_classes(particles)
     control = control_plan(settings, _choose_parts(float(diameter)))
     slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
     bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
-        chunk = _choose_chunk(int(covered), rows * columns, slab_samples)
-        cast = CastPlan(chunk, slab_samples, CELL_SAMPLES // slab_samples)
+        cast = _cast_plan(4 * rows * columns, settings.samples, slab_samples)
         made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast, control)
-        fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY
+        slabs = made.lists.num_bundles * _ceil(settings.samples, slab_samples)
+        fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY and slabs < MOST_SLABS
         if fits or rows == 1:
             break
         bands = min(2 * bands, tile_rows)
@@ -163,7 +162,8 @@ def _for_bands(
         + lists.list_capacity * 8
         + num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * BUNDLE * BUNDLE * 5 * number * 2
-        + cast.chunk * cast.slab_samples * BUNDLE * BUNDLE * number * 16
+        + (16 * cast.chunk + 3 * cast.held) * cast.slab_samples * BUNDLE * BUNDLE * number
+        + slabs * lists.num_bundles * 8
         + camera.width * camera.height * 8 * number
         + (settings.tolerance is not None) * _bytes_of_control(lists, slabs, num_classes, number)
     )
@@ -207,10 +207,11 @@ def _choose_slab_samples(depth_extent: float) -> int:
     return SLAB_SAMPLES[-1]
 
 
-def _choose_chunk(covered: int, tiles: int, slab_samples: int) -> int:
-    """As many bundles as fill the caches, but few enough that a layer of the covered bundles makes some eight chunks."""
-    wanted = min(SAMPLES_AT_ONCE // slab_samples, max(covered // CHUNKS_A_LAYER, SMALLEST_CHUNK), 4 * tiles)
-    return 1 << (wanted - 1).bit_length()
+def _cast_plan(bundles: int, samples: int, slab_samples: int) -> CastPlan:
+    """As many slabs as the caches hold, but not many more than a small image has."""
+    most = bundles * _ceil(samples, slab_samples)
+    chunk = 1 << (min(SAMPLES_AT_ONCE // slab_samples, most) - 1).bit_length()
+    return CastPlan(chunk, slab_samples, min(SAMPLES_HELD // slab_samples, _ceil(most, chunk) * chunk))
 
 
 @functools.partial(jax.jit, static_argnames=("samples", "tile_rows"))
@@ -218,7 +219,7 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
     """What a plan is made from.
 
     Pairs in each row of tiles (with tiles, and at most with bundles); the median diameter of a support in samples, and in
-    pixels; and the number of bundles that particles stand in.
+    pixels.
     """
     depths = camera.depth(jnp.arange(samples, dtype=camera.dtype) + 0.5, samples).astype(particles.dtype)
     ordered = order_particles(particles, camera, depths, samples, 1)
@@ -234,10 +235,6 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
         tiles, bundles = (target, bundles) if counts == "tiles" else (tiles, target)
     index = jnp.arange(samples, dtype=depths.dtype)
     extent = jnp.interp(ordered.z + ordered.reach, depths, index) - jnp.interp(ordered.z - ordered.reach, depths, index)
-    across = _ceil(camera.width, BUNDLE)
-    everywhere = 2 * tile_rows * across
-    place = (top + bottom) // (2 * BUNDLE) * across + (left + right) // (2 * BUNDLE)
-    stood = jnp.zeros(everywhere + 1, bool).at[jnp.where(seen, place, everywhere)].set(True)[:-1]
     median = jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
     wide = jnp.nanmedian(jnp.where(seen, right - left + 1, jnp.nan))
-    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, wide, stood.sum()
+    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, wide

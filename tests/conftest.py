@@ -33,7 +33,7 @@ class Frames:
 
     def plan(self, slab_samples: int = 4, num_classes: int = 3) -> js.Plan:
         lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
-        cast = CastPlan(16, slab_samples, 16 // slab_samples)
+        cast = CastPlan(16, slab_samples, 48)  # stretches that end within a layer
         return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
 
     @property

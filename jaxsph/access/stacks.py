@@ -1,10 +1,10 @@
-"""Stack what is filled along each bundle, and decide in which order the stacks are marched.
+"""Stack what is filled along each bundle, so that empty space costs nothing.
 
 Flow: cells -> [stacks] -> control, cast.
 
-Layer n of the stacks holds every bundle's n-th group of filled items, front to back without gaps. In a layer, bundles are
-ordered by their work and taken `chunk` at a time, so that a chunk's trip counts are nearly their mean and empty space costs
-nothing.
+Layer n of the stacks holds every bundle's n-th filled item, front to back without gaps. With bundles in order of height, the
+bundles of a layer are the first so many of all: the layers, one after the other, are a list of items in which those that are
+near in depth are near each other, and any stretch of it can be put in front of what follows.
 """
 
 from __future__ import annotations
@@ -19,37 +19,35 @@ from jaxtyping import Array, Bool, Int
 
 @dataclasses.dataclass(frozen=True)
 class Stacks:
-    """Which items are marched when; `bundles` is a dummy bundle, `items` a dummy item.
+    """The filled items of a band, layer by layer; `slabs * bundles` is a dummy item.
 
     Attributes:
-        place: place along depth of each bundle's items, front to back; `group` consecutive rows are a layer.
-        order: for each layer, the bundles that have an item in it, most work first, padded to whole chunks with the dummy.
-        num_chunks: chunks of each layer.
+        item: `slab * bundles + bundle` of each, then dummies.
+        start: where each layer begins in `item`, and where the last ends.
+        bundle: bundles by height, tallest first; the n-th item of a layer is that of the n-th bundle.
     """
 
-    place: Int[Array, "items bundles_and_one"]
-    order: Int[Array, "layers padded_bundles"]
-    num_chunks: Int[Array, " layers"]
+    item: Int[Array, " items"]
+    start: Int[Array, " layers_and_one"]
+    bundle: Int[Array, " bundles"]
 
 
-def stack(filled: Bool[Array, "items bundles"], work: Int[Array, "items bundles"], group: int, chunk: int) -> Stacks:
-    """Stack the `filled` items of each bundle in groups; `work` says how much each will take."""
-    items, bundles = filled.shape
-    layers = -(-items // group)
-    position = jnp.where(filled, jnp.cumsum(filled, 0) - 1, layers * group)
-    every = jnp.broadcast_to(jnp.arange(bundles), filled.shape)
-    place = jnp.full((layers * group, bundles + 1), items, jnp.int32)
-    place = place.at[position, every].set(jnp.arange(items, dtype=jnp.int32)[:, None], mode="drop")
-    stacked = jnp.zeros((layers * group, bundles), jnp.int32).at[position, every].set(work.astype(jnp.int32) + 1, mode="drop")
-    stacked = stacked.reshape(layers, group, bundles).sum(1)
-    bits = (bundles + 1).bit_length()
-    key = jnp.minimum(stacked, (1 << (32 - bits)) - 1).astype(jnp.uint32) << bits
-    key = ~lax.sort(~(key | jnp.arange(bundles, dtype=jnp.uint32)), dimension=1)
-    order = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
-    active = (stacked > 0).sum(1)
-    order = jnp.where(jnp.arange(bundles) < active[:, None], order, bundles)
-    order = jnp.pad(order, ((0, 0), (0, -bundles % chunk)), constant_values=bundles)
-    return Stacks(place, order, (active + chunk - 1) // chunk)
+def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
+    """Stack the `filled` items of each bundle."""
+    slabs, bundles = filled.shape
+    nth = jnp.cumsum(filled.astype(jnp.int32), 0)
+    height = nth[-1]
+    bits = (bundles - 1).bit_length()
+    key = lax.sort(((slabs - height).astype(jnp.uint32) << bits) | lax.iota(jnp.uint32, bundles))
+    bundle = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
+    place = jnp.zeros(bundles, jnp.int32).at[bundle].set(jnp.arange(bundles, dtype=jnp.int32))
+    active = bundles - jnp.searchsorted(height[bundle[::-1]], jnp.arange(slabs, dtype=jnp.int32), side="right")
+    start = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(active.astype(jnp.int32))])
+    # always in bounds, as a dropped entry is a branch mispredicted
+    target = jnp.where(filled, start[jnp.maximum(nth - 1, 0)] + place, slabs * bundles)
+    item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)
+    item = item.at[target.ravel()].set(jnp.arange(slabs * bundles, dtype=jnp.int32))
+    return Stacks(item.at[-1].set(slabs * bundles), start, bundle)
 
 
-jax.tree_util.register_dataclass(Stacks, data_fields=["place", "order", "num_chunks"], meta_fields=[])
+jax.tree_util.register_dataclass(Stacks, data_fields=["item", "start", "bundle"], meta_fields=[])

@@ -2,8 +2,10 @@ r"""Ray casting of particles: thread-coherent marching of the first paper's sect
 
 Flow: worklist -> [points] -> image.
 
-Every bundle's slabs of samples are stacked front to back without gaps, and marched layer by layer of that stack
-(`access.stacks`); blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are
+What a slab of samples does to light does not depend on what lies in front of it. So the slabs of all bundles, stacked front
+to back without gaps (`access.stacks`), are taken `held` at a time and marched in order of how many particles they have, such
+that those marched together take equally long; what they emit and absorb is held, and then put into the rays' state layer by
+layer (`composite`). Blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are
 (chunk, samples of a slab, 8 rows, 8 columns).
 
 The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$
@@ -20,12 +22,13 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
+from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, unlit
 from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
@@ -36,38 +39,35 @@ BLOCK = 16  # particles unrolled in the inner loop
 
 
 @dataclasses.dataclass(frozen=True)
-class CastPlan:
-    """Static sizes of the march.
-
-    Attributes:
-        chunk: bundles marched together.
-        slab_samples: samples that share a window of particles.
-        slabs_per_cell: slabs of a cell, and marched in a row, for which the state of the rays is fetched and stored once.
-    """
-
-    chunk: int
-    slab_samples: int
-    slabs_per_cell: int
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 1:
-                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
-
-    @property
-    def cell_samples(self) -> int:
-        """Samples of a cell along depth (D_z in the first paper)."""
-        return self.slab_samples * self.slabs_per_cell
-
-
-@dataclasses.dataclass(frozen=True)
 class Rays:
-    """State of all rays of a band: premultiplied colour, transmittance, depth of half transmittance, kernel evaluations."""
+    """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance, kernel evaluations."""
 
     color: Float[Array, "3 bundles 8 8"]
     transmittance: Float[Array, "bundles 8 8"]
     depth: Float[Array, "bundles 8 8"]
     evaluations: Float[Array, " bundles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class CastPlan:
+    """Static sizes of the march.
+
+    Attributes:
+        chunk: slabs marched together.
+        slab_samples: samples that share a window of particles.
+        held: slabs whose light is held before it is put into the rays' state; a multiple of `chunk`.
+    """
+
+    chunk: int
+    slab_samples: int
+    held: int
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if getattr(self, field.name) < 1:
+                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+        if self.held % self.chunk:
+            raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
 
 
 def cast_points(
@@ -95,40 +95,62 @@ def cast_points(
     samples = half_steps.shape[0] // 2
     # samples past the end have length zero; the dummy slab lies there
     half_steps = jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
-    stacks = stack(work.filled, work.count, plan.slabs_per_cell, plan.chunk)
+    stacks = stack(work.filled)
+    order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
     segments = transfer.segments()
-    state = (
-        *(jnp.zeros((num_bundles + 1, BUNDLE, BUNDLE), dtype) for _ in range(3)),
-        jnp.ones((num_bundles + 1, BUNDLE, BUNDLE), dtype),
-        jnp.full((num_bundles + 1, BUNDLE, BUNDLE), jnp.inf, dtype),
+    pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
+    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
+
+    def march(at: Array) -> Light:
+        """What the slabs `at` emit, as seen from right in front of each, and their samples' optical thickness."""
+        slab, bundle = at // num_bundles, at % num_bundles
+        item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
+        u = camera.column((origins[1][bundle][:, None] + pixel).astype(dtype) + 0.5)
+        v = camera.row((origins[0][bundle][:, None] + pixel).astype(dtype) + 0.5)
+        s, border = _sample_depths(item, slab, half_steps, plan)
+        sums = _gather_field(ordered, lists.rank, item, (u, v, s), camera.is_perspective, kernel)
+        shade = functools.partial(_shade, perspective=camera.is_perspective)
+        *colors, thickness, passed = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
+        return *computed_once(slab[0] >= 0, emitted, colors, passed), thickness
+
+    def march_batch(batch: Array, state: tuple[State, Light]) -> tuple[State, Light]:
+        rays, light = state
+        first = batch * plan.held
+        items = lax.dynamic_slice(order, (first,), (plan.held,))
+        nth, number = _fullest_first(padded.count.ravel()[items], items < slabs * num_bundles)
+        fullest = items[nth]
+        held_at = jnp.zeros(plan.held, jnp.int32).at[nth].set(jnp.arange(plan.held, dtype=jnp.int32))
+
+        def march_chunk(chunk: Array, light: Light) -> Light:
+            begin = chunk * plan.chunk
+            found = march(lax.dynamic_slice(fullest, (begin,), (plan.chunk,)))
+            return tuple(lax.dynamic_update_slice_in_dim(old, new, begin, 0) for old, new in zip(light, found, strict=True))
+
+        light = lax.fori_loop(0, (number + plan.chunk - 1) // plan.chunk, march_chunk, light)
+
+        def border(at: Array) -> Array:
+            slab = items[at] // num_bundles
+            item = jax.tree.map(lambda leaf: leaf[..., slab, items[at] % num_bundles], padded)
+            return _sample_depths(item, slab, half_steps, plan)[1]
+
+        return composite(rays, light, held_at, border, stacks.start, first, number), light
+
+    batches = (stacks.start[-1] + plan.held - 1) // plan.held
+    state = fresh(num_bundles, dtype), unlit(plan.held + 1, plan.slab_samples, dtype)
+    place = jnp.zeros(num_bundles, jnp.int32).at[stacks.bundle].set(jnp.arange(num_bundles, dtype=jnp.int32))
+    *color, transmittance, depth = (
+        field[place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
     )
-    row, column = (jnp.append(origin, 0) for origin in origins)
-    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 1)]), work)
-
-    def march_layer(layer: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        def march_chunk(chunk: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-            bundle = lax.dynamic_slice(stacks.order, (layer, chunk * plan.chunk), (1, plan.chunk))[0]
-            pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
-            u = camera.column((column[bundle][:, None] + pixel).astype(dtype) + 0.5)
-            v = camera.row((row[bundle][:, None] + pixel).astype(dtype) + 0.5)
-
-            def march_item(k: Array, rays: list[Array]) -> list[Array]:
-                slab = stacks.place[layer * plan.slabs_per_cell + k, bundle]
-                item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
-                s, border = _sample_depths(item, slab, half_steps, plan)
-                sums = _gather_field(ordered, lists.rank, item, (u, v, s), camera.is_perspective, kernel)
-                shade = functools.partial(_shade, perspective=camera.is_perspective)
-                shaded = computed_once(k >= 0, shade, *sums, (u, v, border), segments, item)
-                return _composite(rays, shaded, border)
-
-            rays = lax.fori_loop(0, plan.slabs_per_cell, march_item, [field[bundle] for field in state])
-            return tuple(field.at[bundle].set(new) for field, new in zip(state, rays, strict=True))
-
-        return lax.fori_loop(0, stacks.num_chunks[layer], march_chunk, state)
-
-    layers = (stacks.num_chunks > 0).sum()
-    *color, transmittance, depth = (field[:-1] for field in lax.fori_loop(0, layers, march_layer, state))
     return Rays(jnp.stack(color), transmittance, depth, evaluations(work, samples, plan))
+
+
+def _fullest_first(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
+    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are."""
+    bits = (count.shape[0] - 1).bit_length()
+    blocks = jnp.minimum((count + BLOCK - 1) // BLOCK, (1 << (31 - bits)) - 2)
+    key = jnp.where(real, (1 << (31 - bits)) - 2 - blocks, (1 << (31 - bits)) - 1).astype(jnp.uint32) << bits
+    key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
+    return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32), real.sum(dtype=jnp.int32)
 
 
 def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " bundles"]:
@@ -213,43 +235,20 @@ def _shade(
 ) -> list[Array]:
     """Red, green, blue, optical thickness and transmittance of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
+    weight, weighted = (value.reshape(*value.shape[:2], RAYS) for value in (weight, weighted))
     inside = weight > 0
-    quantity = item.origin[:, None, None, None] + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
+    quantity = item.origin[:, None, None] + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
     optics = look_up(segments, quantity)
     if item.paint is not None and item.painted is not None:
-        painted = item.painted[:, None, None, None]
+        painted = item.painted[:, None, None]
         inside |= painted
-        optics = [jnp.where(painted, paint[:, None, None, None], value) for paint, value in zip(item.paint, optics, strict=True)]
+        optics = [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(item.paint, optics, strict=True)]
     *channels, extinction = optics
-    per_depth = jnp.ones_like(u[:, None, :] * v[:, :, None])
+    step = (border[:, 1:] - border[:, :-1])[:, :, None]
     if perspective:
-        per_depth = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2)
-    step = border[:, 1:] - border[:, :-1]
-    thickness = jnp.where(inside, extinction * (step[:, :, None, None] * per_depth[:, None]), 0)
+        step = step * jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, RAYS)
+    thickness = jnp.where(inside, extinction * step, 0)
     return [*channels, thickness, jnp.exp(-thickness)]
-
-
-def _composite(rays: list[Array], shaded: list[Array], border: Array) -> list[Array]:
-    """Front to back over the samples of the cells: first paper, equation 3.
-
-    A sample adds its colour times the light it takes away, `T - T T_i`: however thin the samples, colours then add up to
-    exactly the alpha that is lost.
-    """
-    *color, transmittance, depth = rays
-    *channels, thickness, passed = shaded
-    before, crossing, length, front = (jnp.full_like(depth, value) for value in (1, 1, 0, jnp.inf))
-    for k in range(passed.shape[1]):
-        behind = transmittance * passed[:, k]
-        color = [total + (transmittance - behind) * channel[:, k] for total, channel in zip(color, channels, strict=True)]
-        crossed = (transmittance > 0.5) & (behind <= 0.5)
-        before = jnp.where(crossed, transmittance, before)
-        crossing = jnp.where(crossed, thickness[:, k], crossing)
-        start, end = border[:, k, None, None], border[:, k + 1, None, None]
-        length = jnp.where(crossed, end - start, length)
-        front = jnp.where(crossed, start, front)
-        transmittance = behind
-    depth = jnp.minimum(depth, front + jnp.log(2 * before) / crossing * length)
-    return [*color, transmittance, depth]
 
 
 jax.tree_util.register_dataclass(Rays, data_fields=["color", "transmittance", "depth", "evaluations"], meta_fields=[])

@@ -59,9 +59,10 @@ def adapt(
 ) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
     r"""Decide how every cell is sampled. Where nothing is promising, that takes no more than a look.
 
-    Two images of a bundle whose samples agree differ by rounding. With n samples, each step of compositing rounds the
-    transmittance once and a colour's sum once, the differences and products of a colour another two times its share: less
-    than (n + 1) eps a pixel, and twice that for two images. Only where all cells stay at level 0 are the images the same bits.
+    Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample and once a slab;
+    a colour once a slab, and by the samples of a slab and three more times its share. With n samples, S to a slab, that is
+    less than (n + 2 n / S + S + 4) eps / 2 a pixel, thus (n + S) eps, and twice that for two images. Only where all cells
+    stay at level 0 are the images the same bits.
 
     Returns:
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
@@ -80,7 +81,7 @@ def adapt(
     def decide() -> tuple[Array, Array, Array]:
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * (full > 0).sum(0) + 2).astype(half_steps.dtype)
+        rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * ((full > 0).sum(0) + 1)).astype(half_steps.dtype)
         offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
         beside = cells_with_borders(ordered, lists)
         empty = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))

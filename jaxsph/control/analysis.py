@@ -135,8 +135,8 @@ def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bun
     """At least what the cells in front let through, as computed: the sum is rounded down, the result up."""
     eps, cells = jnp.finfo(thin.dtype).eps, thin.shape[0]
     total = lax.associative_scan(jnp.add, thin) * (1 - (cells + 2) * eps)
-    # each sample's computed transmittance may be larger than the exponential by a few roundings
-    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * (1 + EXPONENTIAL * CELL * cells * eps)
+    # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
+    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * (1 + (EXPONENTIAL + 1) * CELL * cells * eps)
 
 
 def _extremes(value: Array, where: Array) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from jaxsph.control.ranges import RangeTables, transfer_ranges
 from jaxsph.control.worklist import CELL
 from jaxsph.numerics.staging import computed_once
 
-CHUNK = 1024  # bundles probed together
+CHUNK = 1024  # cells probed together
 PROBES = 8  # particles of each slab, from the middle half of its window
 WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
@@ -48,26 +48,25 @@ def promising(
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
     chunk = min(CHUNK, -(-bundles // 16) * 16)
-    pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 1))
+    pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 0))
     begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
-    count = length.sum(0).reshape(num_cells + 1, per_cell, -1)[:-1, :, :-1].sum(1)
-    stacks = stack(count > 0, count, 1, chunk)
+    count = length.sum(0).reshape(num_cells + 1, per_cell, bundles)[:-1].sum(1)
+    stacks = stack(count > 0)
+    items = jnp.pad(stacks.item, (0, chunk), constant_values=num_cells * bundles)
     steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
 
-    def probe_layer(layer: Array, table: Array) -> Array:
-        def probe_chunk(step: Array, table: Array) -> Array:
-            bundle = lax.dynamic_slice(stacks.order, (layer, step * chunk), (1, chunk))[0]
-            cell = stacks.place[layer, bundle]
-            slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
-            window = begin[:, slab, bundle], length[:, slab, bundle]
-            lo, hi = computed_once(step >= 0, _extremes, quantity, rank, window)
-            entry = computed_once(step >= 0, _varies, lo, hi, steps[slab], tables)
-            return table.at[:, cell, bundle].set(entry)
+    def probe_chunk(step: Array, table: Array) -> Array:
+        at = lax.dynamic_slice(items, (step * chunk,), (chunk,))
+        cell, bundle = at // bundles, at % bundles
+        slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
+        window = begin[:, slab, bundle], length[:, slab, bundle]
+        lo, hi = computed_once(step >= 0, _extremes, quantity, rank, window)
+        entry = computed_once(step >= 0, _varies, lo, hi, steps[slab], tables)
+        return table.at[:, at].set(entry)
 
-        return lax.fori_loop(0, stacks.num_chunks[layer], probe_chunk, table)
-
-    table = jnp.zeros((2, num_cells + 1, bundles + 1), quantity.dtype)
-    change, depth = lax.fori_loop(0, (stacks.num_chunks > 0).sum(), probe_layer, table)[:, :-1, :-1]
+    table = jnp.zeros((2, num_cells * bundles + 1), quantity.dtype)
+    table = lax.fori_loop(0, (stacks.start[-1] + chunk - 1) // chunk, probe_chunk, table)
+    change, depth = table[:, :-1].reshape(2, num_cells, bundles)
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
     found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))

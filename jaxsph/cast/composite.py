@@ -1,0 +1,110 @@
+"""Front to back: the light of slabs put into the state of rays, first paper, equation 3.
+
+Flow: points -> [composite] -> image.
+
+A slab that emits colour C and lets through t, both as seen from right in front of it, adds T C to a ray and leaves it T t. In a
+slab a sample adds its colour times the light it takes away, $t_{k-1} - t_k$: however thin the samples, colours then add up to
+the alpha that is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxsph.access.lists import BUNDLE
+
+RAYS = BUNDLE * BUNDLE  # of a bundle, in one row: short rows do not vectorise
+TOGETHER = 256  # bundles of a layer that are composited together
+Light = tuple[Array, ...]  # of slabs: red, green, blue, transmittance (slabs, 64); samples' optical thickness (slabs, samples, 64)
+State = tuple[Array, ...]  # of rays: red, green, blue, transmittance, and depth where that is one half (bundles, 64)
+
+
+def unlit(slabs: int, samples: int, dtype: Any) -> Light:
+    """Slabs with nothing in them."""
+    return *(jnp.full((slabs, RAYS), value, dtype) for value in (0, 0, 0, 1)), jnp.zeros((slabs, samples, RAYS), dtype)
+
+
+def fresh(bundles: int, dtype: Any) -> State:
+    """Rays that have met nothing, with room for a chunk past the last."""
+    return tuple(jnp.full((bundles + TOGETHER, RAYS), value, dtype) for value in (0, 0, 0, 1, jnp.inf))
+
+
+def emitted(colors: list[Array], passed: Array) -> list[Array]:
+    """Red, green and blue of slabs of samples that let through `passed`, as seen from right in front, and their transmittance."""
+    left, total = jnp.ones_like(passed[:, 0]), [jnp.zeros_like(passed[:, 0])] * 3
+    for k in range(passed.shape[1]):
+        behind = left * passed[:, k]
+        total = [added + (left - behind) * color[:, k] for added, color in zip(total, colors, strict=True)]
+        left = behind
+    return [*total, left]
+
+
+def composite(
+    state: State,
+    light: Light,
+    held_at: Int[Array, " held"],
+    borders: Callable[[Array], Array],
+    starts: Int[Array, " layers_and_one"],
+    first: Int[Array, ""],
+    number: Int[Array, ""],
+) -> State:
+    """Put the light of a stretch of the stacks into the rays, whose bundles are in order of height.
+
+    Args:
+        light: of the slabs of the stretch, in any order, and of nothing at the end.
+        held_at: where in `light` each slab of the stretch is held.
+        borders: of slabs by place in the stretch, the depths of the borders of their samples.
+        starts: where the layers of the stacks begin.
+        first, number: where the stretch begins in the stacks, and how long it is.
+    """
+
+    def put_layer(layer: Array, state: State) -> State:
+        begin = jnp.maximum(starts[layer] - first, 0)
+        past = jnp.minimum(starts[layer + 1] - first, number)
+        bundle = first + begin - starts[layer]
+
+        def put_chunk(chunk: Array, state: State) -> State:
+            place = begin + chunk * TOGETHER + jnp.arange(TOGETHER, dtype=jnp.int32)
+            inside = place < past
+            place = jnp.where(inside, place, 0)
+            at = jnp.where(inside, held_at[place], light[0].shape[0] - 1)
+            here = bundle + chunk * TOGETHER
+            rays = tuple(lax.dynamic_slice_in_dim(field, here, TOGETHER) for field in state)
+            rays = _put(rays, light, at, borders(place))
+            return tuple(lax.dynamic_update_slice_in_dim(old, new, here, 0) for old, new in zip(state, rays, strict=True))
+
+        return lax.fori_loop(0, (past - begin + TOGETHER - 1) // TOGETHER, put_chunk, state)
+
+    top = jnp.searchsorted(starts, first, side="right").astype(jnp.int32) - 1
+    bottom = jnp.searchsorted(starts, first + number, side="left").astype(jnp.int32)
+    return lax.fori_loop(top, bottom, put_layer, state)
+
+
+def _put(rays: State, light: Light, at: Array, border: Array) -> State:
+    """Rays behind one more slab each."""
+    *colors, transmittance, depth = rays
+    *emission, left = (field[at] for field in light[:-1])
+    behind = transmittance * left
+    crossed = (transmittance > 0.5) & (behind <= 0.5)
+    depth = lax.cond(crossed.any(), _half_depth, lambda depth, *_: depth, depth, transmittance, light[-1], at, border)
+    return *(color + transmittance * added for color, added in zip(colors, emission, strict=True)), behind, depth
+
+
+def _half_depth(depth: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
+    """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they do not."""
+    thickness = thickness[at]
+    passed = jnp.exp(-thickness)
+    left, reached = jnp.ones_like(depth), transmittance
+    for k in range(passed.shape[1]):
+        left = left * passed[:, k]
+        behind = transmittance * left
+        start, end = border[:, k, None], border[:, k + 1, None]
+        place = start + jnp.log(2 * reached) / thickness[:, k] * (end - start)
+        depth = jnp.where((reached > 0.5) & (behind <= 0.5), place, depth)
+        reached = behind
+    return depth
