@@ -27,7 +27,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.numerics.staging import computed_once
 
 CHUNK = 512  # cells analysed together: operands stay in the second-level cache
-SIZE_BITS = 5  # of a sort key: how full a cell is, in quarters of octaves
+SIZE_BITS = 5  # of a sort key: how full a cell's fullest slab is, in quarters of octaves
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,9 +78,10 @@ def analyse(
     chunk = min(CHUNK, -(-num_cells * bundles // 16) * 16)
     balls = spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
-    count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles).sum(1)
+    count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
+    fullest, count = count.max(1), count.sum(1)
     filled = jnp.pad(cells.count > 0, missing)
-    order, number = _fullest_first(wanted.ravel(), count.ravel(), chunk)
+    order, number = _fullest_first(wanted.ravel(), fullest.ravel(), chunk)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     origin = jnp.pad(origin, missing)
     quantities = _extremes(ordered.quantity, ordered.live)
@@ -124,7 +125,7 @@ def analyse(
 
 def _fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
     """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
-    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 16), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
+    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 4), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
     bits = 32 - SIZE_BITS
     key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
     order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
