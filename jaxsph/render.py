@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.access.cells import Cells, find_cells
+from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.cast.points import Rays, cast_points, evaluations
@@ -94,13 +95,12 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     counts = np.zeros(2)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
-        lists, cells = clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes)
-        view = (camera, scene.transfer, first_row)
-        decided = clock.run("adapt", _adapt, (ordered, lists, cells, *view, _limits(settings, ordered)), plan=plan)
-        seen = (ordered, lists, decided.work, *view)
-        rays = clock.run("cast", _cast, seen, plan=shapes, kernel=scene.particles.kernel)
-        words.append(lists.faults)
-        counts += [float(count) for count in _counts(lists, cells)]
+        grid = Grid(ordered, *clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes))
+        view = (grid, camera, scene.transfer)
+        decided = clock.run("adapt", _adapt, (*view, _limits(settings, ordered)), plan=plan)
+        rays = clock.run("cast", _cast, (*view, decided.work), plan=shapes, kernel=scene.particles.kernel)
+        words.append(grid.lists.faults)
+        counts += [float(count) for count in _counts(grid)]
         bands.append(_unbundle(rays, decided, plan))
         if progress is not None:
             progress(band + 1, plan.bands)
@@ -125,11 +125,11 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
 
     def one_band(band: Int[Array, ""]) -> Any:
         first_row = band * plan.band_height
-        lists, cells = _grid(ordered, camera, first_row, plan=plan)
-        view = (camera, scene.transfer, first_row)
-        decided = _adapt(ordered, lists, cells, *view, _limits(settings, ordered), plan=plan)
-        rays = _cast(ordered, lists, decided.work, *view, plan=plan, kernel=scene.particles.kernel)
-        return _unbundle(rays, decided, plan), lists.faults, _counts(lists, cells)
+        grid = Grid(ordered, *_grid(ordered, camera, first_row, plan=plan))
+        view = (grid, camera, scene.transfer)
+        decided = _adapt(*view, _limits(settings, ordered), plan=plan)
+        rays = _cast(*view, decided.work, plan=plan, kernel=scene.particles.kernel)
+        return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
@@ -144,9 +144,9 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
-def _counts(lists: BundleLists, cells: Cells) -> tuple[Array, Array]:
+def _counts(grid: Grid) -> tuple[Array, Array]:
     """Filled slabs, and (particle, bundle) pairs, of one band."""
-    return (cells.count > 0).sum(), lists.start[-1]
+    return (grid.cells.count > 0).sum(), grid.lists.start[-1]
 
 
 def _limits(settings: Settings, like: Ordered) -> tuple[Array, Array] | None:
@@ -180,52 +180,32 @@ def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def _grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> tuple[BundleLists, Cells]:
-    lists = build_lists(ordered, camera, _half_steps(camera, ordered.x, plan)[1::2], plan.lists, first_row)
-    return lists, find_cells(ordered, lists)
+def _grid(
+    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan
+) -> tuple[BundleLists, Cells, Array, Array, Array]:
+    """What a `Grid` holds besides the particles, which are the same for all bands."""
+    half_steps = _half_steps(camera, ordered.x, plan)
+    lists = build_lists(ordered, camera, half_steps[1::2], plan.lists, first_row)
+    return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def _adapt(
-    ordered: Ordered,
-    lists: BundleLists,
-    cells: Cells,
-    camera: Camera,
-    transfer: TransferFunction,
-    first_row: Int[Array, ""],
-    limits: tuple[Array, Array] | None,
-    *,
-    plan: Plan,
-) -> _Decided:
-    origin = origins(cells, lists.rank, ordered.quantity)
-    work = full_rate(cells, origin)
+def _adapt(grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan) -> _Decided:
+    origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
+    work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)
+    dtype = grid.half_steps.dtype
     if limits is None or plan.control is None:
-        return _Decided(work, full, jnp.zeros(cells.count.shape[1], ordered.x.dtype), None)
-    half_steps = _half_steps(camera, ordered.x, plan)
-    corners = bundle_origins(plan.lists, first_row)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
-    grid = (ordered, lists, cells, corners, camera, transfer, half_steps, origin)
-    work, bound, levels = adapt(*grid, *limits, plan.cast.slab_samples, plan.control)
+        return _Decided(work, full, jnp.zeros(full.shape, dtype), None)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    work, bound, levels = adapt(grid, camera, transfer, origin, *limits, plan.cast.slab_samples, plan.control)
     return _Decided(work, full, bound, levels)
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
-def _cast(
-    ordered: Ordered,
-    lists: BundleLists,
-    work: Worklist,
-    camera: Camera,
-    transfer: TransferFunction,
-    first_row: Int[Array, ""],
-    *,
-    plan: Plan,
-    kernel: str,
-) -> Rays:
-    origins = bundle_origins(plan.lists, first_row)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(ordered.x.dtype), transfer)
-    half_steps = _half_steps(camera, ordered.x, plan)
-    return cast_points(ordered, lists, work, origins, camera, transfer, half_steps, kernel, plan.cast)
+def _cast(grid: Grid, camera: Camera, transfer: TransferFunction, work: Worklist, *, plan: Plan, kernel: str) -> Rays:
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    return cast_points(grid, work, camera, transfer, kernel, plan.cast)
 
 
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:

@@ -20,7 +20,7 @@ from jaxsph.access.lists import BUNDLE
 
 RAYS = BUNDLE * BUNDLE  # of a bundle, in one row: short rows do not vectorise
 TOGETHER = 256  # bundles of a layer that are composited together
-Light = tuple[Array, ...]  # of slabs: red, green, blue, transmittance (slabs, 64); samples' optical thickness (slabs, samples, 64)
+Light = tuple[Array, ...]  # of slabs: red, green, blue, transmittance (slabs, 64); optical thickness (slabs, samples, 64)
 State = tuple[Array, ...]  # of rays: red, green, blue, transmittance, and depth where that is one half (bundles, 64)
 
 

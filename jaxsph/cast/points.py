@@ -25,7 +25,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import position
-from jaxsph.access.lists import BUNDLE, BundleLists
+from jaxsph.access.grid import Grid
+from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, unlit
@@ -70,45 +71,29 @@ class CastPlan:
             raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
 
 
-def cast_points(
-    ordered: Ordered,
-    lists: BundleLists,
-    work: Worklist,
-    origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
-    camera: Camera,
-    transfer: TransferFunction,
-    half_steps: Float[Array, " two_samples_and_one"],
-    kernel: str,
-    plan: CastPlan,
-) -> Rays:
+def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFunction, kernel: str, plan: CastPlan) -> Rays:
     """March all bundles of a band.
 
     Args:
-        ordered, lists: the sparse perspective grid.
         work: the slabs of samples to march.
-        origins: pixel row and column of each bundle.
-        half_steps: view depths s(0), s(1/2), s(1), ... s(N): borders of the fine samples and what lies between, length units.
         kernel: name of the smoothing kernel.
     """
     slabs, num_bundles = work.count.shape
-    dtype = ordered.x.dtype
-    samples = half_steps.shape[0] // 2
+    dtype = grid.half_steps.dtype
     # samples past the end have length zero; the dummy slab lies there
-    half_steps = jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
+    half_steps = jnp.pad(grid.half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - grid.samples)), mode="edge")
     stacks = stack(work.filled)
     order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
     segments = transfer.segments()
-    pixel = jnp.arange(BUNDLE, dtype=jnp.int32)
     padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
 
     def march(at: Array) -> Light:
         """What the slabs `at` emit, as seen from right in front of each, and their samples' optical thickness."""
         slab, bundle = at // num_bundles, at % num_bundles
         item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
-        u = camera.column((origins[1][bundle][:, None] + pixel).astype(dtype) + 0.5)
-        v = camera.row((origins[0][bundle][:, None] + pixel).astype(dtype) + 0.5)
+        u, v = (rays.T for rays in grid.rays(camera, bundle))
         s, border = _sample_depths(item, slab, half_steps, plan)
-        sums = _gather_field(ordered, lists.rank, item, (u, v, s), camera.is_perspective, kernel)
+        sums = _gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
         shade = functools.partial(_shade, perspective=camera.is_perspective)
         *colors, thickness, passed = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
         return *computed_once(slab[0] >= 0, emitted, colors, passed), thickness
@@ -141,7 +126,7 @@ def cast_points(
     *color, transmittance, depth = (
         field[place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
     )
-    return Rays(jnp.stack(color), transmittance, depth, evaluations(work, samples, plan))
+    return Rays(jnp.stack(color), transmittance, depth, evaluations(work, grid.samples, plan))
 
 
 def _fullest_first(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells, cells_with_borders
-from jaxsph.access.lists import BundleLists
-from jaxsph.access.ordering import Ordered
+from jaxsph.access.cells import cells_with_borders
+from jaxsph.access.grid import Grid
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels
@@ -44,13 +43,9 @@ class ControlPlan:
 
 
 def adapt(
-    ordered: Ordered,
-    lists: BundleLists,
-    cells: Cells,
-    origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
+    grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
-    half_steps: Float[Array, " two_samples_and_one"],
     origin: Float[Array, "slabs bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
@@ -68,11 +63,11 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    bundles, samples = cells.count.shape[1], half_steps.shape[0] // 2
+    cells = grid.cells
+    bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL)
     tables = range_tables(transfer)
-    borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - samples), mode="edge")
-    wanted = promising(ordered.quantity, lists.rank, cells, borders, tables, tolerance, slab_samples)
+    wanted = promising(grid, tables, tolerance, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
     windows = coarser_windows(cells, slab_samples)
     costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
@@ -81,19 +76,17 @@ def adapt(
     def decide() -> tuple[Array, Array, Array]:
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(half_steps.dtype).eps * (CELL * ((full > 0).sum(0) + 1)).astype(half_steps.dtype)
+        rounding = 2 * jnp.finfo(dtype).eps * (CELL * ((full > 0).sum(0) + 1)).astype(dtype)
         offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
-        beside = cells_with_borders(ordered, lists)
+        beside = cells_with_borders(grid.ordered, grid.lists)
         empty = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))
         empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0
-        grid = (ordered, lists, cells, beside, origins, camera, borders, origin)
-        analysis = analyse(*grid, wanted, tables, relax, slab_samples, plan.parts)
+        analysis = analyse(grid, beside, camera, origin, wanted, tables, relax, slab_samples, plan.parts)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
         final = merged_levels(chosen, empty & whole, slab_samples)
         return final, analysis.paint, bound(analysis.error, jnp.where(full > 0, final, 0), rounding)
 
     def leave() -> tuple[Array, Array, Array]:
-        dtype = half_steps.dtype
         blank = jnp.zeros((num_cells, bundles), jnp.int32), jnp.zeros((4, num_cells, bundles), dtype)
         return *blank, jnp.zeros(bundles, dtype)
 

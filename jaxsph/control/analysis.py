@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import Cells
-from jaxsph.access.lists import BUNDLE, BundleLists
-from jaxsph.access.ordering import Ordered
+from jaxsph.access.grid import Grid
+from jaxsph.access.lists import BUNDLE
 from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
 from jaxsph.control.errors import CANDIDATES, EXPONENTIAL, cell_errors, fits
 from jaxsph.control.ranges import RangeTables
@@ -46,13 +46,9 @@ class Analysis:
 
 
 def analyse(
-    ordered: Ordered,
-    lists: BundleLists,
-    cells: Cells,
+    grid: Grid,
     beside: Cells,
-    origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
     camera: Camera,
-    borders: Float[Array, " borders"],
     origin: Float[Array, "slabs bundles"],
     wanted: Bool[Array, "cells bundles"],
     tables: RangeTables,
@@ -60,18 +56,18 @@ def analyse(
     slab_samples: int,
     parts: int,
 ) -> Analysis:
-    """Analyse the `wanted` cells of a band; the first arguments are those of `cast_points`.
+    """Analyse the `wanted` cells of a band.
 
     Args:
         beside: windows of the slabs with their borders, as coarse samples lie on those.
-        borders: depths of the borders of fine samples, padded to whole cells.
         origin: quantity that each slab's sums are taken relative to.
         tables: of the transfer function.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
-        slab_samples: samples of each slab of `cells`.
+        slab_samples: samples of each slab of the grid's cells.
         parts: sub-rectangles on each side of a footprint, for the test of coverage.
     """
-    slabs, bundles = cells.count.shape
+    ordered, rank = grid.ordered, grid.lists.rank
+    slabs, bundles = grid.cells.count.shape
     dtype = ordered.x.dtype
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
@@ -80,18 +76,17 @@ def analyse(
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
     count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
     fullest, count = count.max(1), count.sum(1)
-    filled = jnp.pad(cells.count > 0, missing)
+    filled = jnp.pad(grid.cells.count > 0, missing)
     order, number = _fullest_first(wanted.ravel(), fullest.ravel(), chunk)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     origin = jnp.pad(origin, missing)
     quantities = _extremes(ordered.quantity, ordered.live)
-    pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]
+    borders = grid.borders(num_cells * CELL)
 
     def analyse_chunk(step: Array, table: Array) -> Array:
         at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
         cell, bundle, real = at // bundles, at % bundles, step * chunk + jnp.arange(chunk) < number
-        u = camera.column((origins[1][bundle] + pixel).astype(dtype) + 0.5)
-        v = camera.row((origins[0][bundle] + pixel).astype(dtype) + 0.5)
+        u, v = grid.rays(camera, bundle)
         slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
         across, alive = jnp.tile(bundle, per_cell), jnp.tile(real, per_cell)
         window = begin[:, slab, across], jnp.where(alive, length[:, slab, across], 0)
@@ -100,7 +95,7 @@ def analyse(
         places = _extremes(*(value[slab, across].reshape(per_cell, chunk) for value in (origin, filled)))
         places = jnp.tile(places[0], per_cell), jnp.tile(places[1], per_cell)
         look = functools.partial(sample_bounds, tables=tables, perspective=camera.is_perspective, parts=parts)
-        of_slabs = look(balls, lists.rank, window, footprint, edges, places)
+        of_slabs = look(balls, rank, window, footprint, edges, places)
         bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
         edges = borders[cell * CELL + jnp.arange(CELL + 1, dtype=jnp.int32)[:, None]]
         paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)

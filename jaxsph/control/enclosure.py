@@ -19,9 +19,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells, cells_with_borders
-from jaxsph.access.lists import BUNDLE, BundleLists
-from jaxsph.access.ordering import Ordered
+from jaxsph.access.cells import cells_with_borders
+from jaxsph.access.grid import Grid
 from jaxsph.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
 from jaxsph.control.errors import DEPTH_ROUNDING, EXPONENTIAL
 from jaxsph.control.ranges import range_tables
@@ -41,13 +40,9 @@ class BundleBounds:
 
 
 def bundle_bounds(
-    ordered: Ordered,
-    lists: BundleLists,
-    cells: Cells,
-    origins: tuple[Int[Array, " bundles"], Int[Array, " bundles"]],
+    grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
-    half_steps: Float[Array, " two_samples_and_one"],
     levels: Int[Array, "cells bundles"],
     slab_samples: int,
     *,
@@ -57,26 +52,24 @@ def bundle_bounds(
     """Bounds of the pixels of all bundles of a band when cells are sampled at `levels`, 0 to 4.
 
     Args:
-        ordered, lists, cells, origins, camera, transfer, half_steps: as for `cast_points`.
         levels: of every cell; those of merged cells are equal.
-        slab_samples: samples of each slab of `cells`.
+        slab_samples: samples of each slab of the grid's cells.
         parts: sub-rectangles on each side of a footprint, for the test of coverage.
         form: `"lerp"`, or `"paper"` for irradiance and transmittance as separate intervals.
     """
-    slabs, bundles = cells.count.shape
+    ordered, lists = grid.ordered, grid.lists
+    slabs, bundles = grid.cells.count.shape
     dtype = ordered.x.dtype
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
     tables, balls = range_tables(transfer), spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
-    borders = jnp.pad(half_steps[::2], (0, num_cells * CELL - half_steps.shape[0] // 2), mode="edge")
+    borders = grid.borders(num_cells * CELL)
     beside = cells_with_borders(ordered, lists)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     least = jnp.where(ordered.live, ordered.quantity, jnp.inf).min()
     greatest = jnp.where(ordered.live, ordered.quantity, -jnp.inf).max()
-    pixel = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None]
-    u = camera.column((origins[1] + pixel).astype(dtype) + 0.5)
-    v = camera.row((origins[0] + pixel).astype(dtype) + 0.5)
+    u, v = grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))
     paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2) if camera.is_perspective else jnp.ones((1, 1, bundles), dtype)
     path = paths.min((0, 1)), paths.max((0, 1))
 

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jaxsph.access.cells import Cells, position
+from jaxsph.access.cells import position
+from jaxsph.access.grid import Grid
 from jaxsph.access.stacks import stack
 from jaxsph.control.ranges import RangeTables, transfer_ranges
 from jaxsph.control.worklist import CELL
@@ -25,25 +26,16 @@ PROBES = 8  # particles of each slab, from the middle half of its window
 WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
 
-def promising(
-    quantity: Float[Array, " particles"],
-    rank: Int[Array, " pairs"],
-    cells: Cells,
-    borders: Float[Array, " borders"],
-    tables: RangeTables,
-    tolerance: Float[Array, ""],
-    slab_samples: int,
-) -> Bool[Array, "cells bundles"]:
+def promising(grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], slab_samples: int) -> Bool[Array, "cells bundles"]:
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
     Where all of them together hold little of the work, none is worth the analysis. What is promising grows with `tolerance`.
 
     Args:
-        quantity: of the particles, in rank order.
-        borders: depths of the borders of fine samples, padded to whole slabs.
         tables: of the transfer function.
     """
+    quantity, rank, cells = grid.ordered.quantity, grid.lists.rank, grid.cells
     slabs, bundles = cells.count.shape
     per_cell = CELL // slab_samples
     num_cells = -(-slabs // per_cell)
@@ -53,6 +45,7 @@ def promising(
     count = length.sum(0).reshape(num_cells + 1, per_cell, bundles)[:-1].sum(1)
     stacks = stack(count > 0)
     items = jnp.pad(stacks.item, (0, chunk), constant_values=num_cells * bundles)
+    borders = grid.borders(num_cells * CELL)
     steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
 
     def probe_chunk(step: Array, table: Array) -> Array:

@@ -7,18 +7,17 @@ import functools
 import jax
 import pytest
 
-from jaxsph.access.lists import bundle_origins
+from jaxsph.access.grid import Grid
 from jaxsph.control.worklist import origins
-from jaxsph.render import _grid, _half_steps, _order
+from jaxsph.render import _grid, _order
 
 
 @functools.partial(jax.jit, static_argnames="plan")
 def grid_of(particles, camera, *, plan):
-    """Everything that the analysis of a band is made from, in its order."""
+    """The grid of a frame of one band, and what its sums are taken relative to."""
     ordered = _order(particles, camera, plan=plan)
-    lists, cells = _grid(ordered, camera, 0, plan=plan)
-    half_steps = _half_steps(camera, ordered.x, plan)
-    return ordered, lists, cells, bundle_origins(plan.lists, 0), half_steps, origins(cells, lists.rank, ordered.quantity)
+    grid = Grid(ordered, *_grid(ordered, camera, 0, plan=plan))
+    return grid, origins(grid.cells, grid.lists.rank, ordered.quantity)
 
 
 @pytest.fixture(scope="session")

@@ -16,14 +16,13 @@ from jaxsph.control.merge import coarse_work, coarser_windows, merged_levels
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel", "form"))
 def pixels_and_bounds(scene, camera, parts, wished, *, plan, kernel, form):
-    ordered, lists, cells, corners, half_steps, origin = parts
+    grid, origin = parts
     slab_samples = plan.cast.slab_samples
     whole = ((jnp.arange(wished.shape[0]) + 1) * 16 <= plan.samples)[:, None]
     levels = merged_levels(jnp.where(whole, wished, 0), jnp.zeros_like(wished, bool), slab_samples)
-    work = coarse_work(coarser_windows(cells, slab_samples), levels, origin, None, slab_samples)
-    rays = cast_points(ordered, lists, work, corners, camera, scene.transfer, half_steps, kernel, plan.cast)
-    grid = (ordered, lists, cells, corners, camera, scene.transfer, half_steps)
-    bounds = bundle_bounds(*grid, levels, slab_samples, form=form)
+    work = coarse_work(coarser_windows(grid.cells, slab_samples), levels, origin, None, slab_samples)
+    rays = cast_points(grid, work, camera, scene.transfer, kernel, plan.cast)
+    bounds = bundle_bounds(grid, camera, scene.transfer, levels, slab_samples, form=form)
     return jnp.concatenate([rays.color, 1 - rays.transmittance[None]]), bounds
 
 
