@@ -15,7 +15,7 @@ from jaxsph.access.cells import cells_with_borders
 from jaxsph.access.grid import Grid
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
-from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels
+from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels, uncoarsened
 from jaxsph.control.probe import promising
 from jaxsph.control.ranges import range_tables
 from jaxsph.control.worklist import CELL, Worklist
@@ -69,27 +69,30 @@ def adapt(
     tables = range_tables(transfer)
     wanted = promising(grid, tables, tolerance, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
-    windows = coarser_windows(cells, slab_samples)
-    costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
-    full = next(cost for cost in costs if cost is not None)
+    empty = jnp.pad(cells.count, ((0, num_cells * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
+    empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0
 
-    def decide() -> tuple[Array, Array, Array]:
+    def decide() -> tuple[Worklist, Array, Array]:
+        windows = coarser_windows(cells, slab_samples)
+        costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
+        full = next(cost for cost in costs if cost is not None)
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(dtype).eps * (CELL * ((full > 0).sum(0) + 1)).astype(dtype)
-        offer = Offer(saving, on_offer & (full > 0) & whole, rounding)
+        rounding = 2 * jnp.finfo(dtype).eps * (CELL * ((~empty).sum(0) + 1)).astype(dtype)
+        offer = Offer(saving, on_offer & ~empty & whole, rounding)
         beside = cells_with_borders(grid.ordered, grid.lists)
-        empty = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))
-        empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0
         analysis = analyse(grid, beside, camera, origin, wanted, tables, relax, slab_samples, plan.parts)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
-        final = merged_levels(chosen, empty & whole, slab_samples)
-        return final, analysis.paint, bound(analysis.error, jnp.where(full > 0, final, 0), rounding)
+        free = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))
+        free = (free.reshape(num_cells, -1, bundles).sum(1) == 0) & whole
+        final = merged_levels(chosen, free, slab_samples)
+        largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
+        paint = analysis.paint if plan.super_pixels else None
+        return coarse_work(windows, final, origin, paint, slab_samples), largest, final
 
-    def leave() -> tuple[Array, Array, Array]:
-        blank = jnp.zeros((num_cells, bundles), jnp.int32), jnp.zeros((4, num_cells, bundles), dtype)
-        return *blank, jnp.zeros(bundles, dtype)
+    def leave() -> tuple[Worklist, Array, Array]:
+        none = jnp.zeros((num_cells, bundles), jnp.int32)
+        return uncoarsened(cells, origin, plan.super_pixels), jnp.zeros(bundles, dtype), none
 
-    final, paint, largest = lax.cond(wanted.any(), decide, leave)
-    work = coarse_work(windows, final, origin, paint if plan.super_pixels else None, slab_samples)
-    return work, largest, jnp.where(full > 0, final, EMPTY)
+    work, largest, final = lax.cond(wanted.any(), decide, leave)
+    return work, largest, jnp.where(empty, EMPTY, final)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import Cells
 from jaxsph.control.errors import LEVELS, SUPER_PIXEL, fits
-from jaxsph.control.worklist import CELL, COARSEST, Worklist
+from jaxsph.control.worklist import CELL, COARSEST, Worklist, full_rate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +31,7 @@ class Window:
 
 def coarser_windows(cells: Cells, slab_samples: int) -> list[Window]:
     """Unions of the windows of 1, 2, 4, 8 and 16 slabs; the number of slabs is rounded up to a multiple of 16."""
-    missing = -cells.count.shape[0] % (1 << COARSEST)
-    pad = ((0, 0), (0, missing), (0, 0))
-    windows = [Window(jnp.pad(cells.begin, pad), jnp.pad(cells.length, pad))]
+    windows = [Window(_pad_slabs(cells.begin, cells), _pad_slabs(cells.length, cells))]
     for _ in range(COARSEST):
         begin, length = windows[-1].begin, windows[-1].length
         none = jnp.iinfo(begin.dtype).max
@@ -113,6 +111,20 @@ def coarse_work(
         return Worklist(count > 0, level, begin, length, count, origin)
     colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
     return Worklist((count > 0) | painted, level, begin, length, count, origin, painted, colors)
+
+
+def uncoarsened(cells: Cells, origin: Float[Array, "slabs bundles"], super_pixels: bool) -> Worklist:
+    """The reference image's work, in the shape of `coarse_work`."""
+    work = jax.tree.map(lambda leaf: _pad_slabs(leaf, cells), full_rate(cells, origin))
+    if not super_pixels:
+        return work
+    return dataclasses.replace(work, painted=jnp.zeros_like(work.filled), paint=jnp.zeros((4, *work.origin.shape), origin.dtype))
+
+
+def _pad_slabs(value: Array, cells: Cells) -> Array:
+    """Round the number of slabs up to whole windows of the coarsest level."""
+    missing = -cells.count.shape[0] % (1 << COARSEST)
+    return jnp.pad(value, [(0, 0)] * (value.ndim - 2) + [(0, missing), (0, 0)])
 
 
 def _shared_origins(origin: Array, windows: list[Window], level: Array) -> Array:
