@@ -54,7 +54,7 @@ def _windows(lists: BundleLists, first: Array, last: Array) -> Cells:
     low, high = lists.start[:-1], lists.start[1:]
     begin, end = (_bisect(lists.rank, wanted, low, high) for wanted in (first, last))
     length = jnp.maximum(end - begin, 0)
-    return Cells(begin, length, length.sum(0))
+    return Cells(begin, length, length.sum(0, dtype=jnp.int32))
 
 
 def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
