@@ -93,7 +93,7 @@ def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFu
         item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
         u, v = (rays.T for rays in grid.rays(camera, bundle))
         s, border = _sample_depths(item, slab, half_steps, plan)
-        sums = _gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
+        sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
         shade = functools.partial(_shade, perspective=camera.is_perspective)
         *colors, thickness, passed = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
         return *computed_once(slab[0] >= 0, emitted, colors, passed), thickness
@@ -160,7 +160,7 @@ def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPla
     return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
 
 
-def _gather_field(
+def gather_field(
     ordered: Ordered,
     rank: Int[Array, " pairs"],
     item: Worklist,
