@@ -67,7 +67,8 @@ def adapt(
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL)
     tables = range_tables(transfer)
-    wanted = promising(grid, tables, tolerance, slab_samples)
+    lateral = 1 - relax if plan.allocation == "paper" else 0.0
+    wanted = promising(grid, tables, tolerance, lateral, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
     empty = jnp.pad(cells.count, ((0, num_cells * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
     empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0

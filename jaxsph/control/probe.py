@@ -26,7 +26,9 @@ PROBES = 8  # particles of each slab, from the middle half of its window
 WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
 
-def promising(grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], slab_samples: int) -> Bool[Array, "cells bundles"]:
+def promising(
+    grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], lateral: Float[Array, ""] | float, slab_samples: int
+) -> Bool[Array, "cells bundles"]:
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
@@ -34,6 +36,8 @@ def promising(grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], slab
 
     Args:
         tables: of the transfer function.
+        lateral: share of the variation between neighbouring rays, of all cells of a bundle together, that is to be taken from
+            the tolerance before anything is saved.
     """
     quantity, rank, cells = grid.ordered.quantity, grid.lists.rank, grid.cells
     slabs, bundles = cells.count.shape
@@ -63,6 +67,7 @@ def promising(grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], slab
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
     found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
+    found &= 2 * lateral * (front * change).sum(0) <= tolerance
     held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
     return found & (held >= WORTHWHILE * all_held)
 
