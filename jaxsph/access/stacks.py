@@ -24,12 +24,12 @@ class Stacks:
     Attributes:
         item: `slab * bundles + bundle` of each, then dummies.
         start: where each layer begins in `item`, and where the last ends.
-        bundle: bundles by height, tallest first; the n-th item of a layer is that of the n-th bundle.
+        place: of each bundle in order of height, tallest first; the n-th item of a layer is that of the n-th bundle.
     """
 
     item: Int[Array, " items"]
     start: Int[Array, " layers_and_one"]
-    bundle: Int[Array, " bundles"]
+    place: Int[Array, " bundles"]
 
 
 def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
@@ -47,7 +47,7 @@ def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
     target = jnp.where(filled, start[jnp.maximum(nth - 1, 0)] + place, slabs * bundles)
     item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)
     item = item.at[target.ravel()].set(jnp.arange(slabs * bundles, dtype=jnp.int32))
-    return Stacks(item.at[-1].set(slabs * bundles), start, bundle)
+    return Stacks(item.at[-1].set(slabs * bundles), start, place)
 
 
-jax.tree_util.register_dataclass(Stacks, data_fields=["item", "start", "bundle"], meta_fields=[])
+jax.tree_util.register_dataclass(Stacks, data_fields=["item", "start", "place"], meta_fields=[])

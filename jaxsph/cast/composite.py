@@ -91,12 +91,15 @@ def _put(rays: State, light: Light, at: Array, border: Array) -> State:
     *emission, left = (field[at] for field in light[:-1])
     behind = transmittance * left
     crossed = (transmittance > 0.5) & (behind <= 0.5)
-    depth = lax.cond(crossed.any(), _half_depth, lambda depth, *_: depth, depth, transmittance, light[-1], at, border)
+    depth = lax.cond(crossed.any(), _half_depth, lambda depth, *_: depth, depth, crossed, transmittance, light[-1], at, border)
     return *(color + transmittance * added for color, added in zip(colors, emission, strict=True)), behind, depth
 
 
-def _half_depth(depth: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
-    """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they do not."""
+def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
+    """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they have not `crossed` it.
+
+    Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
+    """
     thickness = thickness[at]
     passed = jnp.exp(-thickness)
     left, reached = jnp.ones_like(depth), transmittance
@@ -104,7 +107,10 @@ def _half_depth(depth: Array, transmittance: Array, thickness: Array, at: Array,
         left = left * passed[:, k]
         behind = transmittance * left
         start, end = border[:, k, None], border[:, k + 1, None]
-        place = start + jnp.log(2 * reached) / thickness[:, k] * (end - start)
-        depth = jnp.where((reached > 0.5) & (behind <= 0.5), place, depth)
+        filled = thickness[:, k] > 0
+        share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
+        here = crossed & ((behind <= 0.5) | (k == passed.shape[1] - 1))
+        depth = jnp.where(here, start + jnp.minimum(share, 1) * (end - start), depth)
+        crossed = crossed & ~here
         reached = behind
     return depth

@@ -122,9 +122,8 @@ def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFu
 
     batches = (stacks.start[-1] + plan.held - 1) // plan.held
     state = fresh(num_bundles, dtype), unlit(plan.held + 1, plan.slab_samples, dtype)
-    place = jnp.zeros(num_bundles, jnp.int32).at[stacks.bundle].set(jnp.arange(num_bundles, dtype=jnp.int32))
     *color, transmittance, depth = (
-        field[place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
+        field[stacks.place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
     )
     return Rays(jnp.stack(color), transmittance, depth, evaluations(work, grid.samples, plan))
 

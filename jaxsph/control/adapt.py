@@ -9,9 +9,9 @@ import dataclasses
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import cells_with_borders
+from jaxsph.access.cells import Cells, cells_with_borders
 from jaxsph.access.grid import Grid
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
@@ -70,8 +70,7 @@ def adapt(
     lateral = 1 - relax if plan.allocation == "paper" else 0.0
     wanted = promising(grid, tables, tolerance, lateral, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
-    empty = jnp.pad(cells.count, ((0, num_cells * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
-    empty = empty.reshape(num_cells, -1, bundles).sum(1) == 0
+    empty = _nowhere(cells, num_cells, slab_samples)
 
     def decide() -> tuple[Worklist, Array, Array]:
         windows = coarser_windows(cells, slab_samples)
@@ -84,9 +83,8 @@ def adapt(
         beside = cells_with_borders(grid.ordered, grid.lists)
         analysis = analyse(grid, beside, camera, origin, wanted, tables, relax, slab_samples, plan.parts)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
-        free = jnp.pad(beside.count, ((0, num_cells * CELL // slab_samples - beside.count.shape[0]), (0, 0)))
-        free = (free.reshape(num_cells, -1, bundles).sum(1) == 0) & whole
-        final = merged_levels(chosen, free, slab_samples)
+        free = _nowhere(beside, num_cells, slab_samples)
+        final = merged_levels(chosen, free & whole, slab_samples)
         largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
         paint = analysis.paint if plan.super_pixels else None
         return coarse_work(windows, final, origin, paint, slab_samples), largest, final
@@ -97,3 +95,9 @@ def adapt(
 
     work, largest, final = lax.cond(wanted.any(), decide, leave)
     return work, largest, jnp.where(empty, EMPTY, final)
+
+
+def _nowhere(cells: Cells, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
+    """Cells that no particle can touch."""
+    count = jnp.pad(cells.count, ((0, num_cells * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
+    return count.reshape(num_cells, -1, count.shape[1]).sum(1) == 0

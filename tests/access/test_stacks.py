@@ -14,9 +14,10 @@ from jaxsph.access.stacks import stack
 def test_layers_hold_the_nth_filled_item_of_every_bundle_in_order_of_height(filled):
     slabs, bundles = filled.shape
     stacks = stack(filled)
-    item, start, bundle = (np.asarray(value) for value in (stacks.item, stacks.start, stacks.bundle))
+    item, start, place = (np.asarray(value) for value in (stacks.item, stacks.start, stacks.place))
     height = filled.sum(0)
-    assert sorted(bundle) == list(range(bundles))
+    assert sorted(place) == list(range(bundles))
+    bundle = np.argsort(place)
     assert (np.diff(height[bundle]) <= 0).all()
     assert start[0] == 0 and start[-1] == filled.sum()
     assert (item[start[-1] :] == slabs * bundles).all()
