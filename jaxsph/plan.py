@@ -18,10 +18,12 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsph.access.footprint import pixel_ranges
+from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES
 from jaxsph.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.access.ordering import order_particles
 from jaxsph.cast.points import CastPlan
 from jaxsph.control.adapt import ControlPlan
+from jaxsph.control.pilot import PilotPlan
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene
@@ -35,6 +37,7 @@ MOST_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
+ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -63,7 +66,7 @@ class Plan:
     lists: ListPlan
     cast: CastPlan
     bytes: int
-    control: ControlPlan | None = None
+    control: ControlPlan | PilotPlan | None = None
 
     @property
     def band_height(self) -> int:
@@ -81,7 +84,7 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
-        wanted = control_plan(settings, self.control.parts if self.control else 1)
+        wanted = control_plan(settings, self.control.parts if isinstance(self.control, ControlPlan) else 1)
         if wanted != self.control:
             raise ValueError(
                 f"`plan` was made for error control {self.control}, but settings ask for {wanted}; make a new one with "
@@ -89,10 +92,12 @@ class Plan:
             )
 
 
-def control_plan(settings: Settings, parts: int) -> ControlPlan | None:
+def control_plan(settings: Settings, parts: int) -> ControlPlan | PilotPlan | None:
     """What of `settings` is fixed when a program is compiled; None without a tolerance."""
     if settings.tolerance is None:
         return None
+    if settings.estimator == "pilot":
+        return PilotPlan()
     return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, parts)
 
 
@@ -148,7 +153,7 @@ def _for_bands(
     pairs_a_row: tuple[np.ndarray, np.ndarray],
     num_classes: int,
     cast: CastPlan,
-    control: ControlPlan | None,
+    control: ControlPlan | PilotPlan | None,
 ) -> Plan:
     rows = tiles_a_band[0]
     bands = _ceil(len(pairs_a_row[0]), rows)
@@ -165,15 +170,21 @@ def _for_bands(
         + (16 * cast.chunk + 3 * cast.held) * cast.slab_samples * BUNDLE * BUNDLE * number
         + slabs * lists.num_bundles * 8
         + camera.width * camera.height * 8 * number
-        + (settings.tolerance is not None) * _bytes_of_control(lists, slabs, num_classes, number)
+        + _bytes_of_control(control, lists.num_bundles * slabs, cast.slab_samples, num_classes, number)
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
     return Plan(*size, num_classes, bands, lists, cast, int(memory), control)
 
 
-def _bytes_of_control(lists: ListPlan, slabs: int, num_classes: int, number: int) -> int:
-    """Of the tables of all candidates of all cells, and of the windows of coarser slabs."""
-    return lists.num_bundles * slabs * (64 * number // 4 + num_classes * 32)
+def _bytes_of_control(
+    control: ControlPlan | PilotPlan | None, slabs: int, slab_samples: int, num_classes: int, number: int
+) -> int:
+    """Of the tables of all candidates of all cells, and of the windows of coarser slabs; or of lattices of nodes."""
+    if control is None:
+        return 0
+    if isinstance(control, PilotPlan):
+        return slabs * _ceil(slab_samples, NODE_SAMPLES) * (BUNDLE // NODE_PIXELS) ** 2 * ARRAYS_OF_NODES * number
+    return slabs * (64 * number // 4 + num_classes * 32)
 
 
 def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:

@@ -19,10 +19,13 @@ from jaxtyping import Array, Int
 
 from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import Lattice
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
+from jaxsph.cast.nodes import sum_at_nodes
 from jaxsph.cast.points import Rays, cast_points, evaluations
 from jaxsph.control.adapt import adapt
+from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -97,8 +100,8 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes))
         view = (grid, camera, scene.transfer)
-        decided = clock.run("adapt", _adapt, (*view, _limits(settings, ordered)), plan=plan)
-        rays = clock.run("cast", _cast, (*view, decided.work), plan=shapes, kernel=scene.particles.kernel)
+        decided = clock.run("adapt", _adapt, (*view, _limits(settings, ordered)), plan=plan, kernel=scene.particles.kernel)
+        rays = clock.run("cast", _cast, (*view, decided.work, decided.lattice), plan=shapes, kernel=scene.particles.kernel)
         words.append(grid.lists.faults)
         counts += [float(count) for count in _counts(grid)]
         bands.append(_unbundle(rays, decided, plan))
@@ -115,7 +118,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         "pairs": int(counts[1]),
         "seconds": clock.seconds,
     }
-    certified = plan.control is None or float(settings.relax) == 0
+    certified = _certifies(plan) and (plan.control is None or float(settings.relax) == 0)
     metadata = _metadata(camera, settings, certified)
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats, metadata=metadata)
 
@@ -127,8 +130,8 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         first_row = band * plan.band_height
         grid = Grid(ordered, *_grid(ordered, camera, first_row, plan=plan))
         view = (grid, camera, scene.transfer)
-        decided = _adapt(*view, _limits(settings, ordered), plan=plan)
-        rays = _cast(*view, decided.work, plan=plan, kernel=scene.particles.kernel)
+        decided = _adapt(*view, _limits(settings, ordered), plan=plan, kernel=scene.particles.kernel)
+        rays = _cast(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
         return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
@@ -140,8 +143,13 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     cells_found, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
     stats = {"evaluations": spent, "evaluations_full": full.sum(), "cells": cells_found, "pairs": pairs}
-    certified = jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0)
+    certified = _certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, stats=stats)
+
+
+def _certifies(plan: Plan) -> bool:
+    """Whether the error can be bounded at all."""
+    return not isinstance(plan.control, PilotPlan)
 
 
 def _counts(grid: Grid) -> tuple[Array, Array]:
@@ -153,10 +161,11 @@ def _limits(settings: Settings, like: Ordered) -> tuple[Array, Array] | None:
     """Tolerance and relaxation in the dtype of the particles, the tolerance rounded down; None at full rate."""
     if settings.tolerance is None:
         return None
-    dtype = like.x.dtype
-    tolerance = jnp.asarray(settings.tolerance, dtype)
-    if not is_traced(settings.tolerance) and float(tolerance) > float(settings.tolerance):
-        tolerance = jnp.nextafter(tolerance, jnp.zeros_like(tolerance))
+    dtype, tolerance = like.x.dtype, settings.tolerance
+    if not is_traced(tolerance):
+        rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
+        tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
+    tolerance = jnp.asarray(tolerance, dtype)
     return tolerance, jnp.asarray(settings.relax, dtype)
 
 
@@ -168,9 +177,10 @@ class _Decided:
     full: Array
     bound: Array
     levels: Array | None
+    lattice: Lattice | None = None
 
 
-jax.tree_util.register_dataclass(_Decided, data_fields=["work", "full", "bound", "levels"], meta_fields=[])
+jax.tree_util.register_dataclass(_Decided, data_fields=["work", "full", "bound", "levels", "lattice"], meta_fields=[])
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -189,8 +199,10 @@ def _grid(
     return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
-@functools.partial(jax.jit, static_argnames="plan")
-def _adapt(grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan) -> _Decided:
+@functools.partial(jax.jit, static_argnames=("plan", "kernel"))
+def _adapt(
+    grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
+) -> _Decided:
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)
@@ -198,14 +210,28 @@ def _adapt(grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple
     if limits is None or plan.control is None:
         return _Decided(work, full, jnp.zeros(full.shape, dtype), None)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    if isinstance(plan.control, PilotPlan):
+        wanted = worthwhile(grid, camera, plan.cast.slab_samples)
+        lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, wanted)
+        work, bound = pilot(grid, lattice, camera, transfer, origin, limits[0], plan.cast.slab_samples)
+        return _Decided(work, full, bound, None, lattice)
     work, bound, levels = adapt(grid, camera, transfer, origin, *limits, plan.cast.slab_samples, plan.control)
     return _Decided(work, full, bound, levels)
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
-def _cast(grid: Grid, camera: Camera, transfer: TransferFunction, work: Worklist, *, plan: Plan, kernel: str) -> Rays:
+def _cast(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    work: Worklist,
+    lattice: Lattice | None = None,
+    *,
+    plan: Plan,
+    kernel: str,
+) -> Rays:
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    return cast_points(grid, work, camera, transfer, kernel, plan.cast)
+    return cast_points(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:

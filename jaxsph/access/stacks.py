@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+SIZE_BITS = 5  # of a sort key: how full an item is, in quarters of octaves
+
 
 @dataclasses.dataclass(frozen=True)
 class Stacks:
@@ -48,6 +50,15 @@ def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
     item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)
     item = item.at[target.ravel()].set(jnp.arange(slabs * bundles, dtype=jnp.int32))
     return Stacks(item.at[-1].set(slabs * bundles), start, place)
+
+
+def fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
+    """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
+    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 4), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
+    bits = 32 - SIZE_BITS
+    key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
+    order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
 
 
 jax.tree_util.register_dataclass(Stacks, data_fields=["item", "start", "place"], meta_fields=[])

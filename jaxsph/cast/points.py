@@ -26,10 +26,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import NODE_PIXELS, Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, unlit
+from jaxsph.cast.nodes import interpolate
 from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
@@ -71,12 +73,21 @@ class CastPlan:
             raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
 
 
-def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFunction, kernel: str, plan: CastPlan) -> Rays:
+def cast_points(
+    grid: Grid,
+    work: Worklist,
+    camera: Camera,
+    transfer: TransferFunction,
+    kernel: str,
+    plan: CastPlan,
+    lattice: Lattice | None = None,
+) -> Rays:
     """March all bundles of a band.
 
     Args:
         work: the slabs of samples to march.
         kernel: name of the smoothing kernel.
+        lattice: where the sums of interpolated slabs come from.
     """
     slabs, num_bundles = work.count.shape
     dtype = grid.half_steps.dtype
@@ -94,6 +105,8 @@ def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFu
         u, v = (rays.T for rays in grid.rays(camera, bundle))
         s, border = _sample_depths(item, slab, half_steps, plan)
         sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
+        if lattice is not None:
+            sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
         shade = functools.partial(_shade, perspective=camera.is_perspective)
         *colors, thickness, passed = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
         return *computed_once(slab[0] >= 0, emitted, colors, passed), thickness
@@ -125,7 +138,9 @@ def cast_points(grid: Grid, work: Worklist, camera: Camera, transfer: TransferFu
     *color, transmittance, depth = (
         field[stacks.place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
     )
-    return Rays(jnp.stack(color), transmittance, depth, evaluations(work, grid.samples, plan))
+    spent = evaluations(work, grid.samples, plan)
+    spent = spent if lattice is None else spent + lattice.evaluations
+    return Rays(jnp.stack(color), transmittance, depth, spent)
 
 
 def _fullest_first(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
@@ -157,6 +172,25 @@ def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPla
         border = jnp.where(item.painted[:, None], jnp.minimum(border, first + (1 << COARSEST)), border)
     last = half_steps.shape[0] - 1
     return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
+
+
+def _from_lattice(
+    lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], sums: tuple[Array, Array], plan: CastPlan
+) -> tuple[Array, Array]:
+    """`sums`, but those of interpolated slabs from the lattice."""
+    slab, bundle = at
+    inside = item.interpolated
+    assert inside is not None
+
+    def replaced(sums: tuple[Array, Array]) -> tuple[Array, Array]:
+        # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
+        corner = (grid.row[bundle] - grid.row[0]) // NODE_PIXELS, (grid.column[bundle] - grid.column[0]) // NODE_PIXELS
+        found = interpolate(lattice, slab, corner, plan.slab_samples)
+        here = inside[:, None, None, None]
+        weight, weighted = (jnp.where(here, new.reshape(old.shape), old) for new, old in zip(found, sums, strict=True))
+        return weight, weighted
+
+    return lax.cond(inside.any(), replaced, lambda sums: sums, sums)
 
 
 def gather_field(

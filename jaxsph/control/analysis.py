@@ -14,11 +14,12 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.cells import Cells
 from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE
+from jaxsph.access.stacks import fullest_first
 from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
 from jaxsph.control.errors import CANDIDATES, EXPONENTIAL, cell_errors, fits
 from jaxsph.control.ranges import RangeTables
@@ -27,7 +28,6 @@ from jaxsph.model.camera import Camera
 from jaxsph.numerics.staging import computed_once
 
 CHUNK = 512  # cells analysed together: operands stay in the second-level cache
-SIZE_BITS = 5  # of a sort key: how full a cell's fullest slab is, in quarters of octaves
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ def analyse(
     count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
     fullest, count = count.max(1), count.sum(1)
     filled = jnp.pad(grid.cells.count > 0, missing)
-    order, number = _fullest_first(wanted.ravel(), fullest.ravel(), chunk)
+    order, number = fullest_first(wanted.ravel(), fullest.ravel(), chunk)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     origin = jnp.pad(origin, missing)
     quantities = _extremes(ordered.quantity, ordered.live)
@@ -116,15 +116,6 @@ def analyse(
     error, strict, paint, thin = jnp.split(table, [CANDIDATES, 2 * CANDIDATES, 2 * CANDIDATES + 4])
     front = _transmitted(thin[0])
     return Analysis(front * error, front * strict, paint)
-
-
-def _fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
-    """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
-    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 4), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
-    bits = 32 - SIZE_BITS
-    key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
-    order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
-    return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
 
 
 def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:

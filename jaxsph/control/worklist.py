@@ -32,6 +32,7 @@ class Worklist:
         count: sum of `length` over classes; 0 for super-pixels.
         origin: quantity that the item's sums are taken relative to, that of a particle near by: so that their rounding is a
             share of how much quantities differ, and a constant is rendered as that constant.
+        interpolated: items whose sums are those of the lattice, with `count` 0; None where there is none.
         paint: red, green, blue and extinction of super-pixels, where `painted`; None where there can be none.
     """
 
@@ -43,6 +44,7 @@ class Worklist:
     origin: Float[Array, "slabs bundles"]
     painted: Bool[Array, "slabs bundles"] | None = None
     paint: Float[Array, "4 slabs bundles"] | None = None
+    interpolated: Bool[Array, "slabs bundles"] | None = None
 
 
 def full_rate(cells: Cells, origin: Float[Array, "slabs bundles"]) -> Worklist:

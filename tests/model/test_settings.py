@@ -15,7 +15,7 @@ import jaxsph as js
         ({"tolerance": -0.004}, "`tolerance` must be >= 0 and finite, got -0.004"),
         ({"tolerance": float("nan")}, "`tolerance` must be >= 0"),
         ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
-        ({"estimator": "pilot"}, "`estimator` must be one of interval, got 'pilot'"),
+        ({"estimator": "guess"}, "`estimator` must be one of interval, pilot, got 'guess'"),
         ({"allocation": "fair"}, "`allocation` must be one of budget, greedy, paper, independent"),
     ],
 )

@@ -1,0 +1,129 @@
+"""Sums over particles at the nodes of a lattice, and at the samples between.
+
+Flow: grid -> [nodes] -> control.pilot -> worklist -> points -> image.
+
+A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie side by side in memory.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.cells import position
+from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES, Lattice, between
+from jaxsph.access.lists import BUNDLE
+from jaxsph.access.stacks import fullest_first
+from jaxsph.control.merge import coarser_windows
+from jaxsph.control.worklist import CELL
+from jaxsph.model import kernels
+from jaxsph.model.camera import Camera
+from jaxsph.numerics.staging import computed_once
+
+CHUNK = 256  # cells at once
+BLOCK = 8  # particles unrolled in the inner loop
+ACROSS, DEEP = BUNDLE // NODE_PIXELS, CELL // NODE_SAMPLES  # nodes of a cell
+
+
+def sum_at_nodes(
+    grid: Grid, camera: Camera, kernel: str, slab_samples: int, tile_columns: int, wanted: Bool[Array, ""] | bool = True
+) -> Lattice:
+    """Sums at all nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`."""
+    cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
+    windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
+    begin, length = windows.begin[:, :cells], windows.length[:, :cells]
+    count = jnp.where(wanted, length.sum(0, dtype=jnp.int32), 0)
+    bundles = count.shape[1]
+    chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
+    order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
+    ordered, live = grid.ordered, grid.ordered.live
+    origin = ordered.quantity[jnp.argmax(live)]
+    last = grid.half_steps.shape[0] - 1
+
+    def march(step: Array, table: Array) -> Array:
+        at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
+        real = step * chunk + jnp.arange(chunk, dtype=jnp.int32) < number
+        cell, bundle = at // bundles, at % bundles
+        u, v = (rays[::NODE_PIXELS] for rays in grid.rays(camera, bundle))
+        deep = jnp.arange(DEEP, dtype=jnp.int32)[:, None] * NODE_SAMPLES
+        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep) + 1, last)]
+        window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
+        sums = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
+        target = jnp.where(real, at, cells * bundles)
+        return table.at[target].set(jnp.moveaxis(sums.reshape(2, -1, chunk), -1, 0))
+
+    table = jnp.zeros((cells * bundles + 1, 2, DEEP * ACROSS * ACROSS), ordered.x.dtype)
+    table = lax.fori_loop(0, (number + chunk - 1) // chunk, march, table)[:-1]
+    table = table.reshape(cells, -1, tile_columns, 2, 2, 2, DEEP, ACROSS, ACROSS)
+    table = jnp.transpose(table, (5, 0, 6, 1, 3, 7, 2, 4, 8))
+    weight, weighted = table.reshape(2, cells * DEEP, -1, 2 * ACROSS * tile_columns)
+    spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
+    return Lattice(weight, weighted, origin, spent)
+
+
+def _summed(
+    grid: Grid, window: tuple[Array, Array], nodes: tuple[Array, Array, Array], origin: Array, perspective: bool, kernel: str
+) -> Float[Array, "2 deep down across chunk"]:
+    """Sums of V W and (q - origin) V W at the nodes of a chunk of cells; see `points.gather_field`."""
+    ordered, rank = grid.ordered, grid.lists.rank
+    u, v, s = nodes
+    total = window[1].sum(0)
+    spread = s if perspective else jnp.ones_like(s)
+    su, sv = u * spread[:, None], v * spread[:, None]
+    columns = (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, ordered.quantity)
+    smooth = kernels.by_name(kernel)
+
+    def fetch(index: Array) -> list[Array]:
+        inside = index < total
+        place = position(index, window[0][:, None], window[1][:, None])
+        particle = rank[jnp.clip(place, 0, rank.shape[0] - 1)]
+        x, y, z, scale, size, quantity = (column[particle] for column in columns)
+        return [x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), quantity - origin]
+
+    def add_block(block: Array, sums: Array) -> Array:
+        index = block * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[:, None]
+        particles = computed_once(block >= 0, fetch, index)
+        weight, weighted = sums.real, sums.imag
+        for k in range(BLOCK):
+            x, y, z, scale, size, quantity = (column[k] for column in particles)
+            across = ((su - x) * scale) ** 2
+            along = ((s[:, None] - z) * scale) ** 2 + ((sv - y) * scale) ** 2
+            w = smooth.weigh(smooth.prepare(along, size)[:, :, None], across[:, None], size, jnp)
+            weight, weighted = weight + w, weighted + w * quantity
+        return lax.complex(weight, weighted)
+
+    zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)
+    sums = lax.fori_loop(0, (total.max() + BLOCK - 1) // BLOCK, add_block, lax.complex(zero, zero))
+    return jnp.stack([sums.real, sums.imag])
+
+
+def interpolate(
+    lattice: Lattice, slab: Int[Array, " chunk"], corner: tuple[Array, Array], slab_samples: int
+) -> tuple[Float[Array, "chunk samples 64"], Float[Array, "chunk samples 64"]]:
+    """Sums at all samples of slabs, by the tensor product of cubics through the nearest four nodes along each axis.
+
+    Args:
+        slab: slabs that lie inside the lattice, with a node to spare on every side.
+        corner: first node of their bundles, down and across.
+        slab_samples: samples of a slab.
+    """
+    deep, down, across = lattice.weight.shape
+    within = slab_samples // NODE_SAMPLES
+    shape = (within + 3, ACROSS + 3, ACROSS + 3)
+    offset = np.arange(shape[0])[:, None, None] * down * across + np.arange(shape[1])[:, None] * across + np.arange(shape[2])
+    first = ((slab * within - 1) * down + corner[0] - 1) * across + corner[1] - 1
+    at = jnp.clip(first[:, None, None] + offset.reshape(shape[0], -1).astype(np.int32), 0, deep * down * across - 1)
+    along = between(within, NODE_SAMPLES)
+    across_cell = between(ACROSS, NODE_PIXELS)
+    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, lattice.weight.dtype)
+
+    def spread(sums: Array) -> Array:
+        nodes = sums.ravel().at[at].get(mode="promise_in_bounds")
+        rows = [sum(float(w) * nodes[:, k] for k, w in enumerate(row) if w) for row in along]
+        return jnp.matmul(jnp.stack(rows, 1), lateral, precision=lax.Precision.HIGHEST)
+
+    return jax.tree.map(spread, (lattice.weight, lattice.weighted))

@@ -1,0 +1,64 @@
+"""Nodes hold the sums of full rate, and cubics are met between them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsph as js
+from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES, Lattice
+from jaxsph.cast.nodes import interpolate, sum_at_nodes
+from jaxsph.model import kernels
+from jaxsph.render import _grid, _order
+
+
+def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
+    plan = js.plan(scene, camera, frames.settings)
+    ordered = _order(scene.particles, camera, plan=plan)
+    grid = Grid(ordered, *_grid(ordered, camera, jnp.int32(0), plan=plan))
+    lattice = sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, plan.lists.tile_columns)
+
+    deep, down, across = lattice.weight.shape
+    deep = min(deep, -(-plan.samples // NODE_SAMPLES))
+    depth = np.asarray(grid.half_steps)[1::2][::NODE_SAMPLES][:, None, None]
+    u = np.asarray(camera.column(NODE_PIXELS * np.arange(across) + 0.5))
+    v = np.asarray(camera.row(NODE_PIXELS * np.arange(down) + 0.5))[:, None]
+    spread = depth if camera.is_perspective else np.ones_like(depth)
+    smooth, weight, weighted = kernels.by_name(scene.particles.kernel), 0.0, 0.0
+    x, y, z, scale, size, quantity = (
+        np.asarray(c)[np.asarray(ordered.live)]
+        for c in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, ordered.quantity)
+    )
+    for k in range(len(x)):
+        square = ((u * spread - x[k]) ** 2 + (v * spread - y[k]) ** 2 + (depth - z[k]) ** 2) * scale[k] ** 2
+        w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
+        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.origin))
+    # nodes beyond the image lie in bundles that it has no list for
+    rows, columns = -(-camera.height // NODE_PIXELS), -(-camera.width // NODE_PIXELS)
+    for found, wanted in ((lattice.weight, weight), (lattice.weighted, weighted)):
+        np.testing.assert_allclose(found[:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
+    assert weight.max() > 0
+
+
+def test_a_cubic_field_is_interpolated_exactly(x64):
+    rng = np.random.default_rng(0)
+    z, y, x = np.meshgrid(np.arange(12.0), np.arange(9.0), np.arange(8.0), indexing="ij")
+    cubic = rng.normal(size=(4, 4, 4))
+    field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
+    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.zeros(1))
+    slab, row, column = jnp.asarray([1, 3]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
+    weight, weighted = jax.jit(interpolate, static_argnames="slab_samples")(lattice, slab, (row, column), slab_samples=4)
+    for k in range(2):
+        at = [
+            np.arange(4) / NODE_SAMPLES + 2 * float(slab[k]),
+            np.arange(8) / NODE_PIXELS + float(row[k]),
+            np.arange(8) / NODE_PIXELS + float(column[k]),
+        ]
+        zs, ys, xs = np.meshgrid(*at, indexing="ij")
+        wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(4, 64)
+        np.testing.assert_allclose(weight[k], wanted, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(weighted[k], 2 * wanted, rtol=1e-10, atol=1e-10)

@@ -1,0 +1,183 @@
+"""The pilot estimator: it saves evaluations, says how wrong that is, and leaves alone what its lattice cannot resolve."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.control.pilot import _mean_square_slope
+
+PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
+FULL = js.Settings(samples=128)
+
+
+@functools.cache
+def both(name, size=224, particles=8_000):
+    """A scene at full rate, and with pilots."""
+    scene, camera = js.scenes.load(name, particles, width=size, height=size - 7)
+    return js.render(scene, camera, FULL), js.render(scene, camera, PILOT)
+
+
+def error_of(image, truth):
+    color = np.abs(np.asarray(image.color, np.float64) - np.asarray(truth.color, np.float64)).max(-1)
+    return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
+
+
+@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board"])
+def test_few_pixels_are_over_the_tolerance_and_none_over_twice(name):
+    truth, image = both(name)
+    error = error_of(image, truth)
+    assert (error > PILOT.tolerance).mean() <= 1e-3
+    assert error.max() <= 2 * PILOT.tolerance
+    assert float(image.error_bound.max()) <= PILOT.tolerance
+    assert not image.certified
+
+
+@pytest.mark.parametrize("name", ["mixer", "checker_board"])
+def test_evaluations_are_saved(name):
+    truth, image = both(name)
+    assert image.stats["evaluations_full"] == truth.stats["evaluations"]
+    assert image.stats["evaluations"] < 0.9 * truth.stats["evaluations"]
+    assert float(image.error_bound.max()) > 0
+
+
+def cloud(quantity, support, count=4000, *, extent=1.0):
+    """Particles at random in a cube, seen whole, and a camera with an image of odd size."""
+    rng = np.random.default_rng(1)
+    position = rng.uniform(-extent, extent, (count, 3)).astype(np.float32)
+    particles = js.Particles.from_arrays(position, np.float32(support), np.asarray(quantity(position), np.float32))
+    camera = js.Camera.look_at((0, 0, -4), (0, 0, 0), width=89, height=75, near=1.0, far=7.0)
+    return particles, camera
+
+
+SMOOTH = js.TransferFunction.from_points(
+    np.float32([-1, 0, 0, 1]),
+    np.float32([[0.2, 0.4, 0.9], *[[0.55, 0.45, 0.5]] * 2, [0.9, 0.5, 0.1]]),
+    np.float32([0.5, 1, 1, 2]),
+)
+PLANS = {}
+
+
+def draw(scene, camera):
+    """At full rate, and with pilots; scenes of one number of particles share their plans."""
+    images = []
+    for settings in (FULL, PILOT):
+        key = int(scene.particles.valid.sum()), settings.estimator
+        if key not in PLANS:
+            PLANS[key] = js.plan(scene, camera, settings)
+        images.append(js.render(scene, camera, settings, plan=PLANS[key]))
+    return images
+
+
+def test_a_constant_quantity_keeps_its_colour():
+    particles, camera = cloud(lambda x: np.full(len(x), 0.3), 0.5)
+    scene = js.Scene(particles=particles, transfer=SMOOTH)
+    truth, image = draw(scene, camera)
+    assert image.stats["evaluations"] < truth.stats["evaluations"]
+    assert error_of(image, truth).max() < 1e-5
+    color, alpha = np.asarray(image.color), np.asarray(image.alpha)
+    seen = alpha > 0.5
+    np.testing.assert_allclose(color[seen] / alpha[seen][:, None], np.broadcast_to(SMOOTH(0.3)[0], (seen.sum(), 3)), rtol=1e-5)
+
+
+def test_supports_that_the_lattice_cannot_resolve_are_marched():
+    particles, camera = cloud(lambda x: x[:, 0], 0.02)
+    scene = js.Scene(particles=particles, transfer=SMOOTH)
+    truth, image = draw(scene, camera)
+    assert float(truth.alpha.max()) > 0.01
+    np.testing.assert_array_equal(image.color, truth.color)
+    assert float(image.error_bound.max()) == 0
+
+
+def test_one_small_particle_between_nodes_is_not_lost():
+    particles, camera = cloud(lambda x: np.full(len(x), -1.0), 0.5)
+    tiny = js.Particles.from_arrays(np.float32([[0.013, 0.021, 0.017]]), np.float32([0.03]), np.float32([1.0]), np.float32([1.0]))
+    joined = js.Particles.from_arrays(
+        *(
+            np.concatenate([np.asarray(getattr(p, name)) for p in (particles, tiny)])
+            for name in ("position", "support", "quantity", "volume")
+        )
+    )
+    scene = js.Scene(particles=joined, transfer=SMOOTH)
+    truth, image = draw(scene, camera)
+    assert image.stats["evaluations"] < truth.stats["evaluations"]
+    assert error_of(image, truth).max() <= PILOT.tolerance
+
+
+def test_no_tolerance_to_spend_leaves_full_rate():
+    truth, _ = both("mixer")
+    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
+    image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=0.0))
+    for layer in ("color", "transmittance", "depth"):
+        np.testing.assert_array_equal(getattr(image, layer), getattr(truth, layer))
+    assert float(image.error_bound.max()) == 0
+
+
+def test_a_jump_of_the_transfer_function_is_kept_sharp():
+    jump = js.TransferFunction.from_points(
+        np.float32([-1, 0, 0, 1]), np.float32([[0, 0, 1]] * 2 + [[1, 0, 0]] * 2), np.float32([0.1, 0.1, 4, 4])
+    )
+    particles, camera = cloud(lambda x: x[:, 0], 0.4)
+    scene = js.Scene(particles=particles, transfer=jump)
+    truth, image = draw(scene, camera)
+    assert image.stats["evaluations"] < truth.stats["evaluations"]
+    assert error_of(image, truth).max() <= PILOT.tolerance
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_hardly_any_particles(count):
+    particles, camera = cloud(lambda x: x[:, 0], 0.5, count=count, extent=0.1)
+    scene = js.Scene(particles=particles, transfer=SMOOTH)
+    truth, image = draw(scene, camera)
+    np.testing.assert_array_equal(image.color, truth.color)
+
+
+def test_jit_and_bands_agree_with_eager():
+    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
+    _, image = both("mixer")
+    plan = js.plan(scene, camera, PILOT)
+    traced = jax.jit(lambda s: js.render(s, camera, PILOT, plan=plan))(scene)
+    np.testing.assert_allclose(traced.color, image.color, atol=1e-5)
+    assert not bool(traced.certified)
+    low = dataclasses.replace(PILOT, memory_limit=plan.bytes // 2)
+    banded = js.plan(scene, camera, low)
+    assert banded.bands > 1
+    error = error_of(js.render(scene, camera, low, plan=banded), both("mixer")[0])
+    assert error.max() <= 2 * PILOT.tolerance
+
+
+def test_float64_orthographic_wendland(x64):
+    rng = np.random.default_rng(2)
+    position = rng.uniform(-1, 1, (3000, 3))
+    particles = js.Particles.from_arrays(position, 0.5, np.sin(3 * position[:, 0]), kernel="wendland_c2")
+    camera = js.Camera.orthographic((0, 0, -4), (0, 0, 0), view_height=2.5, width=80, height=72, near=1.0, far=7.0)
+    transfer = js.TransferFunction.from_points(
+        np.float64([-1, 1]), np.float64([[0.2, 0.4, 0.9], [0.9, 0.5, 0.1]]), np.float64([0.5, 2])
+    )
+    scene = js.Scene(particles=particles, transfer=transfer)
+    truth, image = draw(scene, camera)
+    assert image.color.dtype == np.float64
+    assert image.stats["evaluations"] < truth.stats["evaluations"]
+    assert error_of(image, truth).max() <= PILOT.tolerance
+
+
+def test_the_mean_square_slope_is_that_of_a_quadrature():
+    transfer = js.TransferFunction.from_points(
+        np.float32([0, 0.2, 0.5, 1]), np.float32([[0, 0, 0], [1, 0, 0], [0, 0.5, 0], [0, 1, 1]]), np.float32([0, 3, 3, 1])
+    )
+    low, high = np.float32([-0.5, 0.05, 0.1, 0.3, 0.9, 1.2, 0.3]), np.float32([-0.1, 0.1, 0.4, 2.0, 0.9, 1.4, 0.45])
+    found = _mean_square_slope(transfer, jnp.asarray(low), jnp.asarray(high))
+    table = np.concatenate([np.asarray(transfer.colors), np.asarray(transfer.extinction)[:, None]], 1)
+    for i, (a, b) in enumerate(zip(low, high, strict=True)):
+        q = a + (b - a) * (np.arange(4000) + 0.5) / 4000
+        segment = np.searchsorted(np.asarray(transfer.values), q, side="right") - 1
+        slope = np.zeros((5, 4))
+        slope[1:4] = np.diff(table, axis=0) / np.diff(np.asarray(transfer.values))[:, None]
+        wanted = (slope[segment + 1] ** 2).mean(0)
+        np.testing.assert_allclose([float(channel[i]) for channel in found], wanted, rtol=5e-3, atol=1e-5)
