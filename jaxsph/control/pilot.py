@@ -41,6 +41,7 @@ HALVINGS = 24
 ACROSS = BUNDLE // NODE_PIXELS
 Combine = Callable[[Array, Array], Array]
 REACH = 2  # nodes to either side that a fourth difference takes
+GAP = REACH + 1  # nodes without anything past the last of a row: a fourth difference, and the far border of a slab
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,33 +155,43 @@ def _deviations(
 
 
 def _at_nodes(lattice: Lattice, segments: Segments) -> tuple[Array, Array, Array]:
-    """Variance of Q between the nodes, Q, and extinction; one more node on the far sides, where nothing is.
+    """Variance of Q between the nodes, Q, and extinction; with `GAP` more nodes on the far sides, where nothing is.
 
     The variance is infinite where the sum of weights is not clear of zero.
     """
-    padded = [jnp.pad(value, [(REACH, REACH + 1)] * 3) for value in (lattice.weight, lattice.weighted)]
-    shape = [size + 1 for size in lattice.weight.shape]
+    deep, down, across = (size + GAP for size in lattice.weight.shape)
+    stride = (down * across, across, 1)
+    number = deep * stride[0]
+    flat = [_with_gaps(value, (deep, down, across)) for value in (lattice.weight, lattice.weighted)]
 
-    def shifted(value: Array, axis: int, by: int) -> Array:
-        start = [REACH + (by if k == axis else 0) for k in range(3)]
-        return lax.slice(value, start, [a + b for a, b in zip(start, shape, strict=True)])
+    def shifted(value: Array, by: int) -> Array:
+        return value[REACH * stride[0] + by :][:number]
 
     def fourth(value: Array, axis: int) -> Array:
-        left2, left, middle, right, right2 = (shifted(value, axis, by) for by in range(-REACH, REACH + 1))
+        left2, left, middle, right, right2 = (shifted(value, by * stride[axis]) for by in range(-REACH, REACH + 1))
         return (left2 + right2) - 4 * (left + right) + 6 * middle
 
-    weight, weighted = (shifted(value, 0, 0) for value in padded)
+    weight, weighted = (shifted(value, 0) for value in flat)
     inside = weight > 0
     inverse = jnp.where(inside, 1 / jnp.where(inside, weight, 1), 0)
     ratio = weighted * inverse
     spread, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio)
     for axis in range(3):
-        of_weight, of_weighted = (fourth(value, axis) for value in padded)
+        of_weight, of_weighted = (fourth(value, axis) for value in flat)
         unsure += CUBIC * jnp.abs(of_weight)
         spread += (CUBIC * (of_weighted - ratio * of_weight)) ** 2
     spread = jnp.where(inside & (weight > CLEAR * unsure), spread * inverse**2, jnp.inf)
     quantity = lattice.origin + ratio
-    return spread, quantity, jnp.where(inside, look_up(segments, quantity)[3], 0)
+    found = spread, quantity, jnp.where(inside, look_up(segments, quantity)[3], 0)
+    first, second, third = (value.reshape(deep, down, across) for value in found)
+    return first, second, third
+
+
+def _with_gaps(value: Array, shape: tuple[int, int, int]) -> Array:
+    """All nodes in one row, with zeros between rows and layers: neighbours along any axis are then one shift away."""
+    flat = jnp.zeros(shape, value.dtype).at[: value.shape[0], : value.shape[1], : value.shape[2]].set(value).ravel()
+    around = REACH * shape[1] * shape[2]
+    return jnp.zeros(flat.shape[0] + 2 * around, value.dtype).at[around : around + flat.shape[0]].set(flat)
 
 
 def _slant(grid: Grid, camera: Camera, down: int, across: int) -> Array:
@@ -203,7 +214,7 @@ def _pooled(value: Array, combine: Combine, *, slabs: int, within: int) -> Array
 def _pooled_across(value: Array, combine: Combine) -> Array:
     """The same of each layer."""
     for axis in (2, 1):
-        number = value.shape[axis] - 1
+        number = value.shape[axis] - GAP
         parts = (lax.slice_in_dim(value, k, k + number - ACROSS + 1, ACROSS, axis) for k in range(ACROSS + 1))
         value = functools.reduce(combine, parts)
     return value

@@ -29,29 +29,25 @@ def error_of(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
 
 
-@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board"])
-def test_few_pixels_are_over_the_tolerance_and_none_over_twice(name):
+@pytest.mark.parametrize("name", ["mixer", pytest.param("radial", marks=pytest.mark.slow), "checker_board"])
+def test_work_is_saved_few_pixels_are_over_the_tolerance_and_none_over_twice(name):
     truth, image = both(name)
     error = error_of(image, truth)
     assert (error > PILOT.tolerance).mean() <= 1e-3
     assert error.max() <= 2 * PILOT.tolerance
-    assert float(image.error_bound.max()) <= PILOT.tolerance
+    assert 0 < float(image.error_bound.max()) <= PILOT.tolerance
     assert not image.certified
-
-
-@pytest.mark.parametrize("name", ["mixer", "checker_board"])
-def test_evaluations_are_saved(name):
-    truth, image = both(name)
     assert image.stats["evaluations_full"] == truth.stats["evaluations"]
-    assert image.stats["evaluations"] < 0.9 * truth.stats["evaluations"]
-    assert float(image.error_bound.max()) > 0
+    if name != "radial":
+        assert image.stats["evaluations"] < 0.9 * truth.stats["evaluations"]
 
 
 def cloud(quantity, support, count=4000, *, extent=1.0):
     """Particles at random in a cube, seen whole, and a camera with an image of odd size."""
     rng = np.random.default_rng(1)
     position = rng.uniform(-extent, extent, (count, 3)).astype(np.float32)
-    particles = js.Particles.from_arrays(position, np.float32(support), np.asarray(quantity(position), np.float32))
+    quantity = np.asarray(quantity(position), np.float32)
+    particles = js.Particles.from_arrays(position, np.float32(support), quantity, capacity=CAPACITY)
     camera = js.Camera.look_at((0, 0, -4), (0, 0, 0), width=89, height=75, near=1.0, far=7.0)
     return particles, camera
 
@@ -61,18 +57,28 @@ SMOOTH = js.TransferFunction.from_points(
     np.float32([[0.2, 0.4, 0.9], *[[0.55, 0.45, 0.5]] * 2, [0.9, 0.5, 0.1]]),
     np.float32([0.5, 1, 1, 2]),
 )
-PLANS = {}
+CAPACITY = 4001
 
 
-def draw(scene, camera):
-    """At full rate, and with pilots; scenes of one number of particles share their plans."""
-    images = []
-    for settings in (FULL, PILOT):
-        key = int(scene.particles.valid.sum()), settings.estimator
-        if key not in PLANS:
-            PLANS[key] = js.plan(scene, camera, settings)
-        images.append(js.render(scene, camera, settings, plan=PLANS[key]))
-    return images
+@functools.cache
+def plan_of(settings):
+    """One plan for all clouds: that of wide supports and a tiny one."""
+    particles, camera = cloud(lambda x: x[:, 0], 0.5)
+    return js.plan(js.Scene(particles=with_a_tiny_one(particles), transfer=SMOOTH), camera, settings)
+
+
+def with_a_tiny_one(particles):
+    """Another particle between the nodes, of another quantity."""
+    tiny = {"position": [0.013, 0.021, 0.017], "support": 0.03, "quantity": 1.0, "volume": 1.0}
+    columns = {name: np.array(getattr(particles, name)) for name in tiny}
+    for name, value in tiny.items():
+        columns[name][-1] = value
+    return js.Particles.from_arrays(**columns, capacity=CAPACITY)
+
+
+def draw(scene, camera, pilot=PILOT):
+    """At full rate, and with pilots."""
+    return [js.render(scene, camera, settings, plan=plan_of(like)) for settings, like in ((FULL, FULL), (pilot, PILOT))]
 
 
 def test_a_constant_quantity_keeps_its_colour():
@@ -97,23 +103,15 @@ def test_supports_that_the_lattice_cannot_resolve_are_marched():
 
 def test_one_small_particle_between_nodes_is_not_lost():
     particles, camera = cloud(lambda x: np.full(len(x), -1.0), 0.5)
-    tiny = js.Particles.from_arrays(np.float32([[0.013, 0.021, 0.017]]), np.float32([0.03]), np.float32([1.0]), np.float32([1.0]))
-    joined = js.Particles.from_arrays(
-        *(
-            np.concatenate([np.asarray(getattr(p, name)) for p in (particles, tiny)])
-            for name in ("position", "support", "quantity", "volume")
-        )
-    )
-    scene = js.Scene(particles=joined, transfer=SMOOTH)
+    scene = js.Scene(particles=with_a_tiny_one(particles), transfer=SMOOTH)
     truth, image = draw(scene, camera)
     assert image.stats["evaluations"] < truth.stats["evaluations"]
     assert error_of(image, truth).max() <= PILOT.tolerance
 
 
 def test_no_tolerance_to_spend_leaves_full_rate():
-    truth, _ = both("mixer")
-    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
-    image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=0.0))
+    particles, camera = cloud(lambda x: x[:, 0], 0.5)
+    truth, image = draw(js.Scene(particles=particles, transfer=SMOOTH), camera, dataclasses.replace(PILOT, tolerance=0.0))
     for layer in ("color", "transmittance", "depth"):
         np.testing.assert_array_equal(getattr(image, layer), getattr(truth, layer))
     assert float(image.error_bound.max()) == 0
@@ -138,13 +136,19 @@ def test_hardly_any_particles(count):
     np.testing.assert_array_equal(image.color, truth.color)
 
 
-def test_jit_and_bands_agree_with_eager():
+def test_jit_agrees_with_eager():
     scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
     _, image = both("mixer")
     plan = js.plan(scene, camera, PILOT)
     traced = jax.jit(lambda s: js.render(s, camera, PILOT, plan=plan))(scene)
     np.testing.assert_allclose(traced.color, image.color, atol=1e-5)
     assert not bool(traced.certified)
+
+
+@pytest.mark.slow
+def test_bands_keep_the_tolerance_too():
+    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
+    plan = js.plan(scene, camera, PILOT)
     low = dataclasses.replace(PILOT, memory_limit=plan.bytes // 2)
     banded = js.plan(scene, camera, low)
     assert banded.bands > 1
@@ -161,7 +165,7 @@ def test_float64_orthographic_wendland(x64):
         np.float64([-1, 1]), np.float64([[0.2, 0.4, 0.9], [0.9, 0.5, 0.1]]), np.float64([0.5, 2])
     )
     scene = js.Scene(particles=particles, transfer=transfer)
-    truth, image = draw(scene, camera)
+    truth, image = js.render(scene, camera, FULL), js.render(scene, camera, PILOT)
     assert image.color.dtype == np.float64
     assert image.stats["evaluations"] < truth.stats["evaluations"]
     assert error_of(image, truth).max() <= PILOT.tolerance
