@@ -70,7 +70,7 @@ def ranges(column: np.ndarray) -> str:
 
 def camera_line(camera: Camera) -> str:
     """The options that give this camera again, and its depths."""
-    eye, axes = np.asarray(camera.eye, np.float64), np.asarray(camera.axes, np.float64)
+    eye, axes = camera.exact_eye(), np.asarray(camera.axes, np.float64)
     fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
     near, far = float(camera.near), float(camera.far)
     target = eye + axes[2] * (near + far) / 2

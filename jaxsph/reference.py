@@ -86,9 +86,9 @@ def field(scene: Scene, camera: Camera, samples: int, *, cull: bool = True) -> t
 def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, ...]:
     particles = scene.particles
     valid = np.asarray(particles.valid)
-    arrays = (particles.position, particles.support, particles.quantity, particles.volume)
+    arrays = (particles.exact_position(), particles.support, particles.quantity, particles.volume)
     position, support, quantity, volume = (np.asarray(a, np.float64)[valid] for a in arrays)
-    view = (position - np.asarray(camera.eye, np.float64)) @ np.asarray(camera.axes, np.float64).T
+    view = (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     return view, support, quantity, volume
 
 

@@ -179,26 +179,19 @@ def _scaled(volumes: np.ndarray) -> np.ndarray:
 
 
 def _check_rounding(position: np.ndarray, support: np.ndarray) -> str | None:
-    """A note on what float32 does to the positions; `ValueError` where it would destroy them."""
-    if len(position) == 0:
+    """A note on what float32 has done to the positions; `ValueError` where it has destroyed them. float64 ones stay whole."""
+    if len(position) == 0 or position.dtype == np.float64:
         return None
     rounding = float(np.abs(position).max()) * float(np.finfo(np.float32).eps) / 2
     typical = float(np.median(support))
-    if rounding > ROUNDING_REFUSED * typical and not _x64(position):
+    if rounding > ROUNDING_REFUSED * typical:
         raise DataError(
-            f"positions reach {np.abs(position).max():.6g} with supports of {typical:.6g}: float32 rounds them by "
-            f"{rounding / typical:.2g} supports; subtract a common offset from the positions, or use float64 under "
-            f"jax.enable_x64"
+            f"positions reach {np.abs(position).max():.6g} with supports of {typical:.6g}: float32 has rounded them by "
+            f"{rounding / typical:.2g} supports; give them in float64, or subtract a common offset before they become float32"
         )
-    if rounding > ROUNDING_NOTED * float(support.min()) and not _x64(position):
-        return f"float32 rounds positions by up to {rounding / float(support.min()):.2g} of the smallest support"
+    if rounding > ROUNDING_NOTED * float(support.min()):
+        return f"float32 has rounded positions by up to {rounding / float(support.min()):.2g} of the smallest support"
     return None
-
-
-def _x64(position: np.ndarray) -> bool:
-    import jax
-
-    return position.dtype == np.float64 and jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 
 def _range(values: np.ndarray) -> tuple[float, float]:

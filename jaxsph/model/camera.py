@@ -38,6 +38,7 @@ class Camera:
         width: pixels a row.
         height: rows.
         projection: `"perspective"` or `"orthographic"`.
+        eye_rest: what rounding a float64 eye to `eye` has left, length units; None is nothing.
     """
 
     eye: Float[Array, "3"]
@@ -48,6 +49,7 @@ class Camera:
     width: int = 512
     height: int = 512
     projection: str = "perspective"
+    eye_rest: Float[Array, "3"] | None = None
 
     @classmethod
     def look_at(
@@ -155,9 +157,20 @@ class Camera:
         """float32 or float64."""
         return self.eye.dtype
 
-    def to_view(self, position: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-        """World to view coordinates; the difference to the eye is taken first, so that nothing cancels later."""
+    def to_view(self, position: Float[Array, "... 3"], rest: Float[Array, "... 3"] | None = None) -> Float[Array, "... 3"]:
+        """World to view coordinates of `position + rest`."""
+        return self.rotate(self.offset(position, rest))
+
+    def offset(self, position: Float[Array, "... 3"], rest: Float[Array, "... 3"] | None = None) -> Float[Array, "... 3"]:
+        """World coordinates of `position + rest`, relative to the eye: to a few eps of themselves, wherever the eye is."""
         offset = position - self.eye
+        small = self.eye_rest if rest is None or self.eye_rest is None else self.eye_rest - rest
+        if small is None:
+            return offset if rest is None else offset + rest
+        return offset - small
+
+    def rotate(self, offset: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """World directions to view directions."""
         rows = [offset[..., 0] * axis[0] + offset[..., 1] * axis[1] + offset[..., 2] * axis[2] for axis in self.axes]
         return jnp.stack(rows, -1)
 
@@ -176,9 +189,14 @@ class Camera:
         """Vertical ray coordinate v of image-space ordinate `r` in [0, height], from the top; pixel r sits at r + 1/2."""
         return self.half_height * (1 - 2 * r / self.height)
 
+    def exact_eye(self) -> np.ndarray:
+        """The eye in float64, (3,), with what float32 could not hold (host side)."""
+        eye = np.asarray(self.eye, np.float64)
+        return eye if self.eye_rest is None else eye + np.asarray(self.eye_rest, np.float64)
+
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
-        eye, axes = np.asarray(self.eye).tolist(), np.asarray(self.axes).round(9).tolist()
+        eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()
         opening = (
             f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
         )
@@ -210,12 +228,15 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
         eye, target, up = (np.asarray(v, np.float64 if not hasattr(v, "dtype") else None) for v in (eye, target, up))
     eye, target, up = (xp.asarray(v) for v in (eye, target, up))
     wide = [v for v in (eye, target) if v.dtype == jnp.float64]
+    if xp is np:
+        eye, target = eye.astype(np.float64), target.astype(np.float64)
     forward = (target - eye).astype(jnp.float64 if xp is np else jnp.result_type(target, jnp.float32))
     forward = forward / xp.sqrt((forward * forward).sum())
     axes = _axes(forward, up.astype(forward.dtype), xp)
     dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
+    rest = jnp.asarray(eye - eye.astype(dtype), dtype)
     eye, axes, half, near, far = (jnp.asarray(v, dtype) for v in (eye, axes, half, near, far))
-    return Camera(eye, axes, half, near, far, int(width), int(height), projection)
+    return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)
 
 
 def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:
@@ -246,6 +267,6 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
 
 jax.tree_util.register_dataclass(
     Camera,
-    data_fields=["eye", "axes", "half_height", "near", "far"],
+    data_fields=["eye", "axes", "half_height", "near", "far", "eye_rest"],
     meta_fields=["width", "height", "projection"],
 )

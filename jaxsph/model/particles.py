@@ -16,6 +16,8 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model import kernels
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
+NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
+
 
 @dataclasses.dataclass(frozen=True)
 class Particles:
@@ -31,6 +33,8 @@ class Particles:
         volume: V >= 0, any unit: only ratios between particles matter.
         valid: which entries are particles; the rest is padding and contributes nothing.
         kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+        position_rest: what rounding float64 positions to `position` has left, length units; None where that is a negligible
+            part of every support.
     """
 
     position: Float[Array, "particles 3"]
@@ -39,6 +43,7 @@ class Particles:
     volume: Float[Array, " particles"]
     valid: Bool[Array, " particles"]
     kernel: str = "poly6"
+    position_rest: Float[Array, "particles 3"] | None = None
 
     @classmethod
     def from_arrays(
@@ -64,10 +69,12 @@ class Particles:
 
         Returns:
             Particles of dtype float64 if `position` is float64 and x64 is enabled, else float32. float16 and bfloat16
-            are promoted to float32.
+            are promoted to float32. Where float64 positions become float32, what that loses is kept in `position_rest` if it
+            matters: far from the origin, or beside small supports, images are those of the float64 positions.
 
         Raises:
-            ValueError: wrong shapes, non-finite values, supports <= 0, volumes < 0, unknown kernel, capacity < N.
+            ValueError: wrong shapes, non-finite values, supports <= 0, volumes < 0, unknown kernel, capacity < N, numbers that
+                the dtype cannot hold.
         """
         kernels.by_name(kernel)
         arrays = {"position": position, "support": support, "quantity": quantity, "volume": volume}
@@ -93,9 +100,11 @@ class Particles:
             raise ValueError(f"`capacity` must be at least the number of particles ({count}) and 1, got {capacity}")
         padding = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}
         packed = {name: _padded(value, dtype, capacity, padding[name]) for name, value in arrays.items()}
+        rest = None
         if not is_traced(*arrays.values()) and count:
             _require_representable(arrays, packed)
-        return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel)
+            rest = _rest(arrays["position"], packed["position"], packed["support"])
+        return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel, position_rest=rest)
 
     @property
     def capacity(self) -> int:
@@ -112,6 +121,11 @@ class Particles:
         """float32 or float64."""
         return self.position.dtype
 
+    def exact_position(self) -> np.ndarray:
+        """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""
+        position = np.asarray(self.position, np.float64)
+        return position if self.position_rest is None else position + np.asarray(self.position_rest, np.float64)
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around every support, (3,) and (3,), float64, length units (host side).
 
@@ -120,7 +134,7 @@ class Particles:
         valid = np.asarray(self.valid)
         if not valid.any():
             return np.zeros(3), np.zeros(3)
-        position = np.asarray(self.position, np.float64)[valid]
+        position = self.exact_position()[valid]
         support = np.asarray(self.support, np.float64)[valid, None]
         return (position - support).min(0), (position + support).max(0)
 
@@ -130,6 +144,16 @@ def _padded(value: Any, dtype: Any, capacity: int, fill: float) -> Array:
     width = [(0, capacity - value.shape[0])] + [(0, 0)] * (value.ndim - 1)
     with np.errstate(over="ignore"):  # what overflows is refused by name, later
         return jnp.asarray(xp.pad(value, width, constant_values=fill).astype(dtype))
+
+
+def _rest(given: Any, packed: Array, support: Array) -> Array | None:
+    """What rounding `given` to `packed` has left, or None where that is negligible."""
+    given, rounded = np.asarray(given, np.float64), np.asarray(packed, np.float64)
+    rest = np.zeros_like(rounded)
+    rest[: len(given)] = given - rounded[: len(given)]
+    if not (np.abs(rest).max(1) > NEGLIGIBLE * np.asarray(support, np.float64)).any():
+        return None
+    return jnp.asarray(rest, packed.dtype)
 
 
 def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> None:
@@ -142,8 +166,17 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
         packed["support"][:count],
         f"it underflows {packed['support'].dtype}: rescale the scene or use float64",
     )
+    tiny = np.finfo(packed["volume"].dtype).tiny
+    given_volume = np.asarray(given["volume"], np.float64)
+    lost = (given_volume > 0) & (given_volume < tiny)
+    if lost.any():
+        i = int(np.flatnonzero(lost)[0])
+        raise ValueError(
+            f"`volume` must be 0 or at least {tiny:.3g}, but volume[{i}] = {given_volume[i]:.6g} underflows "
+            f"{packed['volume'].dtype}; only ratios of volumes matter, so multiply all of them by the same number"
+        )
 
 
 jax.tree_util.register_dataclass(
-    Particles, data_fields=["position", "support", "quantity", "volume", "valid"], meta_fields=["kernel"]
+    Particles, data_fields=["position", "support", "quantity", "volume", "valid", "position_rest"], meta_fields=["kernel"]
 )

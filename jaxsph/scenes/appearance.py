@@ -111,7 +111,7 @@ def default_transfer(
     share = np.linspace(0, 1, len(colors))
     ramp = FAINTEST + (1 - FAINTEST) * share**STEEPNESS
     depth = _typical_column(
-        np.asarray(particles.position, np.float64)[valid],
+        particles.exact_position()[valid],
         np.asarray(particles.support, np.float64)[valid],
         np.interp(quantity, low + (high - low) * share, ramp),
     )

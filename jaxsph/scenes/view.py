@@ -30,7 +30,7 @@ def snug(camera: Camera, particles: Particles) -> Camera:
     valid = np.asarray(particles.valid)
     if not valid.any():
         return camera
-    offset = np.asarray(particles.position, np.float64)[valid] - np.asarray(camera.eye, np.float64)
+    offset = particles.exact_position()[valid] - camera.exact_eye()
     depth = offset @ np.asarray(camera.axes, np.float64)[2]
     support = np.asarray(particles.support, np.float64)[valid]
     near, far = (depth - support).min(), (depth + support).max()

@@ -80,14 +80,20 @@ def test_read_particles_passes_every_choice_on(samples, tmp_path):
     np.testing.assert_array_equal(particles.support, [0.25] * 3)
 
 
-def test_positions_that_float32_would_destroy_are_refused_and_a_remedy_given():
+def test_positions_that_float32_has_destroyed_are_refused_and_a_remedy_given():
     with pytest.raises(ValueError, match=r"positions reach 1e\+10.*subtract a common offset"):
-        io.particles_from_table(ParticleTable(position + 1e10), "x", 0.1)
+        io.particles_from_table(ParticleTable((position + 1e10).astype(np.float32)), "x", 0.1)
 
 
-def test_positions_that_float32_would_move_are_noted():
-    _, report = io.particles_from_table(ParticleTable(position + 1e4), "x", 0.1)
-    assert any("float32 rounds positions" in note for note in report.notes)
+def test_positions_that_float32_has_moved_are_noted():
+    _, report = io.particles_from_table(ParticleTable((position + 1e4).astype(np.float32)), "x", 0.1)
+    assert any("float32 has rounded positions" in note for note in report.notes)
+
+
+def test_float64_positions_far_from_the_origin_are_kept_whole():
+    particles, report = io.particles_from_table(ParticleTable(position + 1e10), "x", 0.1)
+    assert report.notes == ()
+    np.testing.assert_allclose(particles.exact_position(), position + 1e10, rtol=2.0**-48)
     _, report = io.particles_from_table(ParticleTable(position), "x", 0.1)
     assert report.notes == ()
 
