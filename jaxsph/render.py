@@ -15,13 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
+from jaxsph.access.quantities import rescaled, too_small
+from jaxsph.access.resolution import too_fine
 from jaxsph.cast.nodes import sum_at_nodes
 from jaxsph.cast.points import Rays, cast_points, evaluations
 from jaxsph.control.adapt import adapt
@@ -29,7 +31,6 @@ from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
-from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
@@ -93,13 +94,13 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     plan.check(scene, camera, settings)
     shapes = dataclasses.replace(plan, control=None)  # what the grid and the cast are compiled for, with any error control
     clock.mark("plan")
-    ordered = clock.run("grid", _order, (scene.particles, camera), plan=shapes)
-    bands, words = [], [_input_faults(scene, camera) | ordered.faults]
+    ordered, transfer = clock.run("grid", _order, (scene, camera), plan=shapes)
+    bands, words = [], [_input_faults(scene, camera, plan.samples) | ordered.faults]
     counts = np.zeros(2)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes))
-        view = (grid, camera, scene.transfer)
+        view = (grid, camera, transfer)
         decided = clock.run("adapt", _adapt, (*view, _limits(settings, ordered)), plan=plan, kernel=scene.particles.kernel)
         rays = clock.run("cast", _cast, (*view, decided.work, decided.lattice), plan=shapes, kernel=scene.particles.kernel)
         words.append(grid.lists.faults)
@@ -124,12 +125,12 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
 
 
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
-    ordered = _order(scene.particles, camera, plan=plan)
+    ordered, transfer = _order(scene, camera, plan=plan)
 
     def one_band(band: Int[Array, ""]) -> Any:
         first_row = band * plan.band_height
         grid = Grid(ordered, *_grid(ordered, camera, first_row, plan=plan))
-        view = (grid, camera, scene.transfer)
+        view = (grid, camera, transfer)
         decided = _adapt(*view, _limits(settings, ordered), plan=plan, kernel=scene.particles.kernel)
         rays = _cast(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
         return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
@@ -138,8 +139,9 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
-    word |= _input_faults(scene, camera) | ordered.faults
+    word |= _input_faults(scene, camera, plan.samples) | ordered.faults
     image, full = _assemble(layers, camera, plan, word)
+    image = _blank_if(word & faults.UNUSABLE != 0, image)
     cells_found, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
     stats = {"evaluations": spent, "evaluations_full": full.sum(), "cells": cells_found, "pairs": pairs}
@@ -184,9 +186,16 @@ jax.tree_util.register_dataclass(_Decided, data_fields=["work", "full", "bound",
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
+def _order(scene: Scene, camera: Camera, *, plan: Plan) -> tuple[Ordered, TransferFunction]:
+    """Particles by rank, and the transfer function: in its units are the quantities from here on."""
+    particles = scene.particles
     depths = _half_steps(camera, particles, plan)[1::2]
-    return order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
+    dtype = jnp.promote_types(particles.dtype, camera.dtype)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
+    quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
+    particles = dataclasses.replace(particles, quantity=quantity)
+    ordered = order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
+    return ordered, transfer
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -204,12 +213,13 @@ def _adapt(
     grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
 ) -> _Decided:
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
+    # an origin far beyond what is shown would cost the digits of what is
+    origin = jnp.clip(origin, transfer.values[0], transfer.values[-1])
     work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)
     dtype = grid.half_steps.dtype
     if limits is None or plan.control is None:
         return _Decided(work, full, jnp.zeros(full.shape, dtype), None)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     if isinstance(plan.control, PilotPlan):
         wanted = worthwhile(grid, camera, plan.cast.slab_samples)
         lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, wanted)
@@ -230,7 +240,6 @@ def _cast(
     plan: Plan,
     kernel: str,
 ) -> Rays:
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     return cast_points(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
@@ -274,8 +283,16 @@ def _assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array
     return dataclasses.replace(image, levels=jnp.moveaxis(joined[6][:rows, :columns], -1, 0)), full
 
 
-@jax.jit
-def _input_faults(scene: Scene, camera: Camera) -> Int[Array, ""]:
+def _blank_if(unusable: Bool[Array, ""], image: Image) -> Image:
+    """Nothing at all instead of the NaN that unusable numbers would make."""
+    color = jnp.where(unusable, 0, image.color)
+    transmittance = jnp.where(unusable, 1, image.transmittance)
+    depth, bound = jnp.where(unusable, jnp.inf, image.depth), jnp.where(unusable, 0, image.error_bound)
+    return dataclasses.replace(image, color=color, transmittance=transmittance, depth=depth, error_bound=bound)
+
+
+@functools.partial(jax.jit, static_argnames="samples")
+def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
     """Fault bits of camera and transfer function, whose numbers may have been changed under jit."""
     numbers = jnp.concatenate([camera.eye, camera.axes.ravel(), jnp.stack([camera.half_height, camera.near, camera.far])])
     usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
@@ -284,8 +301,9 @@ def _input_faults(scene: Scene, camera: Camera) -> Int[Array, ""]:
     transfer = scene.transfer
     shown = (transfer.values[1:] >= transfer.values[:-1]).all() & jnp.isfinite(transfer.values).all()
     shown &= ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
-    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all()
-    return faults.raised(faults.BAD_CAMERA, ~usable) | faults.raised(faults.BAD_TRANSFER, ~shown)
+    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all() & ~too_small(transfer.values)
+    unresolved = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples))
+    return unresolved | faults.raised(faults.BAD_CAMERA, ~usable) | faults.raised(faults.BAD_TRANSFER, ~shown)
 
 
 def _raise(word: int, planned: bool) -> None:

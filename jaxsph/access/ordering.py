@@ -19,10 +19,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.access.resolution import LIFT, unresolved, weakest
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
-from jaxsph.numerics import faults
+from jaxsph.numerics import exponents, faults
 from jaxsph.numerics.staging import computed_once
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
@@ -36,8 +37,8 @@ class Ordered:
     """Particles in view space, in rank order (class, then depth); those that no sample can meet come last and are not `live`.
 
     `reach` is the support widened by the rounding of coordinates: what lies outside it has weight zero in floating point.
-    The particle's strength m = V / H^3 is folded into its lengths: `size = m^(1/n)` and `scale = size / H`, with n the degree
-    of its kernel.
+    The particle's strength m = V / H^3, of which the largest is 2^LIFT, is folded into its lengths: `size = m^(1/n)` and
+    `scale = size / H`, with n the degree of its kernel.
 
     Ranks from `first_rank` up to `last_rank` can touch a sample of the slab; from `first_beside` up to `last_beside` any point
     between the samples before and after it, where samples of wider spacing lie.
@@ -96,13 +97,15 @@ def _view(
     particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int
 ) -> tuple[dict[str, Array], Array, Array, Array]:
     """Columns of `Ordered` in the order of `particles`, sort keys, the largest reach of each class, and a fault word."""
-    view = camera.to_view(particles.position)
+    offset = camera.offset(particles.position, particles.position_rest)
+    view = camera.rotate(offset)
     x, y, z = view[:, 0], view[:, 1], view[:, 2]
     finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
     usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
     usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
     eps = jnp.finfo(view.dtype).eps * ROUNDING
-    reach = particles.support * (1 + eps) + eps * jnp.abs(particles.position - camera.eye).max(1)
+    distance = jnp.abs(offset).max(1)
+    reach = particles.support * (1 + eps) + eps * distance
     live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
 
     largest = jnp.where(live, reach, 0).max(initial=0)
@@ -110,10 +113,12 @@ def _view(
     octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
     widest = [jnp.where(live & (octave == k), reach, 0).max(initial=0) for k in range(num_classes)]
 
-    scale, size = _folded(particles, live)
+    scale, size, vanishes = _folded(particles, live)
     columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size, "quantity": particles.quantity}
     columns = {name: jnp.where(live, column, 0) for name, column in columns.items()}
     bad = faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any())
+    blurred = unresolved(view, distance, particles.support, camera, depths)
+    bad |= faults.raised(faults.UNRESOLVED, (live & blurred).any()) | faults.raised(faults.WEAK_PARTICLES, vanishes.any())
     return {**columns, "reach": reach, "live": live}, (octave << DEPTH_BITS) | _depth_key(camera, z), jnp.stack(widest), bad
 
 
@@ -136,18 +141,24 @@ def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
         return (packed >> 32).astype(jnp.uint32), packed.astype(jnp.uint32).astype(jnp.int32)
 
 
-def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array]:
-    """`scale` and `size` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1."""
-    support = jnp.where(live, particles.support, 1)
-    inverse = 1 / support
-    smallest = jnp.where(live, particles.support, jnp.inf).min(initial=jnp.inf)
-    relative = jnp.where(jnp.isfinite(smallest), smallest, 1) * inverse
-    strength = jnp.where(live, particles.volume, 0) * relative * relative * relative
+def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
+    """`scale` and `size` of every particle, and which are so weak that they would vanish.
+
+    CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32.
+    """
+    support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
+    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
+    mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
+    counts = live & (large > 0)
+    exponent -= jnp.where(counts, exponent, jnp.iinfo(jnp.int32).min).max(initial=jnp.iinfo(jnp.int32).min // 2)
+    strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
     peak = strength.max(initial=0)
     strength = strength / jnp.where(peak > 0, peak, 1)
-    degree = kernels.by_name(particles.kernel).degree
-    size = jnp.where(strength > 0, jnp.where(strength > 0, strength, 1) ** (1 / degree), 0)
-    return inverse * size, size
+    kernel = kernels.by_name(particles.kernel)
+    lift = 2.0 ** (LIFT // kernel.degree)
+    size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
+    weak = (counts & (strength < weakest(kernel.degree, strength.dtype))) | (live & exponents.is_subnormal(volume))
+    return size / support, size, weak
 
 
 jax.tree_util.register_dataclass(

@@ -78,7 +78,7 @@ def spheres(ordered: Ordered) -> Spheres:
     """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive."""
     outer = jnp.where(ordered.size > 0, 1 / ordered.reach, jnp.inf)
     inner = 2 * ordered.size / jnp.where(ordered.scale > 0, ordered.scale, 1) - ordered.reach
-    solid = (ordered.size > SOLID) & (inner > 0)
+    solid = (ordered.size > SOLID * ordered.size.max(initial=0)) & (inner > 0)
     inner = jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
     return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantity)
 

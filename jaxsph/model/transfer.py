@@ -43,7 +43,8 @@ class TransferFunction:
             extinction: (K,) >= 0, per length unit.
 
         Raises:
-            ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0.
+            ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0, values
+                that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction}
         given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
@@ -73,6 +74,7 @@ class TransferFunction:
         if not is_traced(*given.values()):
             for name, value in packed.items():
                 require_finite(name, value, f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
+            _require_apart(np.asarray(given["values"], np.float64), packed["values"])
         return cls(**packed)
 
     def __call__(self, quantity: Float[Array, "..."]) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
@@ -96,6 +98,26 @@ class TransferFunction:
         even = jnp.linspace(self.values[0], self.values[-1], self.values.shape[0])
         off = jnp.abs(self.values - even) <= EVEN * jnp.finfo(width.dtype).eps * jnp.maximum(jnp.abs(even[0]), jnp.abs(even[-1]))
         return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
+
+
+def _require_apart(given: np.ndarray, packed: Array) -> None:
+    """Refuse values that rounding moves by a share of what they span, or takes for (nearly) nothing."""
+    span, largest = given[-1] - given[0], np.abs(given).max()
+    moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), SMALLEST * np.finfo(packed.dtype).tiny
+    if moved > MOVED * span:
+        raise ValueError(
+            f"`values` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
+            "subtract an offset from values and quantity, or use float64 under jax.enable_x64"
+        )
+    if 0 < largest < smallest:
+        raise ValueError(
+            f"`values` must reach at least {smallest:.3g} in {packed.dtype} unless all are 0, but the largest is {largest:.3g}; "
+            "multiply values and quantity by the same number"
+        )
+
+
+MOVED = 2.0**-12  # of the span of its values that a transfer function's values may be moved by rounding
+SMALLEST = 2.0**16  # smallest normal numbers that values must reach: quantities among them are then not taken for zero
 
 
 @dataclasses.dataclass(frozen=True)

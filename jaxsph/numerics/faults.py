@@ -15,6 +15,8 @@ LIST_OVERFLOW = 2
 BAD_PARTICLES = 4
 BAD_CAMERA = 8
 BAD_TRANSFER = 16
+UNRESOLVED = 32
+WEAK_PARTICLES = 64
 
 MESSAGES = {
     TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
@@ -24,9 +26,16 @@ MESSAGES = {
     BAD_CAMERA: "the camera is not usable: eye and axes must be finite, the field of view > 0 and 0 < near < far (perspective) "
     "or near < far (orthographic)",
     BAD_TRANSFER: "the transfer function is not usable: values must ascend, colours lie in [0, 1] and extinction be >= 0 "
-    "and finite",
+    "and finite, and not all values so small that they are no normal numbers",
+    UNRESOLVED: "lengths are too far apart for this precision: samples nearer each other than 16 eps of their depth, a particle "
+    "in view that is seen more closely than the rounding of its distance from the eye allows, or lengths outside "
+    "1e-15 .. 1e15 (float32); widen near and far or take fewer samples, move the eye nearer instead of narrowing the view, "
+    "change the unit of length, or use float64 under jax.enable_x64",
+    WEAK_PARTICLES: "the strengths volume / support^3 of the particles are too far apart for this precision, and the weakest "
+    "would vanish: give each particle its own `volume` (about support^3), or use float64 under jax.enable_x64",
 }
 OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
+UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
 
 
 def raised(bit: int, when: Bool[Array, ""]) -> Int[Array, ""]:

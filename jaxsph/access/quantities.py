@@ -1,0 +1,48 @@
+r"""Quantities in units of the transfer function's, so that sums of them neither underflow nor overflow nor lose digits.
+
+Flow: particles, transfer function -> [quantities] -> control, cast.
+
+Only where a quantity lies among the control points matters. Densities of 1e-30 times weights of 1e-9 are no numbers in
+float32; differences between temperatures of 1e6 to 1e6 + 1 would be lost beside 1e6. So quantities and control points are both
+multiplied by a power of two and, where the points span less than their distance from zero, moved by the least of them.
+Both steps are exact for all quantities among the control points, so ordinary images stay the same bits but for the rounding
+that they save.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model.transfer import SMALLEST, TransferFunction
+from jaxsph.numerics import exponents
+
+FARTHEST = 2.0**60  # in units of the largest control point: quantities beyond it are clipped to it, as a mean that holds one is
+
+
+def rescaled(
+    quantity: Float[Array, " particles"], transfer: TransferFunction
+) -> tuple[Float[Array, " particles"], TransferFunction]:
+    """`quantity` and the control points of `transfer`, both in the same units, in which the largest control point is about 1.
+
+    Differentiation: the units are constants.
+    """
+    values = transfer.values
+    largest = jnp.abs(values).max()
+    unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
+    unit = lax.stop_gradient(jnp.where(largest > 0, jnp.maximum(unit, jnp.finfo(unit.dtype).tiny), 1))
+    scaled, values = jnp.clip(quantity * unit, -FARTHEST, FARTHEST), values * unit
+    quantity = jnp.where(jnp.isfinite(quantity), scaled, quantity)  # what is no number is to be found as such
+    first, last = values[0], values[-1]
+    narrow = (first * last > 0) & (last - first <= jnp.minimum(jnp.abs(first), jnp.abs(last)))
+    least = lax.stop_gradient(jnp.where(narrow, first, 0))
+    return quantity - least, dataclasses.replace(transfer, values=values - least)
+
+
+def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:
+    """Whether control points are (nearly) subnormal numbers, and quantities among them would be taken for zero."""
+    largest = jnp.abs(values).max()
+    return ((largest > 0) | exponents.is_subnormal(values).any()) & (largest < SMALLEST * jnp.finfo(values.dtype).tiny)

@@ -1,0 +1,43 @@
+r"""Numbers as mantissa and exponent, where products of many decades would leave the range of the dtype.
+
+XLA treats subnormal numbers as zero on CPU, in comparisons too. So exponents are read from the bits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+
+def split(x: Float[Array, "*any"]) -> tuple[Float[Array, "*any"], Int[Array, "*any"]]:
+    r"""Mantissa m, $1 \le |m| < 2$, and exponent e of x = m 2^e; of zero and of subnormal numbers, 0 and the least exponent."""
+    bits, exponent_bits, mantissa_bits, bias = _layout(x)
+    exponent = (bits >> mantissa_bits) & ((1 << exponent_bits) - 1)
+    mantissa = lax.bitcast_convert_type(bits + ((bias - exponent) << mantissa_bits), x.dtype)
+    return jnp.where(exponent > 0, mantissa, 0), (exponent - bias).astype(jnp.int32)
+
+
+def power_of_two(exponent: Int[Array, "*any"], dtype: Any) -> Float[Array, "*any"]:
+    """$2^e$ exactly; 0 below the range of normal numbers, and the largest power above it."""
+    info = jnp.finfo(dtype)
+    whole = jnp.int32 if info.bits == 32 else jnp.int64
+    bias = -int(info.minexp) + 1
+    biased = jnp.clip(exponent.astype(whole) + bias, 0, 2 * bias)
+    return lax.bitcast_convert_type(biased << info.nmant, dtype)
+
+
+def is_subnormal(x: Float[Array, "*any"]) -> Bool[Array, "*any"]:
+    """Whether x is neither zero nor normal, so that arithmetic takes it for zero."""
+    bits, exponent_bits, mantissa_bits, _ = _layout(x)
+    exponent = (bits >> mantissa_bits) & ((1 << exponent_bits) - 1)
+    return (exponent == 0) & ((bits & ((1 << mantissa_bits) - 1)) != 0)
+
+
+def _layout(x: Array) -> tuple[Array, int, int, int]:
+    """Bits, numbers of exponent and mantissa bits, exponent bias."""
+    info = jnp.finfo(x.dtype)
+    bits = lax.bitcast_convert_type(x, jnp.int32 if info.bits == 32 else jnp.int64)
+    return bits, int(info.nexp), int(info.nmant), -int(info.minexp) + 1
