@@ -4,7 +4,8 @@ Flow: points -> [composite] -> image.
 
 A slab that emits colour C and lets through t, both as seen from right in front of it, adds T C to a ray and leaves it T t. In a
 slab a sample adds its colour times the light it takes away, $t_{k-1} - t_k$: however thin the samples, colours then add up to
-the alpha that is lost.
+the alpha that is lost. And $t_k$ is the exponential of the thickness up to there: one rounding, where a product would round
+at every sample, and always the same way in a uniform medium.
 """
 
 from __future__ import annotations
@@ -34,11 +35,19 @@ def fresh(bundles: int, dtype: Any) -> State:
     return tuple(jnp.full((bundles + TOGETHER, RAYS), value, dtype) for value in (0, 0, 0, 1, jnp.inf))
 
 
-def emitted(colors: list[Array], passed: Array) -> list[Array]:
-    """Red, green and blue of slabs of samples that let through `passed`, as seen from right in front, and their transmittance."""
-    left, total = jnp.ones_like(passed[:, 0]), [jnp.zeros_like(passed[:, 0])] * 3
-    for k in range(passed.shape[1]):
-        behind = left * passed[:, k]
+def transmitted(thickness: Array) -> Array:
+    """What is left behind each sample of slabs of what enters them."""
+    through = [thickness[:, 0]]
+    for k in range(1, thickness.shape[1]):
+        through.append(through[-1] + thickness[:, k])
+    return jnp.exp(-jnp.stack(through, 1))
+
+
+def emitted(colors: list[Array], left_behind: Array) -> list[Array]:
+    """Red, green and blue of slabs of samples, as seen from right in front, and their transmittance."""
+    left, total = jnp.ones_like(left_behind[:, 0]), [jnp.zeros_like(left_behind[:, 0])] * 3
+    for k in range(left_behind.shape[1]):
+        behind = left_behind[:, k]
         total = [added + (left - behind) * color[:, k] for added, color in zip(total, colors, strict=True)]
         left = behind
     return [*total, left]
@@ -101,15 +110,13 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: A
     Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
     """
     thickness = thickness[at]
-    passed = jnp.exp(-thickness)
-    left, reached = jnp.ones_like(depth), transmittance
-    for k in range(passed.shape[1]):
-        left = left * passed[:, k]
-        behind = transmittance * left
+    left, reached = transmitted(thickness), transmittance
+    for k in range(thickness.shape[1]):
+        behind = transmittance * left[:, k]
         start, end = border[:, k, None], border[:, k + 1, None]
         filled = thickness[:, k] > 0
         share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
-        here = crossed & ((behind <= 0.5) | (k == passed.shape[1] - 1))
+        here = crossed & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
         depth = jnp.where(here, start + jnp.minimum(share, 1) * (end - start), depth)
         crossed = crossed & ~here
         reached = behind

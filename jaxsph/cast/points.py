@@ -30,7 +30,7 @@ from jaxsph.access.lattice import NODE_PIXELS, Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
-from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, unlit
+from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, transmitted, unlit
 from jaxsph.cast.nodes import interpolate
 from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.model import kernels
@@ -108,8 +108,9 @@ def cast_points(
         if lattice is not None:
             sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
         shade = functools.partial(_shade, perspective=camera.is_perspective)
-        *colors, thickness, passed = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
-        return *computed_once(slab[0] >= 0, emitted, colors, passed), thickness
+        *colors, thickness = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
+        left = computed_once(slab[0] >= 0, transmitted, thickness)
+        return *computed_once(slab[0] >= 0, emitted, colors, left), thickness
 
     def march_batch(batch: Array, state: tuple[State, Light]) -> tuple[State, Light]:
         rays, light = state
@@ -251,7 +252,7 @@ def _shade(
     *,
     perspective: bool,
 ) -> list[Array]:
-    """Red, green, blue, optical thickness and transmittance of every sample: first paper, equation 2 and section 2.2."""
+    """Red, green, blue and optical thickness of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
     weight, weighted = (value.reshape(*value.shape[:2], RAYS) for value in (weight, weighted))
     inside = weight > 0
@@ -265,8 +266,7 @@ def _shade(
     step = (border[:, 1:] - border[:, :-1])[:, :, None]
     if perspective:
         step = step * jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, RAYS)
-    thickness = jnp.where(inside, extinction * step, 0)
-    return [*channels, thickness, jnp.exp(-thickness)]
+    return [*channels, jnp.where(inside, extinction * step, 0)]
 
 
 jax.tree_util.register_dataclass(Rays, data_fields=["color", "transmittance", "depth", "evaluations"], meta_fields=[])

@@ -54,7 +54,8 @@ def adapt(
 ) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
     r"""Decide how every cell is sampled. Where nothing is promising, that takes no more than a look.
 
-    Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample and once a slab;
+    Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
+    thicknesses, of which the exponential keeps less than that) and once a slab;
     a colour once a slab, and by the samples of a slab and three more times its share. With n samples, S to a slab, that is
     less than (n + 2 n / S + S + 4) eps / 2 a pixel, thus (n + S) eps, and twice that for two images. Only where all cells
     stay at level 0 are the images the same bits.
