@@ -87,7 +87,7 @@ def moved(scene, camera, rng, part):
     position, eye = particles.exact_position(), camera.exact_eye()
     distance = np.abs(position - eye).max(1, keepdims=True)
     quantity = np.asarray(particles.quantity, np.float64)
-    inside = np.abs(quantity) <= 1e6 * np.abs(np.asarray(scene.transfer.values)).max()
+    inside = np.abs(quantity) <= 1e6 * np.abs(np.asarray(scene.transfer.values, np.float64)).max()
     spread = np.ptp(quantity[inside]) if inside.any() else 0
     shaken = {
         "position": position + part * distance * rng.uniform(-1, 1, position.shape),
