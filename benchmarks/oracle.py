@@ -127,7 +127,7 @@ def light_of_candidates(grid: Grid, beside: Cells, scene: js.Scene, camera: js.C
     work = full_rate(beside, origins(grid.cells, grid.lists.rank, grid.ordered.quantity))
     item = jax.tree.map(lambda leaf: leaf[..., cell, bundle], work)
     sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, depth[:, 1:-1]), camera.is_perspective, kernel)
-    weight, weighted = (value.reshape(*value.shape[:2], 64) for value in sums)
+    weight, weighted = (value.reshape(*value.shape[:2], 64) for value in (sums.real, sums.imag))
     slant = jnp.ones((at.shape[0], 1, 64), depth.dtype)
     if camera.is_perspective:
         slant = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, 64)

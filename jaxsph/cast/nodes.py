@@ -7,11 +7,12 @@ A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie sid
 
 from __future__ import annotations
 
-import jax
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
@@ -103,13 +104,16 @@ def _summed(
 
 def interpolate(
     lattice: Lattice, slab: Int[Array, " chunk"], corner: tuple[Array, Array], slab_samples: int
-) -> tuple[Float[Array, "chunk samples 64"], Float[Array, "chunk samples 64"]]:
+) -> Complex[Array, "chunk samples 64"]:
     """Sums at all samples of slabs, by the tensor product of cubics through the nearest four nodes along each axis.
 
     Args:
         slab: slabs that lie inside the lattice, with a node to spare on every side.
         corner: first node of their bundles, down and across.
         slab_samples: samples of a slab.
+
+    Returns:
+        V W as real, (q - origin) V W as imaginary part.
     """
     deep, down, across = lattice.weight.shape
     within = slab_samples // NODE_SAMPLES
@@ -117,13 +121,16 @@ def interpolate(
     offset = np.arange(shape[0])[:, None, None] * down * across + np.arange(shape[1])[:, None] * across + np.arange(shape[2])
     first = ((slab * within - 1) * down + corner[0] - 1) * across + corner[1] - 1
     at = jnp.clip(first[:, None, None] + offset.reshape(shape[0], -1).astype(np.int32), 0, deep * down * across - 1)
-    along = between(within, NODE_SAMPLES)
+    dtype = lattice.weight.dtype
     across_cell = between(ACROSS, NODE_PIXELS)
-    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, lattice.weight.dtype)
+    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, dtype)
+    taps = jnp.asarray(between(1, NODE_SAMPLES), dtype)[..., None]  # of the samples past a node
 
     def spread(sums: Array) -> Array:
         nodes = sums.ravel().at[at].get(mode="promise_in_bounds")
-        rows = [sum(float(w) * nodes[:, k] for k, w in enumerate(row) if w) for row in along]
-        return jnp.matmul(jnp.stack(rows, 1), lateral, precision=lax.Precision.HIGHEST)
+        layers = jnp.matmul(nodes, lateral, precision=lax.Precision.HIGHEST)[:, :, None]
+        # broadcast over the samples past a node rather than stacked: of a stack XLA evaluates every row apart
+        samples = functools.reduce(jnp.add, (taps[:, k] * layers[:, k : k + within] for k in range(4)))
+        return samples.reshape(-1, slab_samples, BUNDLE * BUNDLE)
 
-    return jax.tree.map(spread, (lattice.weight, lattice.weighted))
+    return lax.complex(spread(lattice.weight), spread(lattice.weighted))

@@ -22,7 +22,7 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
@@ -108,7 +108,7 @@ def cast_points(
         if lattice is not None:
             sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
         shade = functools.partial(_shade, perspective=camera.is_perspective)
-        *colors, thickness = computed_once(slab[0] >= 0, shade, *sums, (u, v, border), segments, item)
+        *colors, thickness = computed_once(slab[0] >= 0, shade, sums, (u, v, border), segments, item)
         left = computed_once(slab[0] >= 0, transmitted, thickness)
         return *computed_once(slab[0] >= 0, emitted, colors, left), thickness
 
@@ -175,21 +175,17 @@ def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPla
     return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
 
 
-def _from_lattice(
-    lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], sums: tuple[Array, Array], plan: CastPlan
-) -> tuple[Array, Array]:
+def _from_lattice(lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], sums: Array, plan: CastPlan) -> Array:
     """`sums`, but those of interpolated slabs from the lattice."""
     slab, bundle = at
     inside = item.interpolated
     assert inside is not None
 
-    def replaced(sums: tuple[Array, Array]) -> tuple[Array, Array]:
+    def replaced(sums: Array) -> Array:
         # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
         corner = (grid.row[bundle] - grid.row[0]) // NODE_PIXELS, (grid.column[bundle] - grid.column[0]) // NODE_PIXELS
         found = interpolate(lattice, slab, corner, plan.slab_samples)
-        here = inside[:, None, None, None]
-        weight, weighted = (jnp.where(here, new.reshape(old.shape), old) for new, old in zip(found, sums, strict=True))
-        return weight, weighted
+        return jnp.where(inside[:, None, None, None], found.reshape(sums.shape), sums)
 
     return lax.cond(inside.any(), replaced, lambda sums: sums, sums)
 
@@ -201,10 +197,10 @@ def gather_field(
     rays: tuple[Array, Array, Array],
     perspective: bool,
     kernel: str,
-) -> tuple[Array, Array]:
+) -> Complex[Array, "chunk samples 8 8"]:
     """Sums of V W and (q - origin) V W (up to one common factor) at every sample of the chunk's items.
 
-    The two sums travel as one complex number: of a pair XLA makes two kernels, and each evaluates every weight again.
+    The two travel as one complex number: of a pair XLA makes two kernels, and each evaluates every weight again.
     """
     u, v, s = rays
     begin, length = item.begin, item.length
@@ -239,13 +235,11 @@ def gather_field(
 
     zero = jnp.zeros((*su.shape[:2], BUNDLE, BUNDLE), su.dtype)
     blocks = (total.max() + BLOCK - 1) // BLOCK
-    sums = lax.fori_loop(0, blocks, add_block, lax.complex(zero, zero))
-    return sums.real, sums.imag
+    return lax.fori_loop(0, blocks, add_block, lax.complex(zero, zero))
 
 
 def _shade(
-    weight: Array,
-    weighted: Array,
+    sums: Array,
     geometry: tuple[Array, Array, Array],
     segments: Segments,
     item: Worklist,
@@ -254,7 +248,8 @@ def _shade(
 ) -> list[Array]:
     """Red, green, blue and optical thickness of every sample: first paper, equation 2 and section 2.2."""
     u, v, border = geometry
-    weight, weighted = (value.reshape(*value.shape[:2], RAYS) for value in (weight, weighted))
+    sums = sums.reshape(*sums.shape[:2], RAYS)
+    weight, weighted = sums.real, sums.imag
     inside = weight > 0
     quantity = item.origin[:, None, None] + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
     optics = look_up(segments, quantity)

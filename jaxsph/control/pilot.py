@@ -37,7 +37,8 @@ CLEAR = 12.0  # times its estimated error that the sum of weights is above zero 
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
 LEAST = 8  # eps: what interpolated samples differ by, at least
 WORTHWHILE = 0.25  # least share of a band's work that the lattice must resolve: sampling it costs up to a tenth
-HALVINGS = 24
+HALVINGS = 16  # of the range of prices in octaves
+NARROWEST = 1e-3  # of the transfer function's domain that a slope is averaged over, at least
 ACROSS = BUNDLE // NODE_PIXELS
 Combine = Callable[[Array, Array], Array]
 REACH = 2  # nodes to either side that a fourth difference takes
@@ -124,74 +125,91 @@ def _resolved(grid: Grid, camera: Camera, slab_samples: int) -> Bool[Array, "sla
 def _deviations(
     grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, *, slab_samples: int
 ) -> tuple[Array, Array]:
-    """Variance of light of every slab, if it is interpolated, as it reaches the eye, (slabs, bundles); and where it can be."""
+    """Variance of light of every slab, if it is interpolated, as it reaches the eye, (slabs, bundles); and where it can be.
+
+    Slab by slab from front to back, such that what is at hand stays in the cache.
+    """
     slabs = grid.cells.count.shape[0]
     within = slab_samples // NODE_SAMPLES
-    rows, columns = (size // ACROSS for size in lattice.weight.shape[1:])
-    spread, quantity, extinction = computed_once(grid.row[0] >= 0, _at_nodes, lattice, transfer.segments())
-    last = grid.half_steps.shape[0] - 1
-    borders = grid.half_steps[jnp.minimum(4 * jnp.arange(spread.shape[0] + 1, dtype=jnp.int32), last)]
-    path = _slant(grid, camera, *spread.shape[1:])
-    thickness = extinction * ((borders[1:] - borders[:-1])[:, None, None] * path)
-    absorbed = functools.reduce(jnp.add, (thickness[k : k + slabs * within : within] for k in range(within)))
-    before = jnp.cumsum(absorbed, 0) - absorbed
+    down, across = lattice.weight.shape[1:]
+    rows, columns = down // ACROSS, across // ACROSS
+    layer = (down + GAP) * (across + GAP)
+    weight, weighted = (_in_a_row(value, slabs * within + 1) for value in (lattice.weight, lattice.weighted))
+    segments, squares = transfer.segments(), _squared_slopes(transfer)
+    path = _slant(grid, camera, down + GAP, across + GAP).ravel()
+    longest = _pooled(path, jnp.maximum, down, across)
 
-    pool = functools.partial(_pooled, slabs=slabs, within=within)
-    deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (ACROSS + 1) ** 2))
-    low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
-    front = jnp.exp(-_pooled_across(before, jnp.minimum))
-    taken = -jnp.expm1(-_pooled_across(absorbed, jnp.maximum))
-    slope = _mean_square_slope(transfer, low - 2 * deviation, high + 2 * deviation)
-    edges = grid.borders(slabs * slab_samples)[::slab_samples]
-    length = (edges[1:] - edges[:-1])[:, None, None] * _pooled_across(path[None], jnp.maximum)
-    of_colors = jnp.maximum(jnp.maximum(slope[0], slope[1]), slope[2])
-    # a slab's samples err independently: their sum by the root of their number, their mean by one over it
-    variance = front**2 * deviation**2 * (slope[3] * length**2 + of_colors * taken**2) / slab_samples
+    at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer)
+
+    def one_slab(before: Array, slab: Array) -> tuple[Array, Array]:
+        near = [lax.dynamic_slice(v, (slab * within * layer,), ((within + 1 + 2 * REACH) * layer,)) for v in (weight, weighted)]
+        spread, quantity, extinction = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments)
+        border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
+        absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
+
+        def pool(value: Array, combine: Combine) -> Array:
+            return _pooled(functools.reduce(combine, value), combine, down, across)
+
+        deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (ACROSS + 1) ** 2))
+        low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
+        front, taken = jnp.exp(-pool(before[None], jnp.minimum)), -jnp.expm1(-pool(absorbed[None], jnp.maximum))
+        *of_colors, of_extinction = _mean_square_slope(squares, low - 2 * deviation, high + 2 * deviation)
+        length = (border[-1] - border[0]) * longest
+        # a slab's samples err independently: their sum by the root of their number, their mean by one over it
+        light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
+        return before + absorbed, front**2 * deviation**2 * light / slab_samples
+
+    # one more border than there are samples, and layers past the last
+    last = grid.half_steps.shape[0] - 1
+    edges = grid.half_steps[jnp.minimum(2 * NODE_SAMPLES * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
+    _, variance = lax.scan(one_slab, jnp.zeros_like(path), jnp.arange(slabs, dtype=jnp.int32))
     variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
     spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // NODE_SAMPLES)
     spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
-    return tuple(_by_bundle(value) for value in (variance, spared & jnp.isfinite(variance)))  # type: ignore[return-value]
+    variance = _by_bundle(jnp.where(spared, variance, jnp.inf))
+    return variance, jnp.isfinite(variance)
 
 
-def _at_nodes(lattice: Lattice, segments: Segments) -> tuple[Array, Array, Array]:
-    """Variance of Q between the nodes, Q, and extinction; with `GAP` more nodes on the far sides, where nothing is.
+def _in_a_row(value: Float[Array, "deep down across"], layers: int) -> Float[Array, " nodes"]:
+    """All nodes one after the other, with zeros between rows and layers: neighbours along any axis are then one shift away."""
+    deep, down, across = value.shape
+    kept = min(deep, layers + REACH)
+    row = jnp.zeros((layers + 2 * REACH, down + GAP, across + GAP), value.dtype)
+    return row.at[REACH : REACH + kept, :down, :across].set(value[:kept]).ravel()
+
+
+def _at_nodes(weight: Array, weighted: Array, origin: Array, segments: Segments, *, across: int, layer: int) -> tuple[Array, ...]:
+    """Variance of Q between nodes, Q, and extinction, (layers, nodes of a layer), of all layers but `REACH` on either side.
 
     The variance is infinite where the sum of weights is not clear of zero.
+
+    Args:
+        weight, weighted: sums at nodes in a row.
+        across, layer: how far apart neighbours are down and in depth.
     """
-    deep, down, across = (size + GAP for size in lattice.weight.shape)
-    stride = (down * across, across, 1)
-    number = deep * stride[0]
-    flat = [_with_gaps(value, (deep, down, across)) for value in (lattice.weight, lattice.weighted)]
+    number = weight.shape[0] - 2 * REACH * layer
 
     def shifted(value: Array, by: int) -> Array:
-        return value[REACH * stride[0] + by :][:number]
+        return value[REACH * layer + by :][:number]
 
-    def fourth(value: Array, axis: int) -> Array:
-        left2, left, middle, right, right2 = (shifted(value, by * stride[axis]) for by in range(-REACH, REACH + 1))
+    def fourth(value: Array, stride: int) -> Array:
+        left2, left, middle, right, right2 = (shifted(value, by * stride) for by in range(-REACH, REACH + 1))
         return (left2 + right2) - 4 * (left + right) + 6 * middle
 
-    weight, weighted = (shifted(value, 0) for value in flat)
-    inside = weight > 0
-    inverse = jnp.where(inside, 1 / jnp.where(inside, weight, 1), 0)
-    ratio = weighted * inverse
+    here = shifted(weight, 0)
+    inside = here > 0
+    inverse = jnp.where(inside, 1 / jnp.where(inside, here, 1), 0)
+    ratio = shifted(weighted, 0) * inverse
     spread, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio)
-    for axis in range(3):
-        of_weight, of_weighted = (fourth(value, axis) for value in flat)
+    for stride in (1, across, layer):
+        of_weight = fourth(weight, stride)
         unsure += CUBIC * jnp.abs(of_weight)
-        spread += (CUBIC * (of_weighted - ratio * of_weight)) ** 2
-    spread = jnp.where(inside & (weight > CLEAR * unsure), spread * inverse**2, jnp.inf)
-    quantity = lattice.origin + ratio
+        spread += (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
+    spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
+    quantity = origin + ratio
     found = spread, quantity, jnp.where(inside, look_up(segments, quantity)[3], 0)
-    first, second, third = (value.reshape(deep, down, across) for value in found)
-    return first, second, third
-
-
-def _with_gaps(value: Array, shape: tuple[int, int, int]) -> Array:
-    """All nodes in one row, with zeros between rows and layers: neighbours along any axis are then one shift away."""
-    flat = jnp.zeros(shape, value.dtype).at[: value.shape[0], : value.shape[1], : value.shape[2]].set(value).ravel()
-    around = REACH * shape[1] * shape[2]
-    return jnp.zeros(flat.shape[0] + 2 * around, value.dtype).at[around : around + flat.shape[0]].set(flat)
+    return tuple(value.reshape(-1, layer) for value in found)
 
 
 def _slant(grid: Grid, camera: Camera, down: int, across: int) -> Array:
@@ -204,20 +222,12 @@ def _slant(grid: Grid, camera: Camera, down: int, across: int) -> Array:
     return jnp.sqrt(1 + u**2 + v[:, None] ** 2)
 
 
-def _pooled(value: Array, combine: Combine, *, slabs: int, within: int) -> Array:
-    """Nodes of each slab and bundle combined, those on the far borders as well, (slabs, rows, columns)."""
-    value = _pooled_across(value, combine)
-    value = jnp.pad(value, ((0, max(0, slabs * within + 1 - value.shape[0])), (0, 0), (0, 0)), mode="edge")
-    return functools.reduce(combine, (value[k : k + (slabs - 1) * within + 1 : within] for k in range(within + 1)))
-
-
-def _pooled_across(value: Array, combine: Combine) -> Array:
-    """The same of each layer."""
-    for axis in (2, 1):
-        number = value.shape[axis] - GAP
-        parts = (lax.slice_in_dim(value, k, k + number - ACROSS + 1, ACROSS, axis) for k in range(ACROSS + 1))
-        value = functools.reduce(combine, parts)
-    return value
+def _pooled(value: Float[Array, " nodes"], combine: Combine, down: int, across: int) -> Float[Array, "rows columns"]:
+    """Nodes of a layer combined over each bundle, those on the far borders as well."""
+    for stride in (1, across + GAP):
+        number = value.shape[0] - ACROSS * stride
+        value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(ACROSS + 1)))
+    return value[: down * (across + GAP)].reshape(down, -1)[::ACROSS, :across:ACROSS]
 
 
 def _by_bundle(value: Array) -> Array:
@@ -227,27 +237,25 @@ def _by_bundle(value: Array) -> Array:
     return jnp.transpose(value, (0, 1, 3, 2, 4)).reshape(slabs, -1)
 
 
-def _mean_square_slope(transfer: TransferFunction, low: Array, high: Array) -> list[Array]:
-    """Mean over `[low, high]` of the squared slope of red, green, blue and extinction; infinite with a jump inside."""
-    values = transfer.values
-    table = jnp.concatenate([transfer.colors, transfer.extinction[:, None]], 1).T
-    rise, run = table[:, 1:] - table[:, :-1], values[1:] - values[:-1]
-    jump = ((run <= 0) & (rise != 0).any(0)).astype(jnp.int32)
-    square = jnp.where(run > 0, rise / jnp.where(run > 0, run, 1), 0) ** 2
-    square = jnp.pad(square, ((0, 0), (1, 1)))  # constant before the first control point and past the last
-    width = jnp.pad(run, (1, 0))
-    area = jnp.cumsum(square[:, :-1] * width, 1)  # up to each control point
-    jumps = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jump)])
-    first = jnp.searchsorted(values, low, side="left", method="scan_unrolled").astype(jnp.int32)
-    past = jnp.searchsorted(values, high, side="right", method="scan_unrolled").astype(jnp.int32)
-    begin, end = jnp.minimum(first, values.shape[0] - 1), jnp.maximum(past - 1, 0)
-    within, extent = past > first, high - low
-    clean = ~within | (jumps[end] <= jumps[begin])
-    found = []
-    for channel in range(4):
-        slope, sums = square[channel], area[channel]
-        ends = slope[first] * (values[begin] - low) + slope[past] * (high - values[end])
-        mean = (sums[end] - sums[begin] + ends) / jnp.where(extent > 0, extent, 1)
-        mean = jnp.where(within & (extent > 0), jnp.maximum(mean, 0), slope[first])
-        found.append(jnp.where(clean, mean, jnp.inf))
-    return found
+def _squared_slopes(transfer: TransferFunction) -> Segments:
+    """Integrals from the first control point on of the squared slopes of red, green, blue and extinction; number of jumps."""
+    segments = transfer.segments()
+    run = jnp.append(transfer.values[1:] - transfer.values[:-1], 0)
+    change = jnp.where(run > 0, segments.change / jnp.where(run > 0, run, 1), 0) ** 2 * run
+    jumps = ((run <= 0) & (segments.change != 0).any(0)).astype(run.dtype)
+    added = jnp.append(change, jumps[None], 0)
+    return dataclasses.replace(segments, base=jnp.cumsum(added, 1) - added, change=added.at[-1].set(0))
+
+
+def _mean_square_slope(squares: Segments, low: Array, high: Array) -> list[Array]:
+    """Mean over `[low, high]` of the squared slope of red, green, blue and extinction; infinite with a jump inside.
+
+    With what the difference of two integrals may have lost to rounding.
+    """
+    least = NARROWEST * (squares.start[-1] - squares.start[0])
+    extent = jnp.maximum(high - low, jnp.where(least > 0, least, 1))
+    *upper, jumps = look_up(squares, low + extent)
+    *lower, before = look_up(squares, low)
+    lost = 4 * jnp.finfo(low.dtype).eps
+    means = [((b - a) + lost * b) / extent for a, b in zip(lower, upper, strict=True)]
+    return [jnp.where(jumps > before, jnp.inf, mean) for mean in means]

@@ -149,19 +149,20 @@ SELECT_ALL = 16  # up to this many control points a chain of selects vectorises,
 
 
 def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Array, "..."]]:
-    """`[red, green, blue, extinction]` of `quantity`, each of its shape.
+    """`[red, green, blue, extinction]` of `quantity`, each of its shape; or what else the tables' channels are.
 
     A segment is evaluated as base + part * change from its own beginning, so control points are met exactly (evenly spaced
     ones to a few eps of the whole range).
     """
     if segments.start.shape[0] <= SELECT_ALL:
+        channels = segments.base.shape[0]
         rows = [segments.start, segments.inverse, *segments.base, *segments.change]
         found = [row[0] for row in rows]
         for i in range(1, segments.start.shape[0]):
             past = quantity >= segments.start[i]
             found = [jnp.where(past, row[i], value) for row, value in zip(rows, found, strict=True)]
         part = jnp.clip((quantity - found[0]) * found[1], 0, 1)
-        return [base + part * change for base, change in zip(found[2:6], found[6:], strict=True)]
+        return [base + part * change for base, change in zip(found[2 : 2 + channels], found[2 + channels :], strict=True)]
     i, part = lax.cond(segments.even, _evenly, _scattered, segments, quantity)
     return [_at(base, i) + part * _at(change, i) for base, change in zip(segments.base, segments.change, strict=True)]
 
