@@ -44,8 +44,8 @@ def transmitted(thickness: Array) -> Array:
 
 
 def emitted(colors: list[Array], left_behind: Array) -> list[Array]:
-    """Red, green and blue of slabs of samples, as seen from right in front, and their transmittance."""
-    left, total = jnp.ones_like(left_behind[:, 0]), [jnp.zeros_like(left_behind[:, 0])] * 3
+    """Colours of slabs of samples, as seen from right in front, and their transmittance."""
+    left, total = jnp.ones_like(left_behind[:, 0]), [jnp.zeros_like(left_behind[:, 0])] * len(colors)
     for k in range(left_behind.shape[1]):
         behind = left_behind[:, k]
         total = [added + (left - behind) * color[:, k] for added, color in zip(total, colors, strict=True)]

@@ -17,7 +17,6 @@ $1 - D_{kr}$. Differences to the particle are taken before they are squared, so 
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +29,13 @@ from jaxsph.access.lattice import NODE_PIXELS, Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.stacks import stack
-from jaxsph.cast.composite import RAYS, Light, State, composite, emitted, fresh, transmitted, unlit
+from jaxsph.cast.composite import Light, State, composite, fresh, unlit
 from jaxsph.cast.nodes import interpolate
+from jaxsph.cast.shading import shade
 from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import Segments, TransferFunction, look_up
+from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
 
 BLOCK = 16  # particles unrolled in the inner loop
@@ -107,10 +107,7 @@ def cast_points(
         sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
         if lattice is not None:
             sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
-        shade = functools.partial(_shade, perspective=camera.is_perspective)
-        *colors, thickness = computed_once(slab[0] >= 0, shade, sums, (u, v, border), segments, item)
-        left = computed_once(slab[0] >= 0, transmitted, thickness)
-        return *computed_once(slab[0] >= 0, emitted, colors, left), thickness
+        return shade(sums, (u, v, border), segments, item, camera.is_perspective)
 
     def march_batch(batch: Array, state: tuple[State, Light]) -> tuple[State, Light]:
         rays, light = state
@@ -236,32 +233,6 @@ def gather_field(
     zero = jnp.zeros((*su.shape[:2], BUNDLE, BUNDLE), su.dtype)
     blocks = (total.max() + BLOCK - 1) // BLOCK
     return lax.fori_loop(0, blocks, add_block, lax.complex(zero, zero))
-
-
-def _shade(
-    sums: Array,
-    geometry: tuple[Array, Array, Array],
-    segments: Segments,
-    item: Worklist,
-    *,
-    perspective: bool,
-) -> list[Array]:
-    """Red, green, blue and optical thickness of every sample: first paper, equation 2 and section 2.2."""
-    u, v, border = geometry
-    sums = sums.reshape(*sums.shape[:2], RAYS)
-    weight, weighted = sums.real, sums.imag
-    inside = weight > 0
-    quantity = item.origin[:, None, None] + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
-    optics = look_up(segments, quantity)
-    if item.paint is not None and item.painted is not None:
-        painted = item.painted[:, None, None]
-        inside |= painted
-        optics = [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(item.paint, optics, strict=True)]
-    *channels, extinction = optics
-    step = (border[:, 1:] - border[:, :-1])[:, :, None]
-    if perspective:
-        step = step * jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, RAYS)
-    return [*channels, jnp.where(inside, extinction * step, 0)]
 
 
 jax.tree_util.register_dataclass(Rays, data_fields=["color", "transmittance", "depth", "evaluations"], meta_fields=[])

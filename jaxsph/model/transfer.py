@@ -154,17 +154,34 @@ def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Arr
     A segment is evaluated as base + part * change from its own beginning, so control points are met exactly (evenly spaced
     ones to a few eps of the whole range).
     """
+    return read(segments, find(segments, quantity))
+
+
+def find(segments: Segments, quantity: Float[Array, "..."]) -> tuple[Array, ...]:
+    """Where `quantity` lies in the tables, for `read`: found once, read for one channel or another.
+
+    Segment and place within it; or just the quantity, if control points are so few that comparing it again costs nothing.
+    """
     if segments.start.shape[0] <= SELECT_ALL:
-        channels = segments.base.shape[0]
-        rows = [segments.start, segments.inverse, *segments.base, *segments.change]
-        found = [row[0] for row in rows]
-        for i in range(1, segments.start.shape[0]):
-            past = quantity >= segments.start[i]
-            found = [jnp.where(past, row[i], value) for row, value in zip(rows, found, strict=True)]
-        part = jnp.clip((quantity - found[0]) * found[1], 0, 1)
-        return [base + part * change for base, change in zip(found[2 : 2 + channels], found[2 + channels :], strict=True)]
-    i, part = lax.cond(segments.even, _evenly, _scattered, segments, quantity)
-    return [_at(base, i) + part * _at(change, i) for base, change in zip(segments.base, segments.change, strict=True)]
+        return (quantity,)
+    return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+
+
+def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(None)) -> list[Float[Array, "..."]]:
+    """Some of the channels at a `place` that was found."""
+    bases, changes = (list(table)[channels] for table in (segments.base, segments.change))
+    if len(place) == 2:
+        i, part = place
+        return [_at(base, i) + part * _at(change, i) for base, change in zip(bases, changes, strict=True)]
+    (quantity,) = place
+    rows = [segments.start, segments.inverse, *bases, *changes]
+    found = [row[0] for row in rows]
+    for k in range(1, segments.start.shape[0]):
+        past = quantity >= segments.start[k]
+        found = [jnp.where(past, row[k], value) for row, value in zip(rows, found, strict=True)]
+    part = jnp.clip((quantity - found[0]) * found[1], 0, 1)
+    here = found[2:]
+    return [base + part * change for base, change in zip(here[: len(bases)], here[len(bases) :], strict=True)]
 
 
 def _at(row: Array, i: Array) -> Array:
