@@ -22,8 +22,9 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
+from jaxsph.cast.adjoint import cast
 from jaxsph.cast.nodes import sum_at_nodes
-from jaxsph.cast.points import Rays, cast_points, evaluations
+from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import adapt
 from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
 from jaxsph.control.worklist import Worklist, full_rate, origins
@@ -195,14 +196,17 @@ def _grid(
 ) -> tuple[BundleLists, Cells, Array, Array, Array]:
     """What a `Grid` holds besides the particles, which are the same for all bands."""
     half_steps = _half_steps(camera, ordered.x, plan)
-    lists = build_lists(ordered, camera, half_steps[1::2], plan.lists, first_row)
-    return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
+    fixed, depths = jax.tree.map(lax.stop_gradient, ((ordered, camera), half_steps[1::2]))
+    lists = build_lists(*fixed, depths, plan.lists, first_row)
+    return lists, find_cells(fixed[0], lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
 def _adapt(
     grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
 ) -> _Decided:
+    """How each cell is sampled. Decisions carry no gradient."""
+    grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)
@@ -231,7 +235,7 @@ def _cast(
     kernel: str,
 ) -> Rays:
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    return cast_points(grid, work, camera, transfer, kernel, plan.cast, lattice)
+    return cast(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:

@@ -144,6 +144,18 @@ def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Arr
     return [_at(base, i) + part * _at(change, i) for base, change in zip(segments.base, segments.change, strict=True)]
 
 
+def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Array, "*any"], Float[Array, "*any"]]:
+    """Segment that holds `quantity`, and the share of it that lies before: what `look_up` interpolates by."""
+    if segments.start.shape[0] > SELECT_ALL:
+        return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+    segment, start, inverse = jnp.zeros(quantity.shape, jnp.int32), segments.start[0], segments.inverse[0]
+    for i in range(1, segments.start.shape[0]):
+        past = quantity >= segments.start[i]
+        segment = jnp.where(past, i, segment)
+        start, inverse = (jnp.where(past, row[i], value) for row, value in ((segments.start, start), (segments.inverse, inverse)))
+    return segment, jnp.clip((quantity - start) * inverse, 0, 1)
+
+
 def _at(row: Array, i: Array) -> Array:
     """`row[i]` for indices known to be in range: a clamped gather is a third slower."""
     return row.at[i].get(mode="promise_in_bounds")
@@ -176,12 +188,24 @@ def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     return i, jnp.clip((quantity - _at(segments.start, i)) * _at(segments.inverse, i), 0, 1)
 
 
+@jax.custom_jvp
 def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     """The same for control points that are evenly spaced but for rounding: no tables, no search."""
     last = segments.start.shape[0] - 1
     place = jnp.clip((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
     i = jnp.clip(place.astype(jnp.int32), 0, last)
     return i, place - i.astype(place.dtype)
+
+
+@_evenly.defjvp
+def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) -> tuple[Any, Any]:
+    """Control points that move one by one are evenly spaced no more, so the place within a segment changes as in any other."""
+    (segments, quantity), (segments_dot, quantity_dot) = primals, tangents
+    i, part = _evenly(segments, quantity)
+    start, inverse = _at(segments.start, i), _at(segments.inverse, i)
+    change = (quantity_dot - _at(segments_dot.start, i)) * inverse + (quantity - start) * _at(segments_dot.inverse, i)
+    inside = (quantity >= segments.start[0]) & (quantity < segments.start[-1])
+    return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
 
 
 jax.tree_util.register_dataclass(Segments, data_fields=[f.name for f in dataclasses.fields(Segments)], meta_fields=[])
