@@ -25,14 +25,14 @@ from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
-from jaxsph.access.stacks import Stacks, stack
+from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import RAYS, emitted, unlit
 from jaxsph.cast.moments import COLUMNS, WIDTH, owe_particles
 from jaxsph.cast.points import CastPlan, Rays, _fullest_first, _sample_depths, _shade, cast_points, gather_field
 from jaxsph.cast.worth import Seen, owe_transfer, pathwise, unseen, value_samples, value_slabs
 from jaxsph.control.worklist import Worklist
 from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import Segments, TransferFunction
+from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
 
 Light = tuple[Array, Array]  # colour and transmittance of an image, or what is to be said of them

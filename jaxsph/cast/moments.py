@@ -2,18 +2,17 @@ r"""What particles owe to the samples around them: the transpose of `points.gath
 
 Flow: image cotangents -> adjoint -> [moments] -> cotangents of particles.
 
-A particle's weights at the samples of a slab depend on it by the squared distance $d^2 = a_c + b_r$ and by its size alone. With
-$\bar w$ what a weight is worth to the image and $g = \bar w \, \partial w / \partial d^2$, all that it is owed is in six sums over
-the slab's samples: of $g$, $g \Delta x$, $g \Delta y$, $g d^2$, $\bar w w$ and $\bar W_q w$. XLA evaluates every weight anew
-for each array that it makes, but a reduction of several operands is one loop; it runs over two halves of the rows, and the
-rest of the sum is written out. Shapes, once: slabs come last, so that those side by side in memory are summed side by side.
+A particle's weights at the samples of a slab depend on it by the squared distance $d^2$ and by its size alone. With $\bar w$ what
+a weight is worth to the image and $g = \bar w \, \partial w / \partial d^2$, all that it is owed is in six sums over the samples
+of the slab: of $g$, $g \Delta x$, $g \Delta y$, $g d^2$, $\bar w w$ and $\bar w_q w$. XLA evaluates every weight anew for each
+array that it makes, but a reduction of several operands is one loop. The loop is over two halves, which the compiler writes
+out, and the rest of the sum is written out here. Shapes, once: slabs come last, so that they are summed side by side.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,6 @@ from jaxsph.model import kernels
 from jaxsph.numerics.staging import computed_once
 
 BLOCK = 16  # particles at once
-HALVES = 2  # of the rows: a loop so short is written out by the compiler, and samples of other slabs then side by side
 COLUMNS = ("x", "y", "z", "scale", "size", "quantity")  # of particles, that samples depend on
 WIDTH = 8  # of a row of cotangents, two of them unused: it fills a vector, and is added as one
 
@@ -97,31 +95,41 @@ def _moments(
     particles: list[Array], sides: tuple[Array, ...], worth: list[Array], *, smooth: kernels.Kernel
 ) -> tuple[Array, ...]:
     """Sums over the rays of a bundle, (particles, samples, chunk), of what the head of this file lists."""
-    x, y, z, scale, size, quantity = particles
+    x, y, z, scale, size, quantity = (column[:, :, None] for column in particles)
     su, sv, s = sides
-    x_off, y_off = su - x[:, :, None], sv - y[:, :, None]
-    across = (x_off * scale[:, :, None]) ** 2
-    along = ((s - z) * scale)[:, :, None] ** 2 + (y_off * scale[:, :, None]) ** 2
-    prepared = smooth.prepare(along, size[:, :, None])
+    x_off, y_off = su - x, sv - y
+    across, along = (x_off * scale) ** 2, ((s[:, None] - z) * scale) ** 2 + (y_off * scale) ** 2
+    always = size[0, 0, 0, 0] >= 0
+    operands = x_off, across, along, size, quantity, worth
+    in_rows = computed_once(always, functools.partial(_along_columns, smooth=smooth), *operands)
+    return computed_once(always, _along_rows, in_rows, y_off)
 
-    def of_rows(rows: range) -> list[Any]:
-        sums: list[Any] = [0.0] * 6
-        for r in rows:
-            in_row: Any = 0.0
-            for c in range(BUNDLE):
-                rest = across[:, :, c]
-                weight = smooth.weigh(prepared[:, :, r], rest, size, jnp)
-                value = worth[0][:, r, c] + quantity * worth[1][:, r, c]
-                slope = value * smooth.slope(prepared[:, :, r], rest, size, jnp)
-                in_row = in_row + slope
-                parts = (0, slope * x_off[:, :, c], 0, slope * (along[:, :, r] + rest), value * weight, weight * worth[1][:, r, c])
-                sums = [total + part for total, part in zip(sums, parts, strict=True)]
-            sums[0], sums[2] = sums[0] + in_row, sums[2] + in_row * y_off[:, :, r]
-        return sums
 
-    each = BUNDLE // HALVES
-    halves = zip(*(of_rows(range(half * each, (half + 1) * each)) for half in range(HALVES)), strict=True)
-    operands = tuple(jnp.stack(pair) for pair in halves)
+def _along_columns(
+    x_off: Array, across: Array, along: Array, size: Array, quantity: Array, worth: list[Array], *, smooth: kernels.Kernel
+) -> tuple[Array, ...]:
+    """Of each row of rays, the sums of g, g dx, g d^2, and of what weights are worth in all and through the quantity."""
+    prepared = smooth.prepare(along, size)
+
+    def part(c: int) -> list[Array]:
+        rest, of_weight, of_weighted = across[:, :, c, None], worth[0][:, :, c], worth[1][:, :, c]
+        weight, value = smooth.weigh(prepared, rest, size, jnp), of_weight + quantity * of_weighted
+        slope = value * smooth.slope(prepared, rest, size, jnp)
+        return [slope, slope * x_off[:, :, c, None], slope * (along + rest), value * weight, weight * of_weighted]
+
+    return _in_halves([part(c) for c in range(BUNDLE)])
+
+
+def _along_rows(in_rows: tuple[Array, ...], y_off: Array) -> tuple[Array, ...]:
+    """Sums over the rows of what those over the columns are, and of g dy."""
+    sums = [*in_rows, in_rows[0] * y_off]
+    return _in_halves([[value[:, :, r] for value in sums] for r in range(BUNDLE)])
+
+
+def _in_halves(parts: list[list[Array]]) -> tuple[Array, ...]:
+    """Element-wise sums of lists, in one loop: within the halves of `parts` written out, over the halves by a reduction."""
+    halves = [[functools.reduce(jnp.add, terms) for terms in zip(*half, strict=True)] for half in (parts[::2], parts[1::2])]
+    operands = tuple(jnp.stack(pair) for pair in zip(*halves, strict=True))
     start = tuple(jnp.zeros((), value.dtype) for value in operands)
     return tuple(lax.reduce(operands, start, lambda a, b: tuple(p + q for p, q in zip(a, b, strict=True)), (0,)))
 
@@ -132,7 +140,7 @@ def _settle(particles: list[Array], s: Array, moments: tuple[Array, ...], *, deg
     The kernel is homogeneous of degree n in distance and size, so its derivative by size follows from the other (Euler).
     """
     x, y, z, scale, size, _ = particles
-    slope, slope_x, slope_y, slope_square, of_weight, of_quantity = moments
+    slope, slope_x, slope_square, of_weight, of_quantity, slope_y = moments
     depth, twice = s - z, 2 * scale * scale
     in_x, in_y, in_z = (twice * value for value in (slope_x, slope_y, slope * depth))
     solid = size > 0

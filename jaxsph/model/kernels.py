@@ -59,26 +59,26 @@ def _poly6_slope(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
     return -3 * (t * t)
 
 
-def _cubic_spline(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _cubic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
     outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
     return 2 * outer * outer * outer - 8 * inner * inner * inner
 
 
-def _cubic_spline_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _cubic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
     outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
     return (12 * inner * inner - 3 * outer * outer) / r
 
 
-def _wendland_c2(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _wendland(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
     outer = xp.maximum(size - r, 0)
     square = outer * outer
     return square * square * (size + 4 * r)
 
 
-def _wendland_c2_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _wendland_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     outer = xp.maximum(size - xp.sqrt(part + rest), 0)
     return -10 * (outer * outer * outer)
 
@@ -95,8 +95,24 @@ KERNELS = {
     kernel.name: kernel
     for kernel in (
         Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
-        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic_spline, _cubic_spline_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
-        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland_c2, _wendland_c2_slope, "Dehnen & Aly 2012, MNRAS 425, table 1"),
+        Kernel(
+            "cubic_spline",
+            8 / math.pi,
+            3,
+            _under_root,
+            _cubic_spline,
+            _cubic_spline_slope,
+            "Monaghan & Lattanzio 1985, with H = 2h",
+        ),
+        Kernel(
+            "wendland_c2",
+            21 / (2 * math.pi),
+            5,
+            _under_root,
+            _wendland_c2,
+            _wendland_c2_slope,
+            "Dehnen & Aly 2012, MNRAS 425, table 1",
+        ),
     )
 }
 
