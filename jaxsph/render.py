@@ -196,9 +196,9 @@ def _grid(
 ) -> tuple[BundleLists, Cells, Array, Array, Array]:
     """What a `Grid` holds besides the particles, which are the same for all bands."""
     half_steps = _half_steps(camera, ordered.x, plan)
-    fixed, depths = jax.tree.map(lax.stop_gradient, ((ordered, camera), half_steps[1::2]))
-    lists = build_lists(*fixed, depths, plan.lists, first_row)
-    return lists, find_cells(fixed[0], lists), *bundle_origins(plan.lists, first_row), half_steps
+    ordered, camera, depths = jax.tree.map(lax.stop_gradient, (ordered, camera, half_steps[1::2]))
+    lists = build_lists(ordered, camera, depths, plan.lists, first_row)
+    return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
@@ -206,7 +206,8 @@ def _adapt(
     grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
 ) -> _Decided:
     """How each cell is sampled. Decisions carry no gradient."""
-    grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
+    limits = None if limits is None else (lax.stop_gradient(limits[0]), lax.stop_gradient(limits[1]))
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)

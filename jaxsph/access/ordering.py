@@ -64,6 +64,9 @@ def order_particles(
     """Rank `particles` for the sample `depths` (ascending), in slabs of `slab_samples`.
 
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, which `KEY_MARGIN` covers.
+
+    Differentiation:
+        The columns x, y, z, scale, size and quantity have derivatives; ranks, windows, `reach` and `live` are held fixed.
     """
     look = functools.partial(_view, num_classes=num_classes)
     columns, key, widest, bad = computed_once(camera.near < camera.far, look, particles, camera, depths)
@@ -102,7 +105,7 @@ def _view(
     usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
     usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
     eps = jnp.finfo(view.dtype).eps * ROUNDING
-    reach = particles.support * (1 + eps) + eps * jnp.abs(particles.position - camera.eye).max(1)
+    reach = lax.stop_gradient(particles.support * (1 + eps) + eps * jnp.abs(particles.position - camera.eye).max(1))
     live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
 
     largest = jnp.where(live, reach, 0).max(initial=0)
@@ -137,13 +140,16 @@ def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
 
 
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array]:
-    """`scale` and `size` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1."""
+    """`scale` and `size` of every particle; CSPH only knows ratios of strengths, so the largest becomes 1.
+
+    What all strengths are divided by changes nothing, and carries no gradient; nor does a strength of 0.
+    """
     support = jnp.where(live, particles.support, 1)
     inverse = 1 / support
-    smallest = jnp.where(live, particles.support, jnp.inf).min(initial=jnp.inf)
+    smallest = lax.stop_gradient(jnp.where(live, particles.support, jnp.inf).min(initial=jnp.inf))
     relative = jnp.where(jnp.isfinite(smallest), smallest, 1) * inverse
     strength = jnp.where(live, particles.volume, 0) * relative * relative * relative
-    peak = strength.max(initial=0)
+    peak = lax.stop_gradient(strength.max(initial=0))
     strength = strength / jnp.where(peak > 0, peak, 1)
     degree = kernels.by_name(particles.kernel).degree
     size = jnp.where(strength > 0, jnp.where(strength > 0, strength, 1) ** (1 / degree), 0)

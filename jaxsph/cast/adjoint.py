@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +56,13 @@ class Held:
     work: Worklist
     camera: Camera
     lattice: Lattice | None
+
+
+class Wanted(NamedTuple):
+    """Which cotangents are asked for: by where samples and particles are and what those carry, and by the transfer function."""
+
+    field: bool
+    transfer: bool
 
 
 def cast(
@@ -111,17 +118,19 @@ def _moved(kernel: str, plan: CastPlan, primals: tuple[Values, Held], tangents: 
     if not moving:
         return found, still
     _require_values(held)
+    wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
 
     def push(moves: list[Array]) -> Light:
         def light(parts: list[Array]) -> Light:
             there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
-            rays = _march(kernel, plan, structure.unflatten(there), held)
+            rays = _march(kernel, plan, jax.tree.unflatten(structure, there), held)
             return rays.color, rays.transmittance
 
         return jax.jvp(light, ([leaves[i] for i in moving],), (moves,))[1]
 
     def pull(worth: Light) -> list[Array]:
-        owed = jax.tree.leaves(_pull(kernel, plan, values, held, (found.color, found.transmittance), worth))
+        image = found.color, found.transmittance
+        owed = jax.tree.leaves(_pull(kernel, plan, wanted, values, held, image, worth))
         return [owed[i] for i in moving]
 
     color, transmittance = _linear(push, pull, [moves[i] for i in moving], (found.color, found.transmittance), leaves)
@@ -133,6 +142,10 @@ _cast.defjvp(_moved, symbolic_zeros=True)
 
 def _is_zero(move: Any) -> bool:
     return isinstance(move, SymbolicZero)
+
+
+def _moves(part: Any) -> bool:
+    return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
 
 
 def _require_values(held: Held) -> None:
@@ -185,8 +198,9 @@ def _twice(primals: Any, tangents: Any) -> Any:
     )
 
 
-def _pull(kernel: str, plan: CastPlan, values: Values, held: Held, image: Light, worth: Light) -> Values:
-    """Cotangents of `values`, from those of the image's colour and transmittance."""
+def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Held, image: Light, worth: Light) -> Values:
+    """Cotangents of `values`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
+    plan = dataclasses.replace(plan, held=max(plan.held // (2 * plan.chunk), 1) * plan.chunk)  # as twice as much is held of each
     grid, camera = _of(values, held)
     work, perspective = held.work, camera.is_perspective
     slabs, num_bundles = work.count.shape
@@ -195,8 +209,7 @@ def _pull(kernel: str, plan: CastPlan, values: Values, held: Held, image: Light,
     half_steps, pull_half_steps = jax.vjp(lambda depths: jnp.pad(depths, beyond, mode="edge"), grid.half_steps)
     stacks = stack(work.filled)
     order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
-    segments, pull_segments = jax.vjp(lambda transfer: transfer.segments(), values.transfer)
-    del pull_segments
+    segments = values.transfer.segments()
     padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
     points = segments.start.shape[0]
 
@@ -228,7 +241,10 @@ def _pull(kernel: str, plan: CastPlan, values: Values, held: Held, image: Light,
         slant = jnp.sqrt(1 + square) if perspective else jnp.ones_like(square)
         path = pathwise(border, slant)
         samples = computed_once(slab[0] >= 0, value_samples, sums, path, segments, item, worth)
-        control = control + owe_transfer(samples, segments)
+        if wanted.transfer:
+            control = control + owe_transfer(samples, segments)
+        if not wanted.field:
+            return table, opening, depths, control
         worths = samples.weight, samples.weighted
         paid = owe_particles(table, grid.ordered, grid.lists.rank, item, (u, v, s), worths, perspective, kernel)
         of_step = (samples.path * slant[:, None]).sum(2)
@@ -278,8 +294,8 @@ def _pull(kernel: str, plan: CastPlan, values: Values, held: Held, image: Light,
     columns = {name: table[:, i] for i, name in enumerate(COLUMNS)}
     transfer = TransferFunction(control[4], control[:3].T, control[3])
     half_height = opening / camera.half_height.astype(dtype)
-    owed = Values(columns, pull_half_steps(depths)[0], half_height, transfer)
-    return jax.tree.map(lambda value, like: value.astype(like.dtype), owed, values)
+    total = Values(columns, pull_half_steps(depths)[0], half_height, transfer)
+    return jax.tree.map(lambda value, like: value.astype(like.dtype), total, values)
 
 
 for _kind in (Values, Held):

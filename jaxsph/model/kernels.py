@@ -95,24 +95,8 @@ KERNELS = {
     kernel.name: kernel
     for kernel in (
         Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
-        Kernel(
-            "cubic_spline",
-            8 / math.pi,
-            3,
-            _under_root,
-            _cubic_spline,
-            _cubic_spline_slope,
-            "Monaghan & Lattanzio 1985, with H = 2h",
-        ),
-        Kernel(
-            "wendland_c2",
-            21 / (2 * math.pi),
-            5,
-            _under_root,
-            _wendland_c2,
-            _wendland_c2_slope,
-            "Dehnen & Aly 2012, MNRAS 425, table 1",
-        ),
+        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic, _cubic_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
+        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland, _wendland_slope, "Dehnen & Aly 2012, table 1"),
     )
 }
 
