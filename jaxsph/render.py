@@ -69,6 +69,13 @@ def render(
     Returns:
         Image with dtype of the particles.
 
+    Differentiation:
+        `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
+        camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
+        grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
+        memory does not grow with samples or particles in a cell. Images with super-pixels or of the pilot estimator have no
+        derivatives and raise `NotImplementedError`, as do second derivatives.
+
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace.
         CapacityError: eager, when a given `plan` is too small for this frame.
