@@ -22,7 +22,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
 from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
-from jaxsph.cast.adjoint import cast
+from jaxsph.cast.adjoint import KEPT, cast
 from jaxsph.cast.nodes import sum_at_nodes
 from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import adapt
@@ -143,7 +143,11 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
-    results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
+    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
+        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
+        results = lax.map(jax.checkpoint(one_band, prevent_cse=False, policy=kept), bands)
+    else:
+        results = jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
     word |= _input_faults(scene, camera) | ordered.faults

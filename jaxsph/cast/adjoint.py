@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
@@ -35,6 +36,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
 
+KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
 Light = tuple[Array, Array]  # colour and transmittance of an image, or what is to be said of them
 
 
@@ -111,6 +113,8 @@ def _moved(kernel: str, plan: CastPlan, primals: tuple[Values, Held], tangents: 
     """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
     values, held = primals
     found = _cast(kernel, plan, values, held)
+    color, transmittance = (checkpoint_name(layer, KEPT) for layer in (found.color, found.transmittance))
+    found = dataclasses.replace(found, color=color, transmittance=transmittance)
     still = jax.tree.map(jnp.zeros_like, found)
     leaves, structure = jax.tree.flatten(values)
     moves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
