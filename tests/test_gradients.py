@@ -19,7 +19,7 @@ CLOSE = 1e-6  # of the sum of a slope's terms, and of one: the rounding of some 
 AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers, some thousands of them, in another order
 QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
 ADAPTIVE = {"super_pixels": False}
-STEEPEST = 10.0  # relative change of a gradient a unit of tolerance, in this file's even scene
+STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this file's even scene
 
 
 def total(inputs, worth, settings, plan):
@@ -217,7 +217,8 @@ def test_gradients_are_finite_with(frames, special, dtype):
         scene, camera = frames.scene(rng, dtype=dtype), frames.camera(rng, dtype=dtype)
         inputs = SPECIAL[special](scene, camera, frames), camera
         worth = weights(rng, frames).astype(dtype)
-        owed = valued(inputs, worth, frames.settings, frames.plan())[1]
+        plan = frames.plan()
+        owed = (pulled if dtype is np.float64 else lambda *given: valued(*given)[1])(inputs, worth, frames.settings, plan)
         for part in jax.tree.leaves(owed):
             assert part.dtype == jax.dtypes.float0 or (part.dtype == dtype and np.isfinite(part).all())
         if special == "empty space":
@@ -231,7 +232,8 @@ def test_single_precision_gives_the_same_gradients_but_for_rounding(frames):
             rng = np.random.default_rng(1)
             scene, camera = filled(frames, rng, dtype)
             worth = weights(rng, frames).astype(dtype)
-            owed[dtype] = jax.tree.map(np.asarray, valued((scene, camera), worth, frames.settings, frames.plan())[1])
+            given = (scene, camera), worth, frames.settings, frames.plan()
+            owed[dtype] = jax.tree.map(np.asarray, pulled(*given) if dtype is np.float64 else valued(*given)[1])
     for exact, rounded in zip(*(jax.tree.leaves(found) for found in owed.values()), strict=True):
         if exact.dtype != jax.dtypes.float0:
             np.testing.assert_allclose(rounded, exact, atol=1e-3 * max(np.abs(exact).max(), 1))
@@ -312,7 +314,6 @@ def test_tightening_the_tolerance_moves_gradients_no_more_than_so_much(frames, x
         found[tolerance] = valued(inputs, worth, asked, plan)[1][0].particles.quantity
     exact = found[0.0]
     off = {tolerance: float(np.linalg.norm(slope - exact) / np.linalg.norm(exact)) for tolerance, slope in found.items()}
-    print(off)
     assert all(off[tolerance] <= STEEPEST * tolerance for tolerance in found)
 
 
