@@ -34,8 +34,8 @@ from jaxsph.model import kernels
 
 MOST_BACKWARD = 4.0  # frames
 MOST_MEMORY = 2.0  # times a frame's
-SMALL = {"particles": 400, "width": 48, "height": 48}
-SAMPLES = (64, 128, 256)
+SMALL = {"particles": 150, "width": 24, "height": 24}
+SAMPLES = (32, 64, 128)
 MOST_GROWTH = 1.25  # of our memory, from the fewest to the most samples: lists of slabs are longer, sums are not
 AGREE = 2e-3  # of the largest entry, in float32
 RESULTS = peers.RESULTS.with_name("gradients.json")
