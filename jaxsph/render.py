@@ -24,8 +24,9 @@ from jaxsph.access.lists import BUNDLE, BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
+from jaxsph.cast.adjoint import KEPT, cast
 from jaxsph.cast.nodes import sum_at_nodes
-from jaxsph.cast.points import Rays, cast_points, evaluations
+from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import adapt
 from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
 from jaxsph.control.worklist import Worklist, full_rate, origins
@@ -68,6 +69,13 @@ def render(
 
     Returns:
         Image with dtype of the particles.
+
+    Differentiation:
+        `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
+        camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
+        grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
+        memory does not grow with samples or particles in a cell. Images with super-pixels or of the pilot estimator have no
+        derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace.
@@ -136,7 +144,11 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
-    results = lax.map(one_band, bands) if plan.bands > 1 else jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
+    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
+        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
+        results = lax.map(jax.checkpoint(one_band, prevent_cse=False, policy=kept), bands)
+    else:
+        results = jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)])
     word |= _input_faults(scene, camera, plan.samples) | ordered.faults
@@ -204,7 +216,8 @@ def _grid(
 ) -> tuple[BundleLists, Cells, Array, Array, Array]:
     """What a `Grid` holds besides the particles, which are the same for all bands."""
     half_steps = _half_steps(camera, ordered.x, plan)
-    lists = build_lists(ordered, camera, half_steps[1::2], plan.lists, first_row)
+    ordered, camera, depths = jax.tree.map(lax.stop_gradient, (ordered, camera, half_steps[1::2]))
+    lists = build_lists(ordered, camera, depths, plan.lists, first_row)
     return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
@@ -212,6 +225,9 @@ def _grid(
 def _adapt(
     grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
 ) -> _Decided:
+    """How each cell is sampled. Decisions carry no gradient."""
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
+    limits = None if limits is None else (lax.stop_gradient(limits[0]), lax.stop_gradient(limits[1]))
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     # an origin far beyond what is shown would cost the digits of what is
     origin = jnp.clip(origin, transfer.values[0], transfer.values[-1])
@@ -240,7 +256,7 @@ def _cast(
     plan: Plan,
     kernel: str,
 ) -> Rays:
-    return cast_points(grid, work, camera, transfer, kernel, plan.cast, lattice)
+    return cast(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:

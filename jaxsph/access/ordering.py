@@ -65,6 +65,9 @@ def order_particles(
     """Rank `particles` for the sample `depths` (ascending), in slabs of `slab_samples`.
 
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, which `KEY_MARGIN` covers.
+
+    Differentiation:
+        The columns x, y, z, scale, size and quantity have derivatives; ranks, windows, `reach` and `live` are held fixed.
     """
     look = functools.partial(_view, num_classes=num_classes)
     columns, key, widest, bad = computed_once(camera.near < camera.far, look, particles, camera, depths)
@@ -105,7 +108,7 @@ def _view(
     usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
     eps = jnp.finfo(view.dtype).eps * ROUNDING
     distance = jnp.abs(offset).max(1)
-    reach = particles.support * (1 + eps) + eps * distance
+    reach = lax.stop_gradient(particles.support * (1 + eps) + eps * distance)
     live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
 
     largest = jnp.where(live, reach, 0).max(initial=0)
@@ -144,7 +147,8 @@ def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
     """`scale` and `size` of every particle, and which are so weak that they would vanish.
 
-    CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32.
+    CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32. What
+    all of them are divided by changes nothing, and carries no gradient; nor does a strength of 0.
     """
     support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
     (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
@@ -152,7 +156,7 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     counts = live & (large > 0)
     exponent -= jnp.where(counts, exponent, jnp.iinfo(jnp.int32).min).max(initial=jnp.iinfo(jnp.int32).min // 2)
     strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
-    peak = strength.max(initial=0)
+    peak = lax.stop_gradient(strength.max(initial=0))
     strength = strength / jnp.where(peak > 0, peak, 1)
     kernel = kernels.by_name(particles.kernel)
     lift = 2.0 ** (LIFT // kernel.degree)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 SMALLEST_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
+NOTHING = 1e-37  # the same for particles of no size, which pad blocks: the least that float32 holds in full
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Kernel:
         prepare: `prepare(part, size)`: what the inner loop needs of the first part of $(c q)^2$ and of c.
         weigh: `weigh(prepared, rest, size, xp)`: $w(c q, c)$ for $(c q)^2$ = part + rest, and 0 outside the support; `xp` is
             `numpy` or `jax.numpy`.
+        slope: `slope(prepared, rest, size, xp)`: its derivative by the square $(c q)^2$; finite, and 0 outside the support.
         source: where the formula is from.
     """
 
@@ -39,6 +41,7 @@ class Kernel:
     degree: int
     prepare: Callable[[Any, Any], Any]
     weigh: Callable[[Any, Any, Any, Any], Any]
+    slope: Callable[[Any, Any, Any, Any], Any]
     source: str
 
     def of_square(self, square: Any, xp: Any) -> Any:
@@ -51,17 +54,33 @@ def _poly6(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
     return t * t * t
 
 
-def _cubic_spline(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _poly6_slope(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
+    t = xp.maximum(margin - rest, 0)
+    return -3 * (t * t)
+
+
+def _cubic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
     outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
     return 2 * outer * outer * outer - 8 * inner * inner * inner
 
 
-def _wendland_c2(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+def _cubic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
+    return (12 * inner * inner - 3 * outer * outer) / r
+
+
+def _wendland(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
     outer = xp.maximum(size - r, 0)
     square = outer * outer
     return square * square * (size + 4 * r)
+
+
+def _wendland_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    outer = xp.maximum(size - xp.sqrt(part + rest), 0)
+    return -10 * (outer * outer * outer)
 
 
 def _margin(part: Any, size: Any) -> Any:
@@ -69,15 +88,15 @@ def _margin(part: Any, size: Any) -> Any:
 
 
 def _under_root(part: Any, size: Any) -> Any:
-    return part + SMALLEST_SQUARE * (size * size)
+    return part + (SMALLEST_SQUARE * (size * size) + NOTHING)
 
 
 KERNELS = {
     kernel.name: kernel
     for kernel in (
-        Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, "Mueller, Charypar & Gross 2003, equation 20"),
-        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic_spline, "Monaghan & Lattanzio 1985, with H = 2h"),
-        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland_c2, "Dehnen & Aly 2012, MNRAS 425, table 1"),
+        Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
+        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic, _cubic_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
+        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland, _wendland_slope, "Dehnen & Aly 2012, table 1"),
     )
 }
 

@@ -162,9 +162,7 @@ def find(segments: Segments, quantity: Float[Array, "..."]) -> tuple[Array, ...]
 
     Segment and place within it; or just the quantity, if control points are so few that comparing it again costs nothing.
     """
-    if segments.start.shape[0] <= SELECT_ALL:
-        return (quantity,)
-    return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+    return (quantity,) if segments.start.shape[0] <= SELECT_ALL else locate(segments, quantity)
 
 
 def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(None)) -> list[Float[Array, "..."]]:
@@ -173,15 +171,28 @@ def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(N
     if len(place) == 2:
         i, part = place
         return [_at(base, i) + part * _at(change, i) for base, change in zip(bases, changes, strict=True)]
-    (quantity,) = place
     rows = [segments.start, segments.inverse, *bases, *changes]
+    start, inverse, *found = _selected(rows, segments.start, place[0])
+    part = jnp.clip((place[0] - start) * inverse, 0, 1)
+    return [base + part * change for base, change in zip(found[: len(bases)], found[len(bases) :], strict=True)]
+
+
+def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Array, "*any"], Float[Array, "*any"]]:
+    """Segment that holds `quantity`, and the share of it that lies before: what `look_up` interpolates by."""
+    if segments.start.shape[0] > SELECT_ALL:
+        return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+    each = jnp.arange(segments.start.shape[0], dtype=jnp.int32)
+    segment, start, inverse = _selected([each, segments.start, segments.inverse], segments.start, quantity)
+    return segment, jnp.clip((quantity - start) * inverse, 0, 1)
+
+
+def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
+    """Of each of `rows`, the entry of the segment that holds `quantity`."""
     found = [row[0] for row in rows]
-    for k in range(1, segments.start.shape[0]):
-        past = quantity >= segments.start[k]
+    for k in range(1, start.shape[0]):
+        past = quantity >= start[k]
         found = [jnp.where(past, row[k], value) for row, value in zip(rows, found, strict=True)]
-    part = jnp.clip((quantity - found[0]) * found[1], 0, 1)
-    here = found[2:]
-    return [base + part * change for base, change in zip(here[: len(bases)], here[len(bases) :], strict=True)]
+    return found
 
 
 def _at(row: Array, i: Array) -> Array:
@@ -216,12 +227,24 @@ def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     return i, jnp.clip((quantity - _at(segments.start, i)) * _at(segments.inverse, i), 0, 1)
 
 
+@jax.custom_jvp
 def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     """The same for control points that are evenly spaced but for rounding: no tables, no search."""
     last = segments.start.shape[0] - 1
     place = jnp.clip((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
     i = jnp.clip(place.astype(jnp.int32), 0, last)
     return i, place - i.astype(place.dtype)
+
+
+@_evenly.defjvp
+def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) -> tuple[Any, Any]:
+    """Control points that move one by one are evenly spaced no more, so the place within a segment changes as in any other."""
+    (segments, quantity), (segments_dot, quantity_dot) = primals, tangents
+    i, part = _evenly(segments, quantity)
+    start, inverse = _at(segments.start, i), _at(segments.inverse, i)
+    change = (quantity_dot - _at(segments_dot.start, i)) * inverse + (quantity - start) * _at(segments_dot.inverse, i)
+    inside = (quantity >= segments.start[0]) & (quantity < segments.start[-1])
+    return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
 
 
 jax.tree_util.register_dataclass(Segments, data_fields=[f.name for f in dataclasses.fields(Segments)], meta_fields=[])

@@ -13,11 +13,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 
 def split(x: Float[Array, "*any"]) -> tuple[Float[Array, "*any"], Int[Array, "*any"]]:
-    r"""Mantissa m, $1 \le |m| < 2$, and exponent e of x = m 2^e; of zero and of subnormal numbers, 0 and the least exponent."""
+    r"""Mantissa m, $1 \le |m| < 2$, and exponent e of x = m 2^e; of zero and of subnormal numbers, 0 and the least exponent.
+
+    Differentiation: the exponent is a constant.
+    """
     bits, exponent_bits, mantissa_bits, bias = _layout(x)
     exponent = (bits >> mantissa_bits) & ((1 << exponent_bits) - 1)
-    mantissa = lax.bitcast_convert_type(bits + ((bias - exponent) << mantissa_bits), x.dtype)
-    return jnp.where(exponent > 0, mantissa, 0), (exponent - bias).astype(jnp.int32)
+    normal, exponent = exponent > 0, (exponent - bias).astype(jnp.int32)
+    half = exponent // 2  # in two steps, as 2^-127 is no normal number
+    mantissa = jnp.where(normal, x, 0) * power_of_two(-half, x.dtype) * power_of_two(half - exponent, x.dtype)
+    return mantissa, exponent
 
 
 def power_of_two(exponent: Int[Array, "*any"], dtype: Any) -> Float[Array, "*any"]:

@@ -68,3 +68,16 @@ def test_gradient_is_finite_at_the_particle_at_the_edge_and_outside(name, r):
 def test_unknown_kernel_lists_the_known_ones():
     with pytest.raises(ValueError, match="poly6, cubic_spline, wendland_c2"):
         kernels.by_name("gaussian")
+
+
+@pytest.mark.parametrize("kernel", kernels.KERNELS.values(), ids=kernels.KERNELS)
+def test_slope_is_that_of_the_kernel_and_nothing_outside(kernel):
+    square, size, step = np.array([0.0, 1e-4, 0.2, 0.6, 0.95, 1.0, 1.3]) * 0.49, 0.7, 1e-7
+
+    def of(offset):
+        return kernel.weigh(kernel.prepare(square[1:-2], size), offset, size, np)
+
+    slope = kernel.slope(kernel.prepare(square, size), 0.0, size, np)
+    assert np.isfinite(slope).all() and (slope <= 0).all() and not slope[-2:].any()
+    np.testing.assert_allclose(slope[1:-2], (of(step) - of(-step)) / (2 * step), rtol=1e-5)
+    assert kernel.slope(kernel.prepare(np.zeros(1), 0.0), 0.0, 0.0, np) == 0  # padding
