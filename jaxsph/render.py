@@ -32,6 +32,7 @@ from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
@@ -102,7 +103,8 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     plan.check(scene, camera, settings)
     shapes = dataclasses.replace(plan, control=None)  # what the grid and the cast are compiled for, with any error control
     clock.mark("plan")
-    ordered, transfer = clock.run("grid", _order, (scene, camera), plan=shapes)
+    particles, transfer = _in_own_units(scene, *clock.run("grid", _rescaled, (scene, camera)))
+    ordered = clock.run("grid", _order, (particles, camera), plan=shapes)
     bands, words = [], [_input_faults(scene, camera, plan.samples) | ordered.faults]
     counts = np.zeros(2)
     for band in range(plan.bands):
@@ -133,7 +135,8 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
 
 
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
-    ordered, transfer = _order(scene, camera, plan=plan)
+    particles, transfer = _in_own_units(scene, *_rescaled(scene, camera))
+    ordered = _order(particles, camera, plan=plan)
 
     def one_band(band: Int[Array, ""]) -> Any:
         first_row = band * plan.band_height
@@ -197,17 +200,22 @@ class _Decided:
 jax.tree_util.register_dataclass(_Decided, data_fields=["work", "full", "bound", "levels", "lattice"], meta_fields=[])
 
 
-@functools.partial(jax.jit, static_argnames="plan")
-def _order(scene: Scene, camera: Camera, *, plan: Plan) -> tuple[Ordered, TransferFunction]:
-    """Particles by rank, and the transfer function: in its units are the quantities from here on."""
-    particles = scene.particles
-    depths = _half_steps(camera, particles, plan)[1::2]
-    dtype = jnp.promote_types(particles.dtype, camera.dtype)
+@jax.jit
+def _rescaled(scene: Scene, camera: Camera) -> tuple[Array, TransferFunction]:
+    """Quantities and transfer function in the units that all later stages see, in the dtype of view space."""
+    dtype = jnp.promote_types(scene.particles.dtype, camera.dtype)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
-    quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
-    particles = dataclasses.replace(particles, quantity=quantity)
-    ordered = order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
-    return ordered, transfer
+    return rescaled(scene.particles.quantity.astype(dtype), transfer)
+
+
+def _in_own_units(scene: Scene, quantity: Array, transfer: TransferFunction) -> tuple[Particles, TransferFunction]:
+    return dataclasses.replace(scene.particles, quantity=quantity), transfer
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def _order(particles: Particles, camera: Camera, *, plan: Plan) -> Ordered:
+    depths = _half_steps(camera, particles, plan)[1::2]
+    return order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
 
 
 @functools.partial(jax.jit, static_argnames="plan")
@@ -236,6 +244,7 @@ def _adapt(
     dtype = grid.half_steps.dtype
     if limits is None or plan.control is None:
         return _Decided(work, full, jnp.zeros(full.shape, dtype), None)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     if isinstance(plan.control, PilotPlan):
         wanted = worthwhile(grid, camera, plan.cast.slab_samples)
         lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, wanted)
@@ -256,6 +265,7 @@ def _cast(
     plan: Plan,
     kernel: str,
 ) -> Rays:
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     return cast(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
