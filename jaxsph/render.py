@@ -247,7 +247,8 @@ def _adapt(
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     if isinstance(plan.control, PilotPlan):
         wanted = worthwhile(grid, camera, plan.cast.slab_samples)
-        lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, wanted)
+        amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
+        lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, amid, wanted)
         work, bound = pilot(grid, lattice, camera, transfer, origin, limits[0], plan.cast.slab_samples)
         return _Decided(work, full, bound, None, lattice)
     work, bound, levels = adapt(grid, camera, transfer, origin, *limits, plan.cast.slab_samples, plan.control)

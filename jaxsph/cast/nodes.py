@@ -31,9 +31,19 @@ ACROSS, DEEP = BUNDLE // NODE_PIXELS, CELL // NODE_SAMPLES  # nodes of a cell
 
 
 def sum_at_nodes(
-    grid: Grid, camera: Camera, kernel: str, slab_samples: int, tile_columns: int, wanted: Bool[Array, ""] | bool = True
+    grid: Grid,
+    camera: Camera,
+    kernel: str,
+    slab_samples: int,
+    tile_columns: int,
+    origin: Float[Array, ""],
+    wanted: Bool[Array, ""] | bool = True,
 ) -> Lattice:
-    """Sums at all nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`."""
+    """Sums at all nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
+
+    Args:
+        origin: quantity that sums are taken relative to.
+    """
     cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
     windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
@@ -41,8 +51,6 @@ def sum_at_nodes(
     bundles = count.shape[1]
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
-    ordered, live = grid.ordered, grid.ordered.live
-    origin = ordered.quantity[jnp.argmax(live)]
     last = grid.half_steps.shape[0] - 1
 
     def march(step: Array, table: Array) -> Array:
@@ -57,7 +65,7 @@ def sum_at_nodes(
         target = jnp.where(real, at, cells * bundles)
         return table.at[target].set(jnp.moveaxis(sums.reshape(2, -1, chunk), -1, 0))
 
-    table = jnp.zeros((cells * bundles + 1, 2, DEEP * ACROSS * ACROSS), ordered.x.dtype)
+    table = jnp.zeros((cells * bundles + 1, 2, DEEP * ACROSS * ACROSS), grid.ordered.x.dtype)
     table = lax.fori_loop(0, (number + chunk - 1) // chunk, march, table)[:-1]
     table = table.reshape(cells, -1, tile_columns, 2, 2, 2, DEEP, ACROSS, ACROSS)
     table = jnp.transpose(table, (5, 0, 6, 1, 3, 7, 2, 4, 8))

@@ -20,7 +20,9 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
     plan = js.plan(scene, camera, frames.settings)
     ordered = _order(scene.particles, camera, plan=plan)
     grid = Grid(ordered, *_grid(ordered, camera, jnp.int32(0), plan=plan))
-    lattice = sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, plan.lists.tile_columns)
+    lattice = sum_at_nodes(
+        grid, camera, scene.particles.kernel, plan.cast.slab_samples, plan.lists.tile_columns, jnp.float64(0.4)
+    )
 
     deep, down, across = lattice.weight.shape
     deep = min(deep, -(-plan.samples // NODE_SAMPLES))

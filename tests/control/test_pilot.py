@@ -29,7 +29,7 @@ def error_of(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
 
 
-@pytest.mark.parametrize("name", ["mixer", pytest.param("radial", marks=pytest.mark.slow), "checker_board"])
+@pytest.mark.parametrize("name", ["mixer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("radial", "checker_board"))])
 def test_work_is_saved_few_pixels_are_over_the_tolerance_and_none_over_twice(name):
     truth, image = both(name)
     error = error_of(image, truth)
