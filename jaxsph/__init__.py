@@ -6,6 +6,7 @@ from jaxsph import io, reference, scenes
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
 from jaxsph.plan import Plan, plan
 from jaxsph.render import CapacityError, render
+from jaxsph.sweep import sweep
 
 __all__ = [
     "Camera",
@@ -21,4 +22,5 @@ __all__ = [
     "reference",
     "render",
     "scenes",
+    "sweep",
 ]

@@ -1,0 +1,83 @@
+"""Contenders: what a sweep compares, and how an image of fewer pixels is made comparable.
+
+Flow: settings -> [contenders] -> sweep.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import map_coordinates
+
+from jaxsph.model import Camera, Settings
+
+TOLERANCES = (0.001, 0.004, 0.01)
+ESTIMATORS: dict[str, dict[str, Any]] = {
+    "interval": {"estimator": "interval", "relax": 0.0},
+    "interval relaxed": {"estimator": "interval", "relax": 1.0},
+    "pilot": {"estimator": "pilot", "relax": 0.0},
+}
+BASELINES = ("samples/2", "samples/4", "size/2", "size/4")
+FULL_RATE = "full rate"
+
+
+@dataclasses.dataclass(frozen=True)
+class Contender:
+    """Settings to render with, at a size divided by `shrink` each way, to be scaled up again."""
+
+    method: str
+    settings: Settings
+    shrink: int = 1
+
+    @property
+    def tolerance(self) -> float | None:
+        """What error control is asked for."""
+        return self.settings.tolerance
+
+    def camera(self, camera: Camera) -> Camera:
+        """`camera`, for the image that is rendered."""
+        if self.shrink == 1:
+            return camera
+        size = {"width": -(-camera.width // self.shrink), "height": -(-camera.height // self.shrink)}
+        return dataclasses.replace(camera, **size)
+
+
+def contenders(
+    settings: Settings, tolerances: Sequence[float], estimators: Sequence[str], baselines: Sequence[str]
+) -> list[list[Contender]]:
+    """Settings that take turns: full rate and baselines, then each estimator with all of its tolerances."""
+    for name in estimators:
+        if name not in ESTIMATORS:
+            raise ValueError(f"`estimators` must be of {', '.join(map(repr, ESTIMATORS))}, got {name!r}")
+    groups = [[Contender(FULL_RATE, settings), *(baseline(settings, name) for name in dict.fromkeys(baselines))]]
+    for name in dict.fromkeys(estimators):
+        chosen = [dataclasses.replace(settings, **ESTIMATORS[name], tolerance=float(t)) for t in dict.fromkeys(tolerances)]
+        groups.append([Contender(name, one) for one in chosen])
+    return groups
+
+
+def baseline(settings: Settings, name: str) -> Contender:
+    """Uniform sampling that is coarser, or a smaller image: `"samples/K"` or `"size/K"`."""
+    matched = re.fullmatch(r"(samples|size)/([1-9]\d{0,5})", name)
+    if matched is None:
+        raise ValueError(f"`baselines` must be like 'samples/2' or 'size/4', got {name!r}")
+    factor = int(matched[2])
+    if matched[1] == "size":
+        return Contender(name, settings, factor)
+    return Contender(name, dataclasses.replace(settings, samples=-(-settings.samples // factor)))
+
+
+def scaled_up(layers: Float[np.ndarray, "rows columns 4"], camera: Camera) -> Float[np.ndarray, "height width 4"]:
+    """What an image of fewer pixels shows along the rays of `camera`, bilinearly; the same image where the sizes agree."""
+    rows, columns = layers.shape[:2]
+    if (rows, columns) == (camera.height, camera.width):
+        return layers
+    down = (np.arange(camera.height) + 0.5) / camera.height * 2 - 1
+    across = ((np.arange(camera.width) + 0.5) / camera.width * 2 - 1) * (camera.width / camera.height) / (columns / rows)
+    place = np.meshgrid((down + 1) / 2 * rows - 0.5, (across + 1) / 2 * columns - 0.5, indexing="ij")
+    return np.stack([map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(layers, -1, 0)], -1)

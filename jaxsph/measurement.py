@@ -1,0 +1,140 @@
+"""Measurement: one row of a sweep's table, and the files that the table is kept in.
+
+Flow: sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from jaxsph.io.replace import written_whole
+
+JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
+"""Names in a sweep's folder: one JSON object a line, appended as it is measured; and the same as comma-separated values."""
+
+KEY = ("scene", "frame", "fingerprint", "method", "tolerance", "repeats", "dtype", "device", "jaxsph")
+"""What makes two measurements the same: a sweep does not measure again what its folder holds."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """How wrong one setting was for one frame, and what it took.
+
+    An error is the largest difference of any colour channel or alpha of a pixel; `max_` and `mean_` are over pixels.
+
+    Attributes:
+        scene, frame: what was rendered.
+        fingerprint: digest of particles, transfer function, camera and settings.
+        particles, width, height, samples: size of the frame at full rate, which all settings are compared with.
+        method: `"full rate"`, an estimator, `"samples/K"` or `"size/K"`.
+        tolerance: what error control was asked for; None without.
+        certified: whether `max_bound` is proven.
+        max_error, mean_error: against full rate.
+        over_tolerance: share of pixels whose error is over the tolerance; None without one.
+        max_bound: largest `error_bound`; None without error control.
+        over_bound: share of pixels whose error is over their bound; None without error control.
+        max_error_converged, mean_error_converged: against an image of `converged` times the samples.
+        converged: that factor.
+        evaluations, evaluations_full: kernel evaluations, and those of full rate.
+        plan, compile: seconds to make the plan, and to compile what no setting before had compiled.
+        grid, adapt, cast, image: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks for it.
+        total: median of their sum.
+        deviation: median deviation of that sum from `total`, seconds.
+        full_total: median seconds of full rate in the same turns.
+        repeats: turns.
+        bytes: working memory that the plan estimates.
+        dtype, device, cores, jaxsph, jax, numpy, python, commit: of the run; `commit` is None outside a checkout.
+    """
+
+    scene: str
+    frame: float | None
+    fingerprint: str
+    particles: int
+    width: int
+    height: int
+    samples: int
+    method: str
+    tolerance: float | None
+    certified: bool
+    max_error: float
+    mean_error: float
+    over_tolerance: float | None
+    max_bound: float | None
+    over_bound: float | None
+    max_error_converged: float
+    mean_error_converged: float
+    converged: int
+    evaluations: int
+    evaluations_full: int
+    plan: float
+    compile: float
+    grid: float
+    adapt: float
+    cast: float
+    image: float
+    total: float
+    deviation: float
+    full_total: float
+    repeats: int
+    bytes: int
+    dtype: str
+    device: str
+    cores: int
+    jaxsph: str
+    jax: str
+    numpy: str
+    python: str
+    commit: str | None
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What tells this measurement from others."""
+        return tuple(getattr(self, name) for name in KEY)
+
+
+COLUMNS = tuple(field.name for field in dataclasses.fields(Measurement))
+
+
+def read_journal(path: str | Path) -> list[Measurement]:
+    """The measurements in a journal, oldest first; none where there is no file. A last line without its end is left out.
+
+    Raises:
+        ValueError: a line that is not a measurement of this version.
+    """
+    path = Path(path)
+    if not path.exists():
+        return []
+    *lines, _ = path.read_text(encoding="utf-8").split("\n")
+    return [_parsed(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
+
+
+def _parsed(line: str, where: str) -> Measurement:
+    try:
+        return Measurement(**json.loads(line))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where} is not a measurement of this version of jaxsph; give another folder, or move it") from error
+
+
+def append(path: str | Path, measurement: Measurement) -> None:
+    """Add a line to a journal, and see it written; what an interrupted write left at its end is cut off first."""
+    line = json.dumps(dataclasses.asdict(measurement), allow_nan=False) + "\n"
+    with open(path, "ab+") as file:
+        file.seek(0)
+        file.truncate(file.read().rfind(b"\n") + 1)
+        file.write(line.encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def write_table(path: str | Path, measurements: Iterable[Measurement]) -> None:
+    """Write comma-separated values with a header, whole or not at all; None is an empty cell."""
+    with written_whole(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(dataclasses.asdict(measurement) for measurement in measurements)

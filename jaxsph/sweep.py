@@ -1,0 +1,257 @@
+"""Error against tolerance against time: one table of what every setting of a scene costs, and how wrong it is.
+
+Flow: scene, camera -> plan, render -> [sweep] -> measurements -> files, figures.
+
+Settings are timed in turns with full rate of the same frame, so that a busy machine is slow for all of them; compile time
+and plans are apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.contenders import BASELINES, ESTIMATORS, FULL_RATE, TOLERANCES, Contender, contenders, scaled_up
+from jaxsph.measurement import JOURNAL, KEY, TABLE, Measurement, append, read_journal, write_table
+from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.plan import Plan
+from jaxsph.plan import plan as make_plan
+from jaxsph.provenance import of_frame, of_this_run
+from jaxsph.render import render
+
+STAGES = ("grid", "adapt", "cast", "image")
+
+Progress = Callable[[int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Frame:
+    """A frame, and what its measurements have in common."""
+
+    scene: Scene
+    camera: Camera
+    shared: dict[str, Any]
+
+    def key(self, setting: Contender) -> tuple[Any, ...]:
+        found = self.shared | {"method": setting.method, "tolerance": setting.tolerance}
+        return tuple(found[name] for name in KEY)
+
+
+def sweep(
+    scene: Scene | Sequence[Scene],
+    camera: Camera | Sequence[Camera],
+    settings: Settings | None = None,
+    *,
+    tolerances: Sequence[float] = TOLERANCES,
+    estimators: Sequence[str] = tuple(ESTIMATORS),
+    baselines: Sequence[str] = BASELINES,
+    repeats: int = 3,
+    converged: int = 8,
+    name: str = "scene",
+    frames: Sequence[float] | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> list[Measurement]:
+    """Measure error and time of every estimator at every tolerance, and of coarser sampling and smaller images.
+
+    The error of a pixel is the largest difference of any colour channel or alpha, to the same frame at full rate and to an
+    image of `converged` times the samples. Times are medians over `repeats` turns; each group of settings (the baselines,
+    an estimator) takes turns with full rate.
+
+    Args:
+        scene, camera: what to render, and from where; or as many of both as the sequence has frames.
+        settings: the settings of full rate; default `Settings()`. `tolerance`, `estimator` and `relax` are the sweep's.
+        tolerances: each >= 0.
+        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, the first paper's) and `"pilot"`.
+        baselines: `"samples/K"`, uniform sampling with K times fewer samples; `"size/K"`, an image K times smaller each
+            way, scaled up bilinearly.
+        repeats: turns, at least 1.
+        converged: at least 1.
+        name: of the scene, for the table.
+        frames: a number for each frame; default 0, 1, ... of a sequence.
+        folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
+            be. What it holds already is not measured again. `None` keeps nothing.
+        progress: called as `progress(done, total)` after every image.
+
+    Returns:
+        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it.
+
+    Raises:
+        ValueError: arguments out of range, scenes and cameras that do not pair, a folder that holds something else.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, section 7, tables 2 and 3, figures 11 and 12.
+    """
+    settings = settings or Settings()
+    if settings.tolerance is not None:
+        raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
+    _require_count("repeats", repeats)
+    _require_count("converged", converged)
+    groups = contenders(settings, tolerances, estimators, baselines)
+    views = _views(scene, camera, frames)
+    shared = {"scene": name, "repeats": repeats, "converged": converged} | of_this_run()
+    held = {row.key: row for row in read_journal(_journal(folder))} if folder is not None else {}
+    tasks = []
+    for number, one, view in views:
+        frame = _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number})
+        tasks.append((frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]))
+    tick = _ticker(progress, sum(_num_renders(missing, repeats) for _, missing in tasks))
+    for frame, missing in tasks:
+        for row in _measure(frame, groups[0][0], missing, tick):
+            held[row.key] = row
+            if folder is not None:
+                append(_journal(folder), row)
+    if folder is not None:
+        write_table(Path(folder) / TABLE, held.values())
+    return [held[frame.key(setting)] for frame, _ in tasks for group in groups for setting in group]
+
+
+def _views(
+    scene: Scene | Sequence[Scene], camera: Camera | Sequence[Camera], frames: Sequence[float] | None
+) -> list[tuple[float | None, Scene, Camera]]:
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    cameras = [camera] if isinstance(camera, Camera) else list(camera)
+    if not scenes or len(scenes) != len(cameras):
+        raise ValueError(f"`scene` and `camera` must pair, got {len(scenes)} and {len(cameras)}; give one camera a scene")
+    numbers = ([None] if isinstance(scene, Scene) else range(len(scenes))) if frames is None else list(frames)
+    if len(set(numbers)) != len(scenes):
+        raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(numbers)}")
+    numbers = [None if number is None else float(number) for number in numbers]
+    return list(zip(numbers, scenes, cameras, strict=True))
+
+
+def _require_count(name: str, value: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}")
+
+
+def _num_renders(missing: list[list[Contender]], repeats: int) -> int:
+    """Images that `_measure` makes: two truths, one of each setting, and the turns."""
+    turns = [[setting for setting in group if setting.method != FULL_RATE] for group in missing if group]
+    return 2 * bool(turns) + sum(len(turn) + repeats * (1 + len(turn)) for turn in turns)
+
+
+def _ticker(progress: Progress | None, total: int) -> Callable[[], None]:
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    return tick
+
+
+def _measure(frame: _Frame, full: Contender, missing: list[list[Contender]], tick: Callable[[], None]) -> Iterable[Measurement]:
+    """Rows of what is missing of a frame, as soon as each group has taken its turns."""
+    if not any(missing):
+        return
+    finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
+    truth = _layers(render(frame.scene, frame.camera, finer))
+    tick()
+    of_full = _First.of(frame, full)
+    tick()
+    for group in missing:
+        firsts = [of_full]
+        for setting in group:
+            if setting is not full:
+                firsts.append(_First.of(frame, setting))
+                tick()
+        times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
+        for first, turns in zip(firsts, times, strict=False):
+            if first.setting in group:
+                found = _compared(first, of_full, truth) | _medians(turns) | {"full_total": _medians(times[0])["total"]}
+                yield Measurement(**frame.shared, **found)
+
+
+@dataclasses.dataclass(frozen=True)
+class _First:
+    """The first image of a setting, and the plan that its later ones use."""
+
+    setting: Contender
+    plan: Plan
+    plan_seconds: float
+    compile_seconds: float
+    image: Image
+    layers: Float[np.ndarray, "height width 4"]
+
+    @classmethod
+    def of(cls, frame: _Frame, setting: Contender) -> _First:
+        camera = setting.camera(frame.camera)
+        started = time.perf_counter()
+        plan = make_plan(frame.scene, camera, setting.settings)
+        planned = time.perf_counter() - started
+        image = render(frame.scene, camera, setting.settings, plan=plan)
+        return cls(setting, plan, planned, image.stats["seconds"]["compile"], image, scaled_up(_layers(image), frame.camera))
+
+
+def _in_turns(frame: _Frame, firsts: Sequence[_First], repeats: int, tick: Callable[[], None]) -> list[list[dict[str, float]]]:
+    """Seconds by stage of every turn of every setting."""
+    times: list[list[dict[str, float]]] = [[] for _ in firsts]
+    for _ in range(repeats):
+        for first, turns in zip(firsts, times, strict=True):
+            camera = first.setting.camera(frame.camera)
+            image = render(frame.scene, camera, first.setting.settings, plan=first.plan)
+            seconds = {stage: image.stats["seconds"][stage] for stage in STAGES}
+            if first.setting.shrink > 1:
+                started = time.perf_counter()
+                scaled_up(_layers(image), frame.camera)
+                seconds["image"] += time.perf_counter() - started
+            turns.append(seconds)
+            tick()
+    return times
+
+
+def _medians(turns: list[dict[str, float]]) -> dict[str, float]:
+    sums = [sum(turn.values()) for turn in turns]
+    total = statistics.median(sums)
+    stages = {stage: statistics.median(turn[stage] for turn in turns) for stage in STAGES}
+    return stages | {"total": total, "deviation": statistics.median(abs(one - total) for one in sums)}
+
+
+def _compared(first: _First, full: _First, truth: Float[np.ndarray, "height width 4"]) -> dict[str, Any]:
+    """How wrong an image is, how wrong it was said to be, and the work it took."""
+    error, away = (np.abs(first.layers - other).max(-1) for other in (full.layers, truth))
+    tolerance = first.setting.tolerance
+    bound = None if tolerance is None else np.asarray(first.image.error_bound, np.float64)
+    return {
+        "method": first.setting.method,
+        "tolerance": tolerance,
+        "certified": bool(first.image.certified) and tolerance is not None,
+        "max_error": float(error.max()),
+        "mean_error": float(error.mean()),
+        "over_tolerance": None if tolerance is None else float((error > tolerance).mean()),
+        "max_bound": None if bound is None else float(bound.max()),
+        "over_bound": None if bound is None else float((error > bound).mean()),
+        "max_error_converged": float(away.max()),
+        "mean_error_converged": float(away.mean()),
+        "evaluations": first.image.stats["evaluations"],
+        "evaluations_full": full.image.stats["evaluations"],
+        "plan": first.plan_seconds,
+        "compile": first.compile_seconds,
+        "bytes": first.plan.bytes,
+    }
+
+
+def _layers(image: Image) -> Float[np.ndarray, "height width 4"]:
+    """Colour and alpha, float64."""
+    alpha = 1 - np.asarray(image.transmittance, np.float64)
+    return np.concatenate([np.asarray(image.color, np.float64), alpha[..., None]], -1)
+
+
+def _journal(folder: str | os.PathLike[str]) -> Path:
+    """Path of the journal; its folder is made."""
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"`folder` {os.fspath(folder)} cannot be made ({error.strerror}); give another one") from error
+    return Path(folder) / JOURNAL
