@@ -1,12 +1,11 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
-__version__ = "0.1.0"
-
 from jaxsph import io, reference, scenes
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
 from jaxsph.plan import Plan, plan
 from jaxsph.render import CapacityError, render
 from jaxsph.sweep import sweep
+from jaxsph.version import __version__
 
 __all__ = [
     "Camera",
@@ -17,6 +16,7 @@ __all__ = [
     "Scene",
     "Settings",
     "TransferFunction",
+    "__version__",
     "io",
     "plan",
     "reference",

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 import jaxsph
-from jaxsph import scenes
+from jaxsph import cli_sweep, scenes
 from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
 from jaxsph.scenes.view import snug
@@ -97,9 +97,16 @@ def _parser() -> argparse.ArgumentParser:
     render = command("render", _render, "make an image", "What you do not say is chosen, and said.")
     render.epilog = f"Built-in scenes: {', '.join(SCENE + name for name in scenes.names())}."
     _add_source(render)
+    render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     _add_picture(render)
+    _add_control(render)
     info = command("info", _info, "say what a particle file holds", "And what `render` would show of it.")
     _add_source(info)
+    more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
+    sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
+    _add_source(sweep)
+    _add_picture(sweep)
+    cli_sweep.add_options(sweep)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument
     add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")
@@ -121,7 +128,6 @@ def _add_source(parser: argparse.ArgumentParser) -> None:
 
 def _add_picture(parser: argparse.ArgumentParser) -> None:
     maps, depth = ", ".join(scenes.appearance.COLORMAPS), scenes.appearance.OPTICAL_DEPTH
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=_size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")
@@ -140,11 +146,15 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     add("--target", **place, help="what it looks at (default: the middle of the particles)")
     add("--up", **place, help="upward direction (default 0 1 0)")
     add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
-    add = parser.add_argument_group("error control and means").add_argument
+    add = parser.add_argument_group("means").add_argument
+    add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
+
+
+def _add_control(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("error control").add_argument
     add("--tolerance", type=float, metavar="T", help="largest error of any channel of any pixel (default: none)")
     add("--estimator", choices=("interval", "pilot"), help="how the error is known")
     add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
-    add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -162,7 +172,7 @@ def _render(options: argparse.Namespace) -> None:
     settings = _settings(options)
     output = options.output or Path(Path(options.source.removeprefix(SCENE)).stem + ".png")
     _require_writable(output)
-    scene, camera = _scene_of_name(options) if options.source.startswith(SCENE) else _scene_of_file(options)
+    scene, camera = _scene(options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
     with progress("render") as show:
@@ -176,15 +186,26 @@ def _render(options: argparse.Namespace) -> None:
     say("time", time_line(image, elapsed))
 
 
+def _sweep(options: argparse.Namespace) -> None:
+    settings = _settings(options)
+    if options.frames is not None and options.frame is not None:
+        raise UsageError("--frame and --frames exclude each other; name all moments after --frames")
+    if options.frames is not None and len(set(options.frames)) < len(options.frames):
+        raise UsageError(f"--frames must be different numbers, got {' '.join(f'{moment:g}' for moment in options.frames)}")
+    views = []
+    for moment in options.frames or [options.frame]:
+        options.frame = moment
+        views.append((moment, *_scene(options)))
+    cli_sweep.run(views, settings, Path(options.source.removeprefix(SCENE)).stem, options)
+
+
 def _settings(options: argparse.Namespace) -> Settings:
     """Settings from the options given; what this version's `Settings` does not know, or refuses, is wrong usage."""
     if options.memory is not None and not 0 < options.memory < 2**30:
         raise UsageError(f"--memory must be a positive number of GiB, got {options.memory:g}")
     given = {
         "samples": options.samples,
-        "tolerance": options.tolerance,
-        "estimator": options.estimator,
-        "relax": options.relax,
+        **{name: getattr(options, name, None) for name in ("tolerance", "estimator", "relax")},
         "memory_limit": None if options.memory is None else int(options.memory * 2**30),
     }
     given = {name: value for name, value in given.items() if value is not None}
@@ -197,6 +218,10 @@ def _settings(options: argparse.Namespace) -> Settings:
         raise UsageError(str(error)) from error
 
 
+def _scene(options: argparse.Namespace) -> tuple[Scene, Camera]:
+    return _scene_of_name(options) if options.source.startswith(SCENE) else _scene_of_file(options)
+
+
 def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
     _refuse(options, ("quantity", "support", "kernel", "part_type"), "is for particle files, not for built-in scenes")
     name = options.source.removeprefix(SCENE)
@@ -206,7 +231,7 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
     except ValueError as error:
         raise UsageError(str(error)) from error
     say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.support)}")
-    if options.command == "render":
+    if options.command != "info":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
             scene = dataclasses.replace(scene, transfer=_transfer(scene.particles, options, "concentration"))
         if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):

@@ -27,7 +27,7 @@ def largest_difference(image: Image, truth: Image) -> float:
 
 
 @contextlib.contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
+def progress(what: str, unit: str = " bands") -> Iterator[Callable[[int, int], None] | None]:
     """A progress bar on stderr where a person watches and tqdm is there, else `None`."""
     try:
         from tqdm import tqdm
@@ -37,7 +37,7 @@ def progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
     if not sys.stderr.isatty():
         yield None
         return
-    with tqdm(desc=what, unit=" bands", leave=False, file=sys.stderr) as bar:
+    with tqdm(desc=what, unit=unit, leave=False, file=sys.stderr) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total

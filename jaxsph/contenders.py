@@ -43,8 +43,8 @@ class Contender:
         """`camera`, for the image that is rendered."""
         if self.shrink == 1:
             return camera
-        size = {"width": -(-camera.width // self.shrink), "height": -(-camera.height // self.shrink)}
-        return dataclasses.replace(camera, **size)
+        width, height = (-(-size // self.shrink) for size in (camera.width, camera.height))
+        return dataclasses.replace(camera, width=width, height=height)
 
 
 def contenders(

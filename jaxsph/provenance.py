@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from jaxsph.model import Camera, Scene, Settings
+from jaxsph.version import __version__
 
 
 def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -> dict[str, Any]:
@@ -32,8 +33,6 @@ def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -
 
 def of_this_run() -> dict[str, Any]:
     """Machine and versions."""
-    from jaxsph import __version__
-
     versions = {"jaxsph": __version__, "jax": jax.__version__, "numpy": np.__version__, "python": platform.python_version()}
     return {"device": jax.devices()[0].device_kind, "cores": os.cpu_count() or 1, "commit": _commit()} | versions
 

@@ -40,6 +40,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.plan import Plan
 from jaxsph.plan import plan as make_plan
+from jaxsph.version import __version__
 
 Progress = Callable[[int, int], None]
 
@@ -341,8 +342,6 @@ def _raise(word: int, planned: bool) -> None:
 
 
 def _metadata(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
-    from jaxsph import __version__
-
     exact = settings.tolerance is None
     return (
         ("jaxsph.version", __version__),

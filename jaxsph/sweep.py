@@ -121,11 +121,13 @@ def _views(
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
     if not scenes or len(scenes) != len(cameras):
         raise ValueError(f"`scene` and `camera` must pair, got {len(scenes)} and {len(cameras)}; give one camera a scene")
-    numbers = ([None] if isinstance(scene, Scene) else range(len(scenes))) if frames is None else list(frames)
-    if len(set(numbers)) != len(scenes):
-        raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(numbers)}")
-    numbers = [None if number is None else float(number) for number in numbers]
-    return list(zip(numbers, scenes, cameras, strict=True))
+    if frames is None:
+        if isinstance(scene, Scene):
+            return [(None, scenes[0], cameras[0])]
+        frames = range(len(scenes))
+    if len(set(frames)) != len(scenes) or len(frames) != len(scenes):
+        raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(frames)}")
+    return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
 
 
 def _require_count(name: str, value: int) -> None:

@@ -6,14 +6,14 @@ import importlib
 from typing import Any
 
 
-def require(module: str, purpose: str) -> Any:
+def require(module: str, purpose: str, extra: str = "io") -> Any:
     """The module called `module`.
 
     Raises:
-        ImportError: when it is not installed; the message names `purpose` and the extra that brings the library.
+        ImportError: when it is not installed; the message names `purpose` and the `extra` that brings the library.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         library = module.partition(".")[0]
-        raise ImportError(f'{purpose} needs the library `{library}`: pip install "jaxsph[io]"') from error
+        raise ImportError(f'{purpose} needs the library `{library}`: pip install "jaxsph[{extra}]"') from error

@@ -8,6 +8,8 @@ Flow: [scenes] -> Scene, Camera -> render -> image.
 | `dam_break` | two dyed columns collapse into a basin; an SPH simulation, packaged | 59,582 simulated | 0, 1, 2 |
 | `checker_board` | cubes of increasing concentration that diffuse; analytic | 100,000 | any >= 0 |
 | `radial` | a radial concentration under narrow bands of colour; analytic | 100,000 | static: any |
+| `letters` | letters of dyed fluid fall into a basin; analytic ballistic motion | 100,000 | any >= 0 |
+| `flubber` | two fluids orbit a centre and wind into sheets; analytic | 100,000 | any >= 0 |
 
 Any other number of particles may be asked for: analytic scenes are sampled anew, simulated ones are filled again with
 particles of another size (`sampling.refill`). The same arguments give the same particles on every machine.
@@ -20,6 +22,8 @@ from jaxsph.scenes import appearance
 from jaxsph.scenes.appearance import colormap, default_transfer
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.dam_break import dam_break
+from jaxsph.scenes.flubber import flubber
+from jaxsph.scenes.letters import letters
 from jaxsph.scenes.mixer import mixer
 from jaxsph.scenes.radial import radial
 
@@ -29,13 +33,22 @@ __all__ = [
     "colormap",
     "dam_break",
     "default_transfer",
+    "flubber",
+    "letters",
     "load",
     "mixer",
     "names",
     "radial",
 ]
 
-SCENES = {"mixer": mixer, "radial": radial, "checker_board": checker_board, "dam_break": dam_break}
+SCENES = {
+    "mixer": mixer,
+    "radial": radial,
+    "checker_board": checker_board,
+    "dam_break": dam_break,
+    "letters": letters,
+    "flubber": flubber,
+}
 
 
 def names() -> tuple[str, ...]:

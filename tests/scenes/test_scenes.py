@@ -8,6 +8,7 @@ from jaxsph.scenes.checker_board import CUBES, concentration
 from jaxsph.scenes.sampling import refill, scatter
 from jaxsph.scenes.simulated import simulation
 
+SCENES = ["mixer", "radial", "checker_board", "dam_break", "letters", "flubber"]
 SIMULATED = {"mixer": 43_740, "dam_break": 59_582}
 
 
@@ -21,11 +22,11 @@ def in_view(scene, camera):
 
 
 def test_every_scene_is_listed_and_described():
-    assert set(scenes.names()) == {"mixer", "radial", "checker_board", "dam_break"}
+    assert set(scenes.names()) == set(SCENES)
     assert all(f"`{name}`" in scenes.__doc__ for name in scenes.names())
 
 
-@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board", "dam_break"])
+@pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("count", [1, 2, 777, 5000])
 def test_the_number_of_particles_is_exact(name, count):
     particles = scenes.load(name, particles=count)[0].particles
@@ -43,7 +44,7 @@ def test_simulated_scenes_use_the_simulated_particles_by_default(name):
     assert np.asarray(particles.support)[0] == pytest.approx(2 * stored.spacing)
 
 
-@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board", "dam_break"])
+@pytest.mark.parametrize("name", SCENES)
 def test_the_same_arguments_give_the_same_particles(name):
     first, again, other = (scenes.load(name, particles=500, seed=seed)[0].particles for seed in (3, 3, 4))
     for field in ("position", "support", "quantity", "volume"):
@@ -51,7 +52,7 @@ def test_the_same_arguments_give_the_same_particles(name):
     assert (np.asarray(first.position) != np.asarray(other.position)).any()
 
 
-@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board", "dam_break"])
+@pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("frame", [0, 1, 2])
 @pytest.mark.parametrize("count", [None, 3000])
 def test_the_camera_frames_the_particles(name, frame, count):
@@ -71,7 +72,7 @@ def test_all_frames_share_the_eye(name):
     assert all((np.asarray(c.eye) == np.asarray(cameras[0].eye)).all() for c in cameras)
 
 
-@pytest.mark.parametrize("name", ["mixer", "radial", "checker_board", "dam_break"])
+@pytest.mark.parametrize("name", SCENES)
 def test_the_picture_is_neither_empty_nor_opaque(name):
     scene, camera = scenes.load(name, particles=4000, width=32, height=32)
     image = reference.render(scene, camera, Settings(samples=48))
@@ -117,6 +118,8 @@ def test_checker_board_begins_in_cubes_and_conserves_its_dye():
         ({"name": "mixer", "frame": 0.5}, "got 0.5"),
         ({"name": "dam_break", "frame": float("nan")}, "got nan"),
         ({"name": "checker_board", "frame": -1}, "got -1"),
+        ({"name": "letters", "frame": -0.5}, "got -0.5"),
+        ({"name": "flubber", "frame": float("inf")}, "got inf"),
         ({"name": "radial", "particles": 0}, "at least 1, got 0"),
         ({"name": "radial", "particles": 10.5}, "at least 1, got 10.5"),
     ],

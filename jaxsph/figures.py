@@ -1,0 +1,250 @@
+"""Figures of a sweep: error over tolerance, time over error, and both along a sequence of frames.
+
+Flow: measurements -> [figures] -> error.png, pareto.png, frames.png.
+
+Drawn with matplotlib, which is optional. Where a sweep has several frames, errors are the largest and times the means of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.contenders import ESTIMATORS, FULL_RATE
+from jaxsph.io.optional import require
+from jaxsph.io.replace import written_whole
+from jaxsph.measurement import Measurement
+
+COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00"), strict=True))
+"""Of the estimators: Okabe and Ito's, which all can tell apart."""
+
+MARKERS = dict(zip(ESTIMATORS, "osD", strict=True))
+BASELINE_COLORS = {"samples": "#8a8a8a", "size": "#a6761d"}
+BASELINE_MARKERS = "v^<>PX*h"
+DASHES = ("-", "--", ":", "-.")
+LEAST = 1e-7
+"""Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
+
+MOST_TICKS = 12
+SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A setting over all of its frames."""
+
+    method: str
+    tolerance: float | None
+    error: float
+    away: float
+    bound: float | None
+    seconds: float
+
+
+def require_matplotlib() -> None:
+    """Know before the work that it can be drawn.
+
+    Raises:
+        ImportError: matplotlib is not installed; the message says how to.
+    """
+    require("matplotlib", "drawing the figures of a sweep", "color")
+
+
+def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
+    """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames.
+
+    Returns:
+        The paths of what was written.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: nothing to draw, or measurements of several scenes.
+    """
+    require_matplotlib()
+    rows = list(measurements)
+    if len({row.scene for row in rows}) != 1:
+        found = ", ".join(sorted({row.scene for row in rows})) or "nothing"
+        raise ValueError(f"`measurements` must be of one scene, got {found}; draw each on its own")
+    points = summary(rows)
+    figures = {"error.png": _error, "pareto.png": _pareto}
+    written = [_saved(draw_one(points, _title(rows)), Path(folder) / name) for name, draw_one in figures.items()]
+    if len({row.frame for row in rows}) > 1:
+        written.append(_saved(_frames(rows, _title(rows[:1])), Path(folder) / "frames.png"))
+    return written
+
+
+def summary(rows: Sequence[Measurement]) -> list[Point]:
+    """Of every setting, in order: largest errors and bound, and mean seconds, over its frames."""
+    groups: dict[tuple[str, float | None], list[Measurement]] = {}
+    for row in rows:
+        groups.setdefault((row.method, row.tolerance), []).append(row)
+    points = []
+    for (method, tolerance), group in groups.items():
+        bounds = [row.max_bound for row in group if row.max_bound is not None]
+        errors = (max(row.max_error for row in group), max(row.max_error_converged for row in group))
+        seconds = float(np.mean([row.total for row in group]))
+        points.append(Point(method, tolerance, *errors, max(bounds, default=None), seconds))
+    return points
+
+
+def pareto_front(errors: Sequence[float], seconds: Sequence[float]) -> list[int]:
+    """Indices, by error, of what is faster than all that is at most as wrong."""
+    front: list[int] = []
+    for index in sorted(range(len(errors)), key=lambda i: (errors[i], seconds[i])):
+        if not front or seconds[index] < seconds[front[-1]]:
+            front.append(index)
+    return front
+
+
+def _title(rows: Sequence[Measurement]) -> str:
+    first, frames = rows[0], len({row.frame for row in rows})
+    several = f"{frames} frames, largest error and mean time of them, " if frames > 1 else ""
+    size = f"{first.width} x {first.height} pixels, {first.samples} samples"
+    return f"{first.scene}: {first.particles:,} particles, {size}\n{several}on {first.device} ({first.cores} cores)"
+
+
+def _canvas(title: str, panels: int, **shared: Any) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
+    axes = np.atleast_1d(figure.subplots(*((panels, 1) if "sharex" in shared else (1, panels)), **shared))
+    figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+    for axis in axes:
+        axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _saved(figure: Any, path: Path) -> Path:
+    with written_whole(path) as temporary:
+        figure.savefig(temporary)
+    return path
+
+
+def _legend(figure: Any, axis: Any, **options: Any) -> None:
+    """Outside of the axes, so that it hides nothing."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize="small", **options)
+
+
+def _shown(error: float) -> float:
+    return max(error, LEAST)
+
+
+def _label_zero(axis: Any, errors: Iterable[float], which: str) -> None:
+    """Name the place where errors that are too small for the scale are drawn."""
+    if min(errors, default=1.0) < LEAST:
+        getattr(axis, f"set_{which}lim")(LEAST / 2)
+        line = axis.axhline if which == "y" else axis.axvline
+        line(LEAST, color="#999999", linewidth=0.8, zorder=0)
+        place = (1.0, LEAST) if which == "y" else (LEAST, 0.02)
+        transform = axis.get_yaxis_transform() if which == "y" else axis.get_xaxis_transform()
+        words = {"ha": "right", "va": "bottom"} if which == "y" else {"ha": "right", "va": "bottom", "rotation": 90}
+        axis.text(*place, f" at most {LEAST:g}", transform=transform, color="#777777", fontsize="x-small", **words)
+
+
+def _error(points: Sequence[Point], title: str) -> Any:
+    figure, (axis,) = _canvas(title, 1)
+    controlled = [point for point in points if point.tolerance is not None and point.tolerance > 0]
+    tolerances = sorted({point.tolerance for point in controlled if point.tolerance is not None})
+    if tolerances:
+        ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
+        axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
+        axis.fill_between(ends, ends, [tolerances[-1] * 4] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
+        axis.set_ylim(top=tolerances[-1] * 4)
+        axis.set_xlim(ends)
+    for method, color in COLORS.items():
+        row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
+        if row:
+            x = [point.tolerance for point in row]
+            style: dict[str, Any] = {"color": color, "marker": MARKERS[method], "markersize": 6, "clip_on": False}
+            axis.plot(x, [_shown(point.error) for point in row], label=f"{method}: error", **style)
+            name = "bound" if method == "interval" else "estimate"
+            bounds = [_shown(point.bound or 0.0) for point in row]
+            axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
+    axis.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="largest error of a pixel, against full rate")
+    axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
+    axis.set_xticks([], minor=True)
+    _label_zero(axis, [value for point in controlled for value in (point.error, point.bound or 0.0)], "y")
+    _legend(figure, axis)
+    return figure
+
+
+def _pareto(points: Sequence[Point], title: str) -> Any:
+    figure, axes = _canvas(title, 2, sharey=True)
+    full = [point for point in points if point.method == FULL_RATE]
+    others = [point for point in points if point.method != FULL_RATE]
+    panels = (("error", others, "against full rate"), ("away", points, "against a converged image"))
+    for axis, (name, shown, against) in zip(axes, panels, strict=True):
+        errors = [_shown(getattr(point, name)) for point in shown]
+        for one in full:
+            axis.axhline(one.seconds, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
+        front = pareto_front(errors, [point.seconds for point in shown])
+        x, y = [errors[i] for i in front], [shown[i].seconds for i in front]
+        axis.plot(x, y, color="#009e73", linewidth=5, alpha=0.25, drawstyle="steps-post", label="Pareto front", zorder=1)
+        named: set[str] = set()
+        for point, error in zip(shown, errors, strict=True):
+            label = None if point.method in named else point.method
+            named.add(point.method)
+            axis.plot(error, point.seconds, linestyle="none", label=label, markersize=7, **_look(point.method, points))
+            if point.tolerance is not None:
+                place: dict[str, Any] = {"textcoords": "offset points", "xytext": (5, 4)}
+                axis.annotate(f"{point.tolerance:g}", (error, point.seconds), fontsize="x-small", color="#444444", **place)
+        axis.set(xscale="log", yscale="log", xlabel=f"largest error, {against}")
+        _label_zero(axis, [getattr(point, name) for point in shown], "x")
+    axes[0].set_ylabel("seconds a frame (compile time apart)")
+    _plain_numbers(axes[0].yaxis)
+    _plain_numbers(axes[1].xaxis)
+    _legend(figure, axes[1], title="numbers: tolerance")
+    return figure
+
+
+def _look(method: str, points: Sequence[Point]) -> dict[str, Any]:
+    if method in COLORS:
+        return {"color": COLORS[method], "marker": MARKERS[method]}
+    if method == FULL_RATE:
+        return {"color": "black", "marker": "o"}
+    baselines = list(dict.fromkeys(p.method for p in points if p.method not in COLORS and p.method != FULL_RATE))
+    color = BASELINE_COLORS[method.partition("/")[0]]
+    return {"color": color, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
+
+
+def _plain_numbers(axis: Any) -> None:
+    """Numbers as they are said, not as powers of ten, and enough of them where the range is short."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    if high < 100 * low:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 5 * low else (1, 1.5, 2, 3, 4, 5, 7)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _frames(rows: Sequence[Measurement], title: str) -> Any:
+    figure, (errors, times) = _canvas(title, 2, sharex=True)
+    tolerances = sorted({row.tolerance for row in rows if row.tolerance is not None})
+    for number, limit in enumerate(tolerances):
+        errors.axhline(limit, color="#bbbbbb", linewidth=0.8, linestyle=DASHES[number % len(DASHES)])
+    for method, tolerance in dict.fromkeys((row.method, row.tolerance) for row in rows):
+        line = sorted((r for r in rows if (r.method, r.tolerance) == (method, tolerance)), key=lambda row: row.frame or 0.0)
+        moments = [row.frame for row in line]
+        style: dict[str, Any] = {"markersize": 4, "linewidth": 1.2, **_look(method, summary(rows))}
+        if tolerance is not None:
+            style["linestyle"] = DASHES[tolerances.index(tolerance) % len(DASHES)]
+        label = method if tolerance is None else f"{method}, {tolerance:g}"
+        times.plot(moments, [row.total for row in line], label=label, **style)
+        if method != FULL_RATE:
+            errors.plot(moments, [_shown(row.max_error) for row in line], **style)
+    errors.set(yscale="log", ylabel="largest error")
+    times.set(yscale="log", xlabel="frame", ylabel="seconds a frame")
+    _label_zero(errors, [row.max_error for row in rows if row.method != FULL_RATE], "y")
+    _plain_numbers(times.yaxis)
+    shown = sorted({row.frame or 0.0 for row in rows})
+    if len(shown) <= MOST_TICKS:
+        times.set_xticks(shown, [f"{moment:g}" for moment in shown])
+    _legend(figure, times)
+    return figure

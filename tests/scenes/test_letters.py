@@ -1,0 +1,47 @@
+"""Letters fall freely, splash, and stay in their basin."""
+
+import numpy as np
+import pytest
+
+from jaxsph import scenes
+from jaxsph.scenes.letters import BASIN, GLYPHS, GRAVITY, SECONDS_A_FRAME, STROKE, area, distance
+
+
+def columns(frame, count=4000):
+    particles = scenes.load("letters", count, frame)[0].particles
+    return np.asarray(particles.position, np.float64), np.asarray(particles.quantity)
+
+
+def test_dye_tells_the_letters_apart_and_shares_are_those_of_their_volumes():
+    _, dye = columns(0)
+    values, counts = np.unique(dye, return_counts=True)
+    assert values == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert counts[1:] / counts[1] == pytest.approx([area(name) / area("S") for name in GLYPHS], rel=0.02)
+
+
+def test_letters_fall_freely_until_they_meet_the_water():
+    start, dye = columns(0)
+    for frame in (0.5, 1.5, 2.0):
+        place, _ = columns(frame)
+        drop = GRAVITY / 2 * (frame * SECONDS_A_FRAME) ** 2
+        dry = (dye > 0) & (start[:, 1] - drop > BASIN[1][1] + 0.02)
+        assert dry.sum() > 500 and place[dry] == pytest.approx(start[dry] - (0, drop, 0), abs=1e-5)
+
+
+def test_what_has_met_the_water_is_thrown_up_or_sinks_and_stays_between_the_walls():
+    start, dye = columns(0)
+    surface = BASIN[1][1]
+    for frame in (4.0, 7.0, 30.0):
+        place, _ = columns(frame)
+        for axis in (0, 2):
+            assert (place[:, axis] >= BASIN[0][axis] - 1e-6).all() and (place[:, axis] <= BASIN[1][axis] + 1e-6).all()
+        assert (place[:, 1] >= 0).all() and place[:, 1].max() < start[:, 1].max()
+        rising = (place[:, 1] > 1.8 * surface) & (dye > 0)
+        assert rising.any() == (frame < 30)
+    assert place[:, 1].max() < 2 * surface  # at rest, in a basin that is fuller by what fell into it
+
+
+def test_a_face_is_as_large_as_its_strokes():
+    bar = np.array([[0.3, 0.5], [0.3, 0.5 + STROKE], [0.3, 1.0]])
+    assert distance(bar, "H") == pytest.approx([0, STROKE, 0.3])
+    assert area("H") == pytest.approx(2 * (2 * STROKE + np.pi * STROKE**2) + (0.6 - 2 * STROKE) * 2 * STROKE, rel=0.02)
