@@ -1,0 +1,239 @@
+"""The sweep: errors are those of the images, the table is kept and never measured twice, the figures are drawn."""
+
+import csv
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph import cli, figures, provenance
+from jaxsph.contenders import BASELINES, baseline, scaled_up
+from jaxsph.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
+
+PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
+CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2", "size/2")}
+ONCE = {"repeats": 1, "converged": 1}
+SOURCE = ["scene:radial", "--particles", PARTICLES, "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
+LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1]
+
+
+@pytest.fixture(scope="module")
+def view():
+    return js.scenes.load("radial", PARTICLES, width=WIDTH, height=HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sweep")
+
+
+@pytest.fixture(scope="module")
+def rows(view, folder):
+    return js.sweep(*view, js.Settings(samples=SAMPLES), **CHOSEN, **ONCE, name="radial", folder=folder)
+
+
+def layers(image):
+    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.alpha, np.float64)[..., None]], -1)
+
+
+def run(capsys, *arguments):
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+def test_there_is_a_row_for_every_setting_full_rate_first(rows):
+    expected = [("full rate", None), ("samples/2", None), ("size/2", None)]
+    expected += [(name, tolerance) for name in CHOSEN["estimators"] for tolerance in CHOSEN["tolerances"]]
+    assert [(row.method, row.tolerance) for row in rows] == expected
+    size = (PARTICLES, WIDTH, HEIGHT, SAMPLES)
+    assert {(row.particles, row.width, row.height, row.samples) for row in rows} == {size}
+    assert all(row.repeats == 1 and row.dtype == "float32" and row.jaxsph == js.__version__ for row in rows)
+
+
+def test_errors_are_the_differences_of_the_images(view, rows):
+    scene, camera = view
+    settings = js.Settings(samples=SAMPLES)
+    full = js.render(scene, camera, settings)
+    coarse = js.render(scene, camera, dataclasses.replace(settings, samples=SAMPLES // 2))
+    error = np.abs(layers(coarse) - layers(full)).max(-1)
+    row = rows[1]
+    assert row.max_error == pytest.approx(error.max(), abs=1e-7) and row.mean_error == pytest.approx(error.mean(), abs=1e-7)
+    assert (row.evaluations, row.evaluations_full) == (coarse.stats["evaluations"], full.stats["evaluations"])
+    assert rows[0].max_error == 0 and rows[0].evaluations == rows[0].evaluations_full
+    relaxed = js.render(scene, camera, dataclasses.replace(settings, tolerance=0.3, relax=1.0))
+    away, row = np.abs(layers(relaxed) - layers(full)).max(-1), rows[-1]
+    assert row.max_error == pytest.approx(away.max(), abs=1e-7) and row.over_tolerance == (away > 0.3).mean()
+    assert row.max_bound == np.asarray(relaxed.error_bound).max() and row.evaluations == relaxed.stats["evaluations"]
+
+
+def test_certified_settings_keep_their_word(rows):
+    certified = [row for row in rows if row.certified]
+    assert [row.method for row in certified] == ["interval"] * 2
+    for row in certified:
+        assert row.max_error <= row.max_bound <= row.tolerance and row.over_tolerance == row.over_bound == 0
+
+
+def test_the_converged_image_has_that_many_times_the_samples(view, rows):
+    """Half the samples against twice as many is what `samples/2` is against full rate."""
+    (half,) = js.sweep(*view, js.Settings(samples=SAMPLES // 2), estimators=(), baselines=(), repeats=1, converged=2)
+    assert half.max_error == 0 and half.max_error_converged == pytest.approx(rows[1].max_error, abs=1e-7)
+    assert half.mean_error_converged == pytest.approx(rows[1].mean_error, abs=1e-7)
+
+
+def test_stages_add_up_and_compiling_is_apart(rows):
+    for row in rows:
+        assert row.total == pytest.approx(row.grid + row.adapt + row.cast + row.image)  # of one turn the median is the turn
+        assert min(row.grid, row.cast, row.image, row.full_total) > 0 and row.deviation == 0 and row.bytes > 0
+    first, again = (row for row in rows if row.method == "interval")
+    assert first.compile > 10 * again.compile  # a tolerance compiles nothing
+
+
+def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypatch):
+    before = (folder / JOURNAL).read_text()
+    steps = []
+    settings = js.Settings(samples=SAMPLES)
+    more = {"name": "radial", "folder": folder, "progress": lambda done, total: steps.append((done, total))}
+    assert js.sweep(*view, settings, **CHOSEN, **ONCE, **more) == rows
+    assert not steps and (folder / JOURNAL).read_text() == before
+    found = js.sweep(*view, settings, **CHOSEN | {"tolerances": (0.02, 0.1), "estimators": ("interval",)}, **ONCE, **more)
+    assert [row.tolerance for row in found[3:]] == [0.02, 0.1] and found[:4] == rows[:4]
+    added = (folder / JOURNAL).read_text().removeprefix(before).splitlines()
+    assert [json.loads(line)["tolerance"] for line in added] == [0.1]
+    assert steps == [(done, 5) for done in range(1, 6)]  # two truths, the new setting, and its turn with full rate
+
+
+def test_other_data_is_another_measurement(view):
+    scene, camera = view
+    settings = js.Settings(samples=SAMPLES)
+    moved = dataclasses.replace(scene.particles, quantity=scene.particles.quantity + 1e-3)
+    nearer = dataclasses.replace(camera, near=camera.near * 0.9)
+    wider = dataclasses.replace(camera, width=WIDTH + 1)
+    variants = [(scene, camera, settings, 8), (dataclasses.replace(scene, particles=moved), camera, settings, 8)]
+    variants += [(scene, nearer, settings, 8), (scene, wider, settings, 8), (scene, camera, settings, 4)]
+    variants += [(scene, camera, js.Settings(samples=SAMPLES, merge=False), 8)]
+    digests = [provenance.of_frame(*variant)["fingerprint"] for variant in variants]
+    assert len(set(digests)) == len(variants) and digests[0] == provenance.of_frame(*view, settings, 8)["fingerprint"]
+
+
+def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(rows, tmp_path):
+    path = tmp_path / JOURNAL
+    append(path, rows[0])
+    with open(path, "a") as file:
+        file.write('{"scene": "rad')
+    assert read_journal(path) == [rows[0]]
+    append(path, rows[1])
+    assert read_journal(path) == rows[:2]
+    path.write_text('{"scene": "radial"}\n')
+    with pytest.raises(ValueError, match=r"line 1 is not a measurement.*another folder"):
+        read_journal(path)
+
+
+def test_the_csv_is_the_same_table(rows, tmp_path):
+    write_table(tmp_path / TABLE, rows)
+    with open(tmp_path / TABLE, newline="") as file:
+        found = list(csv.DictReader(file))
+    assert tuple(found[0]) == COLUMNS and len(found) == len(rows)
+    for got, row in zip(found, rows, strict=True):
+        assert got["method"] == row.method and float(got["max_error"]) == row.max_error
+        assert got["tolerance"] == ("" if row.tolerance is None else str(row.tolerance))
+
+
+def test_a_smaller_image_is_read_where_its_rays_pass():
+    """A ramp over the view is reproduced by fewer pixels of another aspect, but for the border that they do not reach."""
+    camera = js.Camera.look_at((0, 0, 5), (0, 0, 0), width=40, height=33, near=1, far=2)
+    small = baseline(js.Settings(), "size/2").camera(camera)
+    assert (small.width, small.height) == (20, 17)
+
+    def ramp(view):
+        across = (2 * (np.arange(view.width) + 0.5) / view.width - 1) * view.width / view.height
+        down = 2 * (np.arange(view.height) + 0.5) / view.height - 1
+        return np.stack(np.broadcast_arrays(across[None], down[:, None], 0.0, 1.0), -1)
+
+    inner = np.s_[2:-2, 2:-2]
+    assert scaled_up(ramp(small), camera)[inner] == pytest.approx(ramp(camera)[inner], abs=1e-12)
+    assert scaled_up(ramp(camera), camera) is not None and (scaled_up(ramp(camera), camera) == ramp(camera)).all()
+    assert [baseline(js.Settings(), name).shrink for name in BASELINES] == [1, 1, 2, 4]
+    assert [baseline(js.Settings(), name).settings.samples for name in BASELINES] == [128, 64, 256, 256]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"estimators": ("exact",)}, "'interval', 'interval relaxed', 'pilot', got 'exact'"),
+        ({"baselines": ("pixels/2",)}, "'samples/2' or 'size/4', got 'pixels/2'"),
+        ({"baselines": ("size/0",)}, "got 'size/0'"),
+        ({"tolerances": (-1.0,)}, "`tolerance` must be >= 0"),
+        ({"repeats": 0}, "`repeats` must be an integer of at least 1, got 0"),
+        ({"converged": 0}, "`converged` must be"),
+        ({"settings": js.Settings(tolerance=0.1)}, "give `tolerances` instead"),
+        ({"frames": (1, 2)}, "1 different numbers"),
+    ],
+)
+def test_bad_arguments_are_named(view, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        js.sweep(*view, **arguments)
+    with pytest.raises(ValueError, match="must pair, got 2 and 1"):
+        js.sweep([view[0]] * 2, view[1])
+
+
+def test_the_front_holds_what_nothing_beats():
+    errors, seconds = [0.1, 0.01, 0.1, 0.001, 0.0, 0.5], [1.0, 2.0, 0.5, 3.0, 9.0, 0.5]
+    assert figures.pareto_front(errors, seconds) == [4, 3, 1, 2]
+    assert figures.pareto_front([], []) == []
+
+
+def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
+    pytest.importorskip("matplotlib")
+    later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=row.total + 2) for row in rows]
+    points = figures.summary([*rows, *later])
+    assert [point.error for point in points] == [row.max_error + 1 for row in rows]
+    assert [point.seconds for point in points] == pytest.approx([row.total + 1 for row in rows])
+
+
+def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--frames", 0, 2, *LEAST_WORK)
+    assert (code, err) == (0, [])
+    names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "frames.png")
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == sorted(names)
+    assert all(name in out for name in names) and "samples/2" in out and "frame 2" in out
+    found = read_journal(tmp_path / "new" / "out" / JOURNAL)
+    assert [(row.frame, row.method) for row in found] == [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
+    assert {row.max_error for row in found[1::2]} == {rows[1].max_error}  # it does not move
+
+
+def test_without_matplotlib_the_command_says_so_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    code, _, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "out", *LEAST_WORK)
+    assert code == 1 and len(err) == 1 and "jaxsph[color]" in err[0] and not (tmp_path / "out").exists()
+    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "out", *LEAST_WORK, "--no-figures")
+    assert (code, err) == (0, []) and "png" not in out and (tmp_path / "out" / TABLE).exists()
+
+
+def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    code, _, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "taken", *LEAST_WORK, "--no-figures")
+    assert code == 1 and len(err) == 1 and "taken" in err[0] and "another one" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "-o"),
+        (["-o", "out", "--tolerances", "-1"], "number >= 0"),
+        (["-o", "out", "--tolerances", "none"], "'none'"),
+        (["-o", "out", "--estimators", "exact"], "invalid choice"),
+        (["-o", "out", "--baselines", "half"], "samples/2"),
+        (["-o", "out", "--repeats", "0"], "at least 1"),
+        (["-o", "out", "--samples", "0"], "`samples` must be"),
+        (["-o", "out", "--frames", "1", "1"], "different"),
+        (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2_and_one_line(capsys, arguments, message):
+    code, _, err = run(capsys, "sweep", "scene:radial", *arguments)
+    assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
