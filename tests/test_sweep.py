@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import importlib
 import json
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from jaxsph.contenders import BASELINES, baseline, scaled_up
 from jaxsph.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
 
 PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
-CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2", "size/2")}
+CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2",)}
 ONCE = {"repeats": 1, "converged": 1}
 SOURCE = ["scene:radial", "--particles", PARTICLES, "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
 LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1]
@@ -46,7 +48,7 @@ def run(capsys, *arguments):
 
 
 def test_there_is_a_row_for_every_setting_full_rate_first(rows):
-    expected = [("full rate", None), ("samples/2", None), ("size/2", None)]
+    expected = [("full rate", None), ("samples/2", None)]
     expected += [(name, tolerance) for name in CHOSEN["estimators"] for tolerance in CHOSEN["tolerances"]]
     assert [(row.method, row.tolerance) for row in rows] == expected
     size = (PARTICLES, WIDTH, HEIGHT, SAMPLES)
@@ -100,10 +102,62 @@ def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypat
     assert js.sweep(*view, settings, **CHOSEN, **ONCE, **more) == rows
     assert not steps and (folder / JOURNAL).read_text() == before
     found = js.sweep(*view, settings, **CHOSEN | {"tolerances": (0.02, 0.1), "estimators": ("interval",)}, **ONCE, **more)
-    assert [row.tolerance for row in found[3:]] == [0.02, 0.1] and found[:4] == rows[:4]
+    assert [row.tolerance for row in found[2:]] == [0.02, 0.1] and found[:3] == rows[:3]
     added = (folder / JOURNAL).read_text().removeprefix(before).splitlines()
     assert [json.loads(line)["tolerance"] for line in added] == [0.1]
     assert steps == [(done, 5) for done in range(1, 6)]  # two truths, the new setting, and its turn with full rate
+
+
+@pytest.fixture
+def by_reference(monkeypatch):
+    """The reference renderer in place of the fast one: nothing is compiled. Gives the settings and sizes it was asked for."""
+    module, calls = importlib.import_module("jaxsph.sweep"), []
+
+    def render(scene, camera, settings, *, plan=None):
+        calls.append((settings.tolerance, camera.width))
+        image = js.reference.render(scene, camera, settings)
+        seconds = dict.fromkeys(("plan", "compile", "grid", "adapt", "cast", "image"), 1.0)
+        return dataclasses.replace(image, stats=image.stats | {"seconds": seconds})
+
+    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(module, "make_plan", lambda *_: types.SimpleNamespace(bytes=1))
+    return calls
+
+
+def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
+    scene, camera = js.scenes.load("radial", 50, width=24, height=16)
+    settings = js.Settings(samples=8)
+    full, half = js.sweep(scene, camera, settings, estimators=(), baselines=("size/2",), **ONCE)
+    small = js.reference.render(scene, dataclasses.replace(camera, width=12, height=8), settings)
+    expected = np.abs(scaled_up(layers(small), camera) - layers(js.reference.render(scene, camera, settings))).max(-1)
+    assert half.max_error == expected.max() > 0 and half.mean_error == expected.mean()
+    assert half.evaluations < full.evaluations == half.evaluations_full
+    assert half.image > full.image and half.certified is False and half.max_bound is None
+
+
+def test_each_group_takes_turns_with_full_rate(by_reference):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.1, 0.2), "estimators": ("pilot",), "baselines": ("size/2",), "repeats": 2}
+    rows = js.sweep(scene, camera, js.Settings(samples=4), **chosen)
+    truths, turns = [(None, 8)] * 2, [(None, 8), (0.1, 8), (0.2, 8)]
+    assert by_reference == [*truths, (None, 4), *[(None, 8), (None, 4)] * 2, (0.1, 8), (0.2, 8), *turns * 2]
+    assert all(row.full_total == 4 and row.repeats == 2 for row in rows)
+
+
+def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "folder": tmp_path}
+
+    def stop(done, total):
+        if done == total:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        js.sweep(scene, camera, js.Settings(samples=4), **chosen, progress=stop)
+    assert [row.method for row in read_journal(tmp_path / JOURNAL)] == ["full rate"]
+    by_reference.clear()
+    rows = js.sweep(scene, camera, js.Settings(samples=4), **chosen)
+    assert [row.method for row in rows] == ["full rate", "pilot"] and len(by_reference) == 2 + 1 + 2
 
 
 def test_other_data_is_another_measurement(view):
