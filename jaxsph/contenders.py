@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,12 @@ class Contender:
     def tolerance(self) -> float | None:
         """What error control is asked for."""
         return self.settings.tolerance
+
+    @property
+    def kind(self) -> Hashable:
+        """What fixes its plan besides the frame: all but the numbers that a plan does not depend on."""
+        tolerance = None if self.tolerance is None else 0.0
+        return dataclasses.replace(self.settings, tolerance=tolerance, relax=0.0), self.shrink
 
     def camera(self, camera: Camera) -> Camera:
         """`camera`, for the image that is rendered."""

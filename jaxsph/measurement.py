@@ -42,7 +42,7 @@ class Measurement:
         max_error_converged, mean_error_converged: against an image of `converged` times the samples.
         converged: that factor.
         evaluations, evaluations_full: kernel evaluations, and those of full rate.
-        plan, compile: seconds to make the plan, and to compile what no setting before had compiled.
+        plan, compile: seconds to make the plan, 0 where an earlier one serves, and to compile what was not compiled before.
         grid, adapt, cast, image: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks for it.
         total: median of their sum.
         deviation: median deviation of that sum from `total`, seconds.

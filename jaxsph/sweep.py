@@ -8,11 +8,12 @@ and plans are apart.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from jaxsph.render import render
 STAGES = ("grid", "adapt", "cast", "image")
 
 Progress = Callable[[int, int], None]
+Plans = dict[Hashable, Plan]
+"""By kind of contender: frames of a sequence share them, so that little is compiled for the later ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,8 +107,9 @@ def sweep(
         frame = _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number})
         tasks.append((frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]))
     tick = _ticker(progress, sum(_num_renders(missing, repeats) for _, missing in tasks))
+    plans: Plans = {}
     for frame, missing in tasks:
-        for row in _measure(frame, groups[0][0], missing, tick):
+        for row in _measure(frame, groups[0][0], missing, plans, tick):
             held[row.key] = row
             if folder is not None:
                 append(_journal(folder), row)
@@ -153,20 +157,22 @@ def _ticker(progress: Progress | None, total: int) -> Callable[[], None]:
     return tick
 
 
-def _measure(frame: _Frame, full: Contender, missing: list[list[Contender]], tick: Callable[[], None]) -> Iterable[Measurement]:
+def _measure(
+    frame: _Frame, full: Contender, missing: list[list[Contender]], plans: Plans, tick: Callable[[], None]
+) -> Iterable[Measurement]:
     """Rows of what is missing of a frame, as soon as each group has taken its turns."""
     if not any(missing):
         return
     finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
-    truth = _layers(render(frame.scene, frame.camera, finer))
+    truth = _First.of(frame, Contender("converged", finer), plans).layers
     tick()
-    of_full = _First.of(frame, full)
+    of_full = _First.of(frame, full, plans)
     tick()
     for group in missing:
         firsts = [of_full]
         for setting in group:
             if setting is not full:
-                firsts.append(_First.of(frame, setting))
+                firsts.append(_First.of(frame, setting, plans))
                 tick()
         times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
         for first, turns in zip(firsts, times, strict=False):
@@ -187,13 +193,18 @@ class _First:
     layers: Float[np.ndarray, "height width 4"]
 
     @classmethod
-    def of(cls, frame: _Frame, setting: Contender) -> _First:
-        camera = setting.camera(frame.camera)
-        started = time.perf_counter()
-        plan = make_plan(frame.scene, camera, setting.settings)
-        planned = time.perf_counter() - started
-        image = render(frame.scene, camera, setting.settings, plan=plan)
-        return cls(setting, plan, planned, image.stats["seconds"]["compile"], image, scaled_up(_layers(image), frame.camera))
+    def of(cls, frame: _Frame, setting: Contender, plans: Plans) -> _First:
+        view, image, planned = (frame.scene, setting.camera(frame.camera), setting.settings), None, 0.0
+        if setting.kind in plans:
+            with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
+                image = render(*view, plan=plans[setting.kind])
+        if image is None:
+            started = time.perf_counter()
+            plans[setting.kind] = make_plan(*view)
+            planned = time.perf_counter() - started
+            image = render(*view, plan=plans[setting.kind])
+        compiled, layers = image.stats["seconds"]["compile"], scaled_up(_layers(image), frame.camera)
+        return cls(setting, plans[setting.kind], planned, compiled, image, layers)
 
 
 def _in_turns(frame: _Frame, firsts: Sequence[_First], repeats: int, tick: Callable[[], None]) -> list[list[dict[str, float]]]:

@@ -144,6 +144,22 @@ def test_each_group_takes_turns_with_full_rate(by_reference):
     assert all(row.full_total == 4 and row.repeats == 2 for row in rows)
 
 
+def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
+    module = importlib.import_module("jaxsph.sweep")
+    views = [js.scenes.load("letters", 20, frame, width=8, height=8) for frame in range(3)]
+    made, fits = [], module.render
+
+    def render(scene, camera, settings, *, plan):
+        if scene is views[2][0] and plan.bytes <= 2:
+            raise js.CapacityError("too small")
+        return fits(scene, camera, settings, plan=plan)
+
+    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(module, "make_plan", lambda *_: made.append(None) or types.SimpleNamespace(bytes=len(made)))
+    rows = js.sweep(*zip(*views, strict=True), js.Settings(samples=4), estimators=(), baselines=(), **ONCE | {"converged": 2})
+    assert [(row.frame, row.bytes) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
+
+
 def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
     scene, camera = js.scenes.load("radial", 20, width=8, height=8)
     chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "folder": tmp_path}
