@@ -62,7 +62,7 @@ def keeps_its_word(row: Measurement) -> bool:
 def on_the_front(rows: list[Measurement]) -> list[str]:
     """Settings that nothing beats in both error against full rate and time, over all frames."""
     points = [point for point in figures.summary(rows) if point.method != "full rate"]
-    front = figures.pareto_front([point.error for point in points], [point.seconds for point in points])
+    front = figures.pareto_front([point.error for point in points], [point.time for point in points])
     names = [(points[i].method, points[i].tolerance) for i in front]
     return [method if tolerance is None else f"{method} {tolerance:g}" for method, tolerance in names]
 

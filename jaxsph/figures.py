@@ -3,6 +3,7 @@
 Flow: measurements -> [figures] -> error.png, pareto.png, frames.png.
 
 Drawn with matplotlib, which is optional. Where a sweep has several frames, errors are the largest and times the means of them.
+Times are shares of what full rate took in the same turns, as a busy machine is slow for both.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00"), strict=True))
 """Of the estimators: Okabe and Ito's, which all can tell apart."""
 
 MARKERS = dict(zip(ESTIMATORS, "osD", strict=True))
+MARKER_SIZES = dict(zip(ESTIMATORS, (10, 7, 4), strict=True))
+"""What is drawn later is smaller, so that equal results of two estimators are both seen."""
+LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4)), strict=True))
 BASELINE_COLORS = {"samples": "#8a8a8a", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
@@ -42,7 +46,7 @@ class Point:
     error: float
     away: float
     bound: float | None
-    seconds: float
+    time: float
 
 
 def require_matplotlib() -> None:
@@ -73,12 +77,12 @@ def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
     figures = {"error.png": _error, "pareto.png": _pareto}
     written = [_saved(draw_one(points, _title(rows)), Path(folder) / name) for name, draw_one in figures.items()]
     if len({row.frame for row in rows}) > 1:
-        written.append(_saved(_frames(rows, _title(rows[:1])), Path(folder) / "frames.png"))
+        written.append(_saved(_frames(rows, _title(rows, summed=False)), Path(folder) / "frames.png"))
     return written
 
 
 def summary(rows: Sequence[Measurement]) -> list[Point]:
-    """Of every setting, in order: largest errors and bound, and mean seconds, over its frames."""
+    """Of every setting, in order: largest errors and bound, and time over that of full rate, over its frames."""
     groups: dict[tuple[str, float | None], list[Measurement]] = {}
     for row in rows:
         groups.setdefault((row.method, row.tolerance), []).append(row)
@@ -86,25 +90,27 @@ def summary(rows: Sequence[Measurement]) -> list[Point]:
     for (method, tolerance), group in groups.items():
         bounds = [row.max_bound for row in group if row.max_bound is not None]
         errors = (max(row.max_error for row in group), max(row.max_error_converged for row in group))
-        seconds = float(np.mean([row.total for row in group]))
-        points.append(Point(method, tolerance, *errors, max(bounds, default=None), seconds))
+        share = sum(row.total for row in group) / sum(row.full_total for row in group)
+        points.append(Point(method, tolerance, *errors, max(bounds, default=None), share))
     return points
 
 
-def pareto_front(errors: Sequence[float], seconds: Sequence[float]) -> list[int]:
+def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
     """Indices, by error, of what is faster than all that is at most as wrong."""
     front: list[int] = []
-    for index in sorted(range(len(errors)), key=lambda i: (errors[i], seconds[i])):
-        if not front or seconds[index] < seconds[front[-1]]:
+    for index in sorted(range(len(errors)), key=lambda i: (errors[i], times[i])):
+        if not front or times[index] < times[front[-1]]:
             front.append(index)
     return front
 
 
-def _title(rows: Sequence[Measurement]) -> str:
+def _title(rows: Sequence[Measurement], summed: bool = True) -> str:
     first, frames = rows[0], len({row.frame for row in rows})
-    several = f"{frames} frames, largest error and mean time of them, " if frames > 1 else ""
+    several = f"{frames} frames, largest error and mean time, " if frames > 1 and summed else ""
+    full = float(np.median([row.full_total for row in rows]))
     size = f"{first.width} x {first.height} pixels, {first.samples} samples"
-    return f"{first.scene}: {first.particles:,} particles, {size}\n{several}on {first.device} ({first.cores} cores)"
+    machine = f"on {first.device} ({first.cores} cores), where full rate takes {full:.3g} s a frame"
+    return f"{first.scene}: {first.particles:,} particles, {size}\n{several}{machine}"
 
 
 def _canvas(title: str, panels: int, **shared: Any) -> tuple[Any, Any]:
@@ -161,7 +167,13 @@ def _error(points: Sequence[Point], title: str) -> Any:
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
             x = [point.tolerance for point in row]
-            style: dict[str, Any] = {"color": color, "marker": MARKERS[method], "markersize": 6, "clip_on": False}
+            style: dict[str, Any] = {
+                "color": color,
+                "marker": MARKERS[method],
+                "markersize": MARKER_SIZES[method],
+                "clip_on": False,
+            }
+            style["linewidth"] = MARKER_SIZES[method] / 3
             axis.plot(x, [_shown(point.error) for point in row], label=f"{method}: error", **style)
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
@@ -176,41 +188,52 @@ def _error(points: Sequence[Point], title: str) -> Any:
 
 def _pareto(points: Sequence[Point], title: str) -> Any:
     figure, axes = _canvas(title, 2, sharey=True)
-    full = [point for point in points if point.method == FULL_RATE]
     others = [point for point in points if point.method != FULL_RATE]
     panels = (("error", others, "against full rate"), ("away", points, "against a converged image"))
     for axis, (name, shown, against) in zip(axes, panels, strict=True):
         errors = [_shown(getattr(point, name)) for point in shown]
-        for one in full:
-            axis.axhline(one.seconds, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
-        front = pareto_front(errors, [point.seconds for point in shown])
-        x, y = [errors[i] for i in front], [shown[i].seconds for i in front]
+        axis.axhline(1, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
+        front = pareto_front(errors, [point.time for point in shown])
+        x, y = [errors[i] for i in front], [shown[i].time for i in front]
         axis.plot(x, y, color="#009e73", linewidth=5, alpha=0.25, drawstyle="steps-post", label="Pareto front", zorder=1)
         named: set[str] = set()
         for point, error in zip(shown, errors, strict=True):
             label = None if point.method in named else point.method
             named.add(point.method)
-            axis.plot(error, point.seconds, linestyle="none", label=label, markersize=7, **_look(point.method, points))
-            if point.tolerance is not None:
-                place: dict[str, Any] = {"textcoords": "offset points", "xytext": (5, 4)}
-                axis.annotate(f"{point.tolerance:g}", (error, point.seconds), fontsize="x-small", color="#444444", **place)
-        axis.set(xscale="log", yscale="log", xlabel=f"largest error, {against}")
+            axis.plot(error, point.time, linestyle="none", label=label, **_look(point.method, points))
+        _label_tolerances(axis, shown, errors)
+        axis.set(xscale="log", xlabel=f"largest error, {against}")
         _label_zero(axis, [getattr(point, name) for point in shown], "x")
-    axes[0].set_ylabel("seconds a frame (compile time apart)")
-    _plain_numbers(axes[0].yaxis)
+    axes[0].set_ylabel("time of a frame, over that of full rate")
+    axes[0].set_ylim(0, 1.1 * max(1.0, *(point.time for point in points)))
     _plain_numbers(axes[1].xaxis)
     _legend(figure, axes[1], title="numbers: tolerance")
     return figure
 
 
+def _label_tolerances(axis: Any, points: Sequence[Point], errors: Sequence[float]) -> None:
+    """Write tolerances beside the points, those of one estimator that lie together as one."""
+    places: dict[tuple[str, int, int], list[tuple[float, float, str]]] = {}
+    for point, error in zip(points, errors, strict=True):
+        if point.tolerance is not None:
+            near = (point.method, round(4 * np.log10(error)), round(10 * point.time))
+            places.setdefault(near, []).append((error, point.time, f"{point.tolerance:g}"))
+    for (method, *_), found in places.items():
+        error, time, _ = found[0]
+        right, up = LABEL_PLACES[method]
+        style: dict[str, Any] = {"fontsize": "x-small", "color": COLORS[method], "ha": "left" if right > 0 else "center"}
+        text = ", ".join(tolerance for *_, tolerance in found)
+        axis.annotate(text, (error, time), textcoords="offset points", xytext=(right, up), **style)
+
+
 def _look(method: str, points: Sequence[Point]) -> dict[str, Any]:
     if method in COLORS:
-        return {"color": COLORS[method], "marker": MARKERS[method]}
+        return {"color": COLORS[method], "marker": MARKERS[method], "markersize": MARKER_SIZES[method]}
     if method == FULL_RATE:
-        return {"color": "black", "marker": "o"}
+        return {"color": "black", "marker": "o", "markersize": 8}
     baselines = list(dict.fromkeys(p.method for p in points if p.method not in COLORS and p.method != FULL_RATE))
     color = BASELINE_COLORS[method.partition("/")[0]]
-    return {"color": color, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
+    return {"color": color, "markersize": 7, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
 
 
 def _plain_numbers(axis: Any) -> None:
@@ -226,23 +249,25 @@ def _plain_numbers(axis: Any) -> None:
 
 def _frames(rows: Sequence[Measurement], title: str) -> Any:
     figure, (errors, times) = _canvas(title, 2, sharex=True)
+    points = summary(rows)
     tolerances = sorted({row.tolerance for row in rows if row.tolerance is not None})
     for number, limit in enumerate(tolerances):
         errors.axhline(limit, color="#bbbbbb", linewidth=0.8, linestyle=DASHES[number % len(DASHES)])
     for method, tolerance in dict.fromkeys((row.method, row.tolerance) for row in rows):
         line = sorted((r for r in rows if (r.method, r.tolerance) == (method, tolerance)), key=lambda row: row.frame or 0.0)
         moments = [row.frame for row in line]
-        style: dict[str, Any] = {"markersize": 4, "linewidth": 1.2, **_look(method, summary(rows))}
+        style: dict[str, Any] = {"linewidth": 1.2, **_look(method, points)}
+        style["markersize"] *= 0.7
         if tolerance is not None:
             style["linestyle"] = DASHES[tolerances.index(tolerance) % len(DASHES)]
         label = method if tolerance is None else f"{method}, {tolerance:g}"
-        times.plot(moments, [row.total for row in line], label=label, **style)
+        times.plot(moments, [row.total / row.full_total for row in line], label=label, **style)
         if method != FULL_RATE:
             errors.plot(moments, [_shown(row.max_error) for row in line], **style)
     errors.set(yscale="log", ylabel="largest error")
-    times.set(yscale="log", xlabel="frame", ylabel="seconds a frame")
+    times.set(xlabel="frame", ylabel="time, over full rate")
     _label_zero(errors, [row.max_error for row in rows if row.method != FULL_RATE], "y")
-    _plain_numbers(times.yaxis)
+    times.set_ylim(bottom=0)
     shown = sorted({row.frame or 0.0 for row in rows})
     if len(shown) <= MOST_TICKS:
         times.set_xticks(shown, [f"{moment:g}" for moment in shown])

@@ -258,10 +258,10 @@ def test_the_front_holds_what_nothing_beats():
 
 def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
     pytest.importorskip("matplotlib")
-    later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=row.total + 2) for row in rows]
+    later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=2.0, full_total=4.0) for row in rows]
     points = figures.summary([*rows, *later])
     assert [point.error for point in points] == [row.max_error + 1 for row in rows]
-    assert [point.seconds for point in points] == pytest.approx([row.total + 1 for row in rows])
+    assert [point.time for point in points] == pytest.approx([(row.total + 2) / (row.full_total + 4) for row in rows])
 
 
 def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
