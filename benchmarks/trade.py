@@ -2,8 +2,8 @@
 
 `jaxsph.sweep` measures every estimator at every tolerance, coarser sampling and smaller images for five scenes, those of the
 first paper's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is measured on where
-an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are for reading. The
-default size takes some 20 minutes on two cores.
+an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are for reading. Most of
+the time is compiling: some two minutes a scene on two busy cores.
 
     python benchmarks/trade.py [--repeats 3] [--size 256] [--scenes mixer radial] [--particles 50000] [--frames 0 2]
 """

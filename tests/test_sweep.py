@@ -256,6 +256,15 @@ def test_the_front_holds_what_nothing_beats():
     assert figures.pareto_front([], []) == []
 
 
+def test_scenes_are_not_drawn_over_each_other(rows, tmp_path):
+    pytest.importorskip("matplotlib")
+    with pytest.raises(ValueError, match="one scene, got mixer, radial; draw each on its own"):
+        figures.draw([*rows, dataclasses.replace(rows[0], scene="mixer")], tmp_path)
+    with pytest.raises(ValueError, match="got nothing"):
+        figures.draw([], tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
     pytest.importorskip("matplotlib")
     later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=2.0, full_total=4.0) for row in rows]
