@@ -31,7 +31,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
 from jaxsph.numerics.staging import computed_once
 
-DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
+DEVIATIONS = 7.0  # standard deviations that pixels are taken to stay within
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 CLEAR = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
