@@ -201,6 +201,7 @@ def _pareto(points: Sequence[Point], title: str) -> Any:
             label = None if point.method in named else point.method
             named.add(point.method)
             axis.plot(error, point.time, linestyle="none", label=label, **_look(point.method, points))
+        axis.margins(x=0.15)  # room for the labels
         _label_tolerances(axis, shown, errors)
         axis.set(xscale="log", xlabel=f"largest error, {against}")
         _label_zero(axis, [getattr(point, name) for point in shown], "x")
