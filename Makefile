@@ -2,8 +2,8 @@
 SHELL := /bin/bash
 VENV := .venv
 PYTHON ?=
-# 0 runs the suite in one process; each further process compiles its own programs.
-JOBS ?= 0
+# Processes that share the suite file by file, as tests of a file share compiled programs; 0 runs all in one.
+JOBS ?= 2
 PYTEST_ARGS ?=
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
@@ -32,10 +32,10 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@touch $(VENV)/.installed-test $@
 
 test: lint
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) $(PYTEST_ARGS)
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) -m '' $(PYTEST_ARGS)
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile -m '' $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .
