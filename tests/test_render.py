@@ -1,6 +1,7 @@
 """Promises of `render`: it is the reference image, whatever the scene, the camera and the plan."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -75,8 +76,13 @@ def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, pro
         compare(image, js.reference.render(scene, camera, frames.settings), 1e-10)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (8, 8), (9, 7), (33, 16), (5, 40)])
-@pytest.mark.parametrize("samples", [1, 5, 16, 33])
+SIZES, SAMPLES = [(1, 1), (8, 8), (9, 7), (33, 16), (5, 40)], [1, 5, 16, 33]
+EACH_ONCE = [((1, 1), 1), ((8, 8), 16), ((9, 7), 5), ((33, 16), 33), ((5, 40), 1)]  # each is a plan, and so a compilation
+
+
+@pytest.mark.parametrize(("size", "samples"), [
+    pytest.param(*both, marks=() if both in EACH_ONCE else pytest.mark.slow) for both in itertools.product(SIZES, SAMPLES)
+])  # fmt: skip
 def test_any_image_size_and_number_of_samples(frames, compare, size, samples):
     rng = np.random.default_rng(size[0] * samples)
     scene = frames.scene(rng, decades=0.0)
