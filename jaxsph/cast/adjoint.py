@@ -6,9 +6,6 @@ Forward, derivatives are those of the march itself. Backward, the slabs are marc
 in `points`: its sums over particles and its light are held, what each slab is worth follows from the rays before and behind it
 (`worth`), and what it is worth is paid out to the samples, and by them to particles (`moments`). So memory is that of the march,
 whatever the number of samples or of particles in a cell.
-
-Both are one linear map A and its transpose. JAX takes such a pair as the solution of a linear system: with $L = [[1, 0], [-A,
-1]]$ the solution of $L x = (t, 0)$ is $(t, A t)$, and that of $L^T x = (0, c)$ is $(A^T c, c)$.
 """
 
 from __future__ import annotations
@@ -29,14 +26,16 @@ from jaxsph.access.lattice import Lattice
 from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import RAYS, unlit
 from jaxsph.cast.moments import COLUMNS, WIDTH, owe_particles
-from jaxsph.cast.points import CastPlan, Rays, _fullest_first, _sample_depths, cast_points, gather_field
+from jaxsph.cast.points import CastPlan, Rays, cast_points, gather_field, order_by_fullness, sample_depths
 from jaxsph.cast.shading import shade
 from jaxsph.cast.worth import Seen, owe_transfer, pathwise, unseen, value_samples, value_slabs
 from jaxsph.control.worklist import Worklist
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.transposed import linear_map
 
+TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
 Light = tuple[Array, Array]  # colour and transmittance of an image, or what is to be said of them
 
@@ -138,7 +137,8 @@ def _moved(kernel: str, plan: CastPlan, primals: tuple[Values, Held], tangents: 
         owed = jax.tree.leaves(_pull(kernel, plan, wanted, values, held, image, worth))
         return [owed[i] for i in moving]
 
-    color, transmittance = _linear(push, pull, [moves[i] for i in moving], (found.color, found.transmittance), leaves)
+    like = found.color, found.transmittance
+    color, transmittance = linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE)
     return found, dataclasses.replace(still, color=color, transmittance=transmittance)
 
 
@@ -164,43 +164,6 @@ def _require_values(held: Held) -> None:
         raise NotImplementedError(
             "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
         )
-
-
-def _linear(push: Any, pull: Any, moves: list[Array], like: Light, depends: list[Array]) -> Light:
-    """`push(moves)`, whose transpose is `pull`. Differentiated again, it raises: neither depends on the values for JAX."""
-
-    def tied(moves: list[Array], depends: list[Array]) -> Light:
-        """Zeros like the image that depend on `moves`, linearly, and on `depends`."""
-        zero = 0 * functools.reduce(jnp.add, [leaf.ravel()[0].astype(like[0].dtype) for leaf in moves])
-        zero = zero * functools.reduce(jnp.add, [leaf.ravel()[0].astype(zero.dtype) for leaf in depends]) if depends else zero
-        return jnp.broadcast_to(zero, like[0].shape), jnp.broadcast_to(zero, like[1].shape)
-
-    def minus(light: Light, other: Light) -> Light:
-        return light[0] - other[0], light[1] - other[1]
-
-    def matrix(pair: tuple[list[Array], Light]) -> tuple[list[Array], Light]:
-        return pair[0], minus(pair[1], tied(pair[0], [_once(leaf) for leaf in depends]))
-
-    def solve(_: Any, right: tuple[list[Array], Light]) -> tuple[list[Array], Light]:
-        pushed = push(right[0])
-        return right[0], (right[1][0] + pushed[0], right[1][1] + pushed[1])
-
-    def solve_transposed(_: Any, right: tuple[list[Array], Light]) -> tuple[list[Array], Light]:
-        return [value + owed for value, owed in zip(right[0], pull(right[1]), strict=True)], right[1]
-
-    return lax.custom_linear_solve(matrix, (moves, tied(moves, [])), solve, solve_transposed)[1]
-
-
-@jax.custom_jvp
-def _once(value: Array) -> Array:
-    return value
-
-
-@_once.defjvp
-def _twice(primals: Any, tangents: Any) -> Any:
-    raise NotImplementedError(
-        "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
-    )
 
 
 def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Held, image: Light, worth: Light) -> Values:
@@ -229,7 +192,7 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
         """What the slabs `at` emit, and the sums at their samples."""
         item, slab, bundle = item_at(at)
         u, v = rays_at(bundle)
-        s, border = _sample_depths(item, slab, half_steps, plan)
+        s, border = sample_depths(item, slab, half_steps, plan)
         sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
         *light, _ = shade(sums, (u, v, border), segments, item, perspective)
         sums = sums.reshape(*sums.shape[:2], RAYS)
@@ -240,7 +203,7 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
         table, opening, depths, control = owed
         item, slab, bundle = item_at(at)
         u, v = rays_at(bundle)
-        (s, border), pull_depths = jax.vjp(lambda depths: _sample_depths(item, slab, depths, plan), half_steps)
+        (s, border), pull_depths = jax.vjp(lambda depths: sample_depths(item, slab, depths, plan), half_steps)
         square = (u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, RAYS)
         slant = jnp.sqrt(1 + square) if perspective else jnp.ones_like(square)
         path = pathwise(border, slant)
@@ -264,7 +227,7 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
         seen, (light, sums), owed = carry
         first = batch * plan.held
         items = lax.dynamic_slice(order, (first,), (plan.held,))
-        nth, number = _fullest_first(padded.count.ravel()[items], items < slabs * num_bundles)
+        nth, number = order_by_fullness(padded.count.ravel()[items], items < slabs * num_bundles)
         fullest = items[nth]
         held_at = jnp.zeros(plan.held, jnp.int32).at[nth].set(jnp.arange(plan.held, dtype=jnp.int32))
         chunks = (number + plan.chunk - 1) // plan.chunk

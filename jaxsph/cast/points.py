@@ -103,7 +103,7 @@ def cast_points(
         slab, bundle = at // num_bundles, at % num_bundles
         item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
         u, v = (rays.T for rays in grid.rays(camera, bundle))
-        s, border = _sample_depths(item, slab, half_steps, plan)
+        s, border = sample_depths(item, slab, half_steps, plan)
         sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
         if lattice is not None:
             sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
@@ -113,7 +113,7 @@ def cast_points(
         rays, light = state
         first = batch * plan.held
         items = lax.dynamic_slice(order, (first,), (plan.held,))
-        nth, number = _fullest_first(padded.count.ravel()[items], items < slabs * num_bundles)
+        nth, number = order_by_fullness(padded.count.ravel()[items], items < slabs * num_bundles)
         fullest = items[nth]
         held_at = jnp.zeros(plan.held, jnp.int32).at[nth].set(jnp.arange(plan.held, dtype=jnp.int32))
 
@@ -127,7 +127,7 @@ def cast_points(
         def border(at: Array) -> Array:
             slab = items[at] // num_bundles
             item = jax.tree.map(lambda leaf: leaf[..., slab, items[at] % num_bundles], padded)
-            return _sample_depths(item, slab, half_steps, plan)[1]
+            return sample_depths(item, slab, half_steps, plan)[1]
 
         return composite(rays, light, held_at, border, stacks.start, first, number), light
 
@@ -141,7 +141,7 @@ def cast_points(
     return Rays(jnp.stack(color), transmittance, depth, spent)
 
 
-def _fullest_first(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
+def order_by_fullness(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
     """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are."""
     bits = (count.shape[0] - 1).bit_length()
     blocks = jnp.minimum((count + BLOCK - 1) // BLOCK, (1 << (31 - bits)) - 2)
@@ -157,7 +157,7 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
     return (work.count.astype(jnp.float32) * in_slab.astype(jnp.float32)).sum(0)
 
 
-def _sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPlan) -> tuple[Array, Array]:
+def sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPlan) -> tuple[Array, Array]:
     """View depths of an item's samples, and of the borders between them.
 
     A coarse sample sits at the sample-space middle of its window. A super-pixel is a single sample as long as the cell.
