@@ -32,10 +32,10 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@touch $(VENV)/.installed-test $@
 
 test: lint
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile -m '' $(PYTEST_ARGS)
+	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m '' $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .

@@ -1,123 +1,18 @@
-"""Promises at the extremes: over thirteen decades of every input a float32 image is right, or refused; never silently wrong.
+"""Promises at the extremes: over thirteen decades of every input a float32 image is right; never silently wrong.
 
-What "right" means: the reference image of particles and samples moved by a few eps of their distance from the eye. How much
-that changes a pixel is what it may be off, and 64 eps (`error_and_allowance`).
+What cannot be right is refused: `test_refusals`.
 """
 
 import dataclasses
 import itertools
-from unittest import mock
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from extreme import FORWARD, Extreme, error_and_allowance, layers
 
 import jaxsph as js
-from jaxsph.numerics import faults
 from jaxsph.plan import control_plan
-
-EPS = float(np.finfo(np.float32).eps)
-FORWARD = -np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
-
-
-@dataclasses.dataclass(frozen=True)
-class Extreme:
-    """A frame of 24 particles in a cube of two units, seen from three units away; and what of it is extreme."""
-
-    length: float = 1.0  # of a unit
-    offset: float = 0.0  # of everything from the origin, units
-    decades: float = 1.0  # over which supports are spread
-    volume: str = "given"
-    support: float = 1.0
-    slab: float | None = None  # far / near - 1 of a thin frame, into which the scene is shrunk
-    nearest: float | None = None  # far / near
-    extinction: tuple[float, ...] = (1, 1, 1, 1, 1)  # factors
-    scale: float = 1.0  # of quantities and control points
-    start: float = 0.0  # of quantities and control points, before they are scaled
-    spike: float | None = None  # quantity of two particles
-    coincident: bool = False
-    projection: str = "perspective"
-    kernel: str = "poly6"
-
-    def scene(self, frames, seed=0):
-        rng = np.random.default_rng(seed)
-        count = frames.capacity
-        position = rng.uniform(-1, 1, (count, 3)) * (0 if self.coincident else 1)
-        support = 0.9 * 10 ** -rng.uniform(0, self.decades, count) * self.support
-        volume = {"given": rng.uniform(0.1, 1, count), "equal": np.ones(count), "cube": support**3 / support.max() ** 3}[
-            self.volume
-        ]
-        quantity = self.rounded(rng.uniform(0, 1, count))
-        if self.spike is not None:
-            quantity[:2] = self.spike, -self.spike
-        points = np.sort(rng.uniform(0, 1, 5)), rng.uniform(0, 1, (5, 3)), rng.uniform(0, 4, 5) * self.extinction
-        unit = self.length * (1 if self.slab is None else self.slab / 3.4)
-        place = position * unit + self.origin()
-        particles = js.Particles.from_arrays(place, support * unit, quantity, volume, self.kernel)
-        return js.Scene(
-            particles=particles, transfer=js.TransferFunction.from_points(self.rounded(points[0]), points[1], points[2] / unit)
-        )
-
-    def rounded(self, value):
-        """Numbers that float32 holds as they are."""
-        return np.float32((value + self.start) * self.scale).astype(np.float64)
-
-    def origin(self):
-        return np.array([1, -1 / 3, 1 / 7]) * self.offset * self.length
-
-    def camera(self, frames):
-        target, size = self.origin(), {"width": frames.width, "height": frames.height}
-        distance, near, far, height = 3.0, 1.3, 4.7, 2.6
-        if self.slab is not None:
-            distance, near, far, height = 1.0, 1 - self.slab / 2, 1 + self.slab / 2, 0.8 * self.slab
-        if self.nearest is not None:
-            near = far / self.nearest
-        distance, near, far, height = (value * self.length for value in (distance, near, far, height))
-        eye, up = target - FORWARD * distance, (0.1, 1, 0.2)
-        if self.projection == "perspective":
-            fov = 2 * np.degrees(np.arctan(height / distance / 2))
-            return js.Camera.look_at(eye, target, up, fov, **size, near=near, far=far)
-        return js.Camera.orthographic(eye, target, up, height, **size, near=near, far=far)
-
-
-def moved(scene, camera, rng, part):
-    """The scene with everything moved by up to `part` of what it is rounded by: positions, supports, quantities."""
-    particles = scene.particles
-    position, eye = particles.exact_position(), camera.exact_eye()
-    distance = np.abs(position - eye).max(1, keepdims=True)
-    quantity = np.asarray(particles.quantity, np.float64)
-    inside = np.abs(quantity) <= 1e6 * np.abs(np.asarray(scene.transfer.values, np.float64)).max()
-    spread = np.ptp(quantity[inside]) if inside.any() else 0
-    shaken = {
-        "position": position + part * distance * rng.uniform(-1, 1, position.shape),
-        "quantity": quantity + part * spread * rng.uniform(-1, 1, quantity.shape),
-        "support": np.asarray(particles.support, np.float64) * (1 + part * rng.uniform(-1, 1, quantity.shape)),
-        "position_rest": None,
-    }
-    return dataclasses.replace(scene, particles=dataclasses.replace(particles, **shaken))
-
-
-def layers(image):
-    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.transmittance, np.float64)[..., None]], -1)
-
-
-def error_and_allowance(image, scene, camera, settings, draws=6):
-    """Error of every pixel, and how much the reference changes when rounding moves what it is made of."""
-    truth = layers(js.reference.render(scene, camera, settings))
-    part = (4 + np.log(float(camera.far) / float(camera.near)) / 2 if camera.is_perspective else 4) * EPS
-    rng, change = np.random.default_rng(0), np.zeros(truth.shape[:2])
-    depth = js.reference._depth
-    for _ in range(draws):
-
-        def shaken_depth(*at):
-            exact = depth(*at)
-            return exact + part * np.abs(exact) * rng.uniform(-1, 1, exact.shape)
-
-        with mock.patch.object(js.reference, "_depth", shaken_depth):
-            shaken = layers(js.reference.render(moved(scene, camera, rng, part), camera, settings))
-        change = np.maximum(change, np.abs(shaken - truth).max(-1))
-    return np.abs(layers(image) - truth).max(-1), 64 * EPS + 2 * change
 
 
 def is_right(frames, extreme, seed=0):
@@ -210,54 +105,6 @@ def test_an_extreme_frame_is_right_with_other_kernels(frames, name, kernel):
     is_right(frames, dataclasses.replace(ALONE[name], kernel=kernel), seed=1)
 
 
-@pytest.mark.parametrize(
-    ("extreme", "message"),
-    [
-        (Extreme(length=1e-20), "lengths are too far apart"),
-        (Extreme(length=1e19), "lengths are too far apart"),
-        (Extreme(slab=1e-5), "lengths are too far apart"),
-        (Extreme(nearest=1e30), "lengths are too far apart"),
-        (Extreme(support=1e16), "lengths are too far apart"),
-        (Extreme(decades=14, volume="equal"), "strengths .* are too far apart"),
-    ],
-)
-def test_lengths_and_strengths_that_float32_cannot_hold_are_refused(frames, extreme, message):
-    with pytest.raises(ValueError, match=message):
-        js.render(extreme.scene(frames), extreme.camera(frames), frames.settings, plan=frames.plan())
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda f: Extreme(scale=1e-36).scene(f), "`values` must reach at least"),
-        (
-            lambda f: js.TransferFunction.from_points(1e8 + np.linspace(0, 1, 5), np.ones((5, 3)), np.ones(5)),
-            "subtract an offset",
-        ),
-        (lambda f: js.Particles.from_arrays(np.zeros((2, 3)), 1.0, 0.0, volume=[1.0, 1e-40]), r"volume\[1\] = 1e-40 underflows"),
-    ],
-)
-def test_numbers_that_float32_would_lose_are_refused_where_they_are_given(frames, make, message):
-    with pytest.raises(ValueError, match=message):
-        make(frames)
-
-
-def test_a_particle_too_small_for_a_narrow_view_is_refused_and_from_nearby_it_is_right(frames):
-    """A support of 1e-6 seen from 3 units away through a telescope is less than the rounding of its depth."""
-    particles = js.Particles.from_arrays(np.full((1, 3), 1 / 3), 1e-6, 0.5, capacity=frames.capacity)
-    scene = js.Scene(particles=particles, transfer=Extreme().scene(frames).transfer)
-    target, size = particles.exact_position()[0], {"width": frames.width, "height": frames.height}
-    narrow = js.Camera.look_at(target - 3 * FORWARD, target, fov_degrees=3e-5, **size, near=2.9999, far=3.0001)
-    with pytest.raises(ValueError, match="move the eye nearer instead of narrowing the view"):
-        js.render(scene, narrow, frames.settings, plan=frames.plan())
-    thick = js.TransferFunction.from_points(scene.transfer.values, scene.transfer.colors, scene.transfer.extinction * 1e6)
-    scene = dataclasses.replace(scene, transfer=thick)
-    nearby = js.Camera.look_at(target - 3e-6 * FORWARD, target, **size, near=1.9e-6, far=4.1e-6)
-    image = js.render(scene, nearby, frames.settings, plan=frames.plan())
-    error, allowed = error_and_allowance(image, scene, nearby, frames.settings)
-    assert (error <= allowed).all() and float(image.alpha.max()) > 0.1
-
-
 def test_float64_positions_far_from_the_origin_give_the_image_of_those_around_it(frames):
     """Whatever the offset, as long as float64 holds the positions."""
     near = Extreme()
@@ -285,121 +132,6 @@ def test_half_precision_is_promoted(frames, dtype):
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
     error, allowed = error_and_allowance(image, scene, camera, frames.settings)
     assert (error <= allowed).all()
-
-
-SPOILT = {
-    "position": ("particles", np.nan, faults.BAD_PARTICLES),
-    "support": ("particles", np.nan, faults.BAD_PARTICLES),
-    "quantity": ("particles", np.nan, faults.BAD_PARTICLES),
-    "volume": ("particles", np.nan, faults.BAD_PARTICLES),
-    "values": ("transfer", np.nan, faults.BAD_TRANSFER),
-    "colors": ("transfer", np.nan, faults.BAD_TRANSFER),
-    "extinction": ("transfer", np.nan, faults.BAD_TRANSFER),
-    "eye": ("camera", np.nan, faults.BAD_CAMERA),
-    "axes": ("camera", np.nan, faults.BAD_CAMERA),
-    "half_height": ("camera", np.nan, faults.BAD_CAMERA),
-    "near": ("camera", np.nan, faults.BAD_CAMERA),
-    "far": ("camera", np.nan, faults.BAD_CAMERA),
-}
-
-
-@pytest.fixture(scope="module")
-def jitted(frames):
-    return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
-
-
-def test_nan_under_jit_is_a_fault_and_no_image_of_nan(frames, jitted):
-    for field, (part, value, bit) in SPOILT.items():
-        scene, camera = Extreme().scene(frames), Extreme().camera(frames)
-        owner = camera if part == "camera" else getattr(scene, part)
-        whole = getattr(owner, field)
-        owner = dataclasses.replace(owner, **{field: whole.at[(0,) * whole.ndim].set(value)})
-        scene, camera = (scene, owner) if part == "camera" else (dataclasses.replace(scene, **{part: owner}), camera)
-        image = jitted(scene, camera)
-        assert int(image.faults) & bit, field
-        assert np.isfinite(image.color).all() and np.isfinite(image.transmittance).all(), field
-
-
-def test_what_cannot_be_held_apart_is_a_fault_under_jit(frames, jitted):
-    scene, camera = Extreme().scene(frames), Extreme().camera(frames)
-    assert int(jitted(scene, camera).faults) == 0
-    assert int(jitted(scene, dataclasses.replace(camera, far=camera.near * np.float32(1.00001))).faults) & faults.UNRESOLVED
-    tiny = dataclasses.replace(scene.transfer, values=scene.transfer.values * np.float32(1e-37))
-    assert int(jitted(dataclasses.replace(scene, transfer=tiny), camera).faults) & faults.BAD_TRANSFER
-    for change in ({"volume": np.float32(1e-37)}, {"support": np.float32(1e-12)}):
-        field, value = next(iter(change.items()))
-        weak = dataclasses.replace(scene.particles, **{field: getattr(scene.particles, field).at[0].set(value)})
-        assert int(jitted(dataclasses.replace(scene, particles=weak), camera).faults) & faults.WEAK_PARTICLES
-
-
-def test_the_same_input_gives_the_same_bits_eager_and_jitted(frames, jitted):
-    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
-    for render in (jitted, lambda *frame: js.render(*frame, frames.settings, plan=frames.plan())):
-        first, second = render(scene, camera), render(scene, camera)
-        assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("color", "transmittance", "depth"))
-
-
-def test_the_order_of_particles_changes_a_pixel_by_rounding_alone(frames):
-    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
-    image = js.render(scene, camera, frames.settings, plan=frames.plan())
-    for seed in range(4):
-        order = np.random.default_rng(seed).permutation(frames.capacity)
-        shuffled = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[order], scene.particles))  # noqa: B023
-        other = js.render(shuffled, camera, frames.settings, plan=frames.plan())
-        assert np.abs(layers(other) - layers(image)).max() <= 4 * EPS
-
-
-@pytest.mark.parametrize("length", [1e-6, 1.0, 1e8])
-def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(frames, length):
-    """At a control point: nothing of the CSPH quotient is left, whatever the supports."""
-    extreme = Extreme(length=length, decades=4.3, volume="equal")
-    scene, camera = extreme.scene(frames), extreme.camera(frames)
-    transfer = scene.transfer
-    for i in (0, 2, 4):
-        quantity = jnp.full_like(scene.particles.quantity, transfer.values[i])
-        constant = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
-        flat = dataclasses.replace(
-            transfer,
-            colors=jnp.broadcast_to(transfer.colors[i], (5, 3)),
-            extinction=jnp.broadcast_to(transfer.extinction[i], (5,)),
-        )
-        image, same = (
-            js.render(s, camera, frames.settings, plan=frames.plan())
-            for s in (constant, dataclasses.replace(scene, transfer=flat))
-        )
-        assert np.array_equal(image.color, same.color) and np.array_equal(image.transmittance, same.transmittance)
-        alpha, color = 1 - np.asarray(image.transmittance, np.float64), np.asarray(transfer.colors[i], np.float64)
-        assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
-
-
-def test_a_uniform_medium_obeys_beer_lambert(frames):
-    """One support far larger than the view; and many of equal quantity that fill it. Optical depths from 1e-3 to 1e3."""
-    rng = np.random.default_rng(0)
-    one = js.Particles.from_arrays(np.zeros((1, 3)), 1e4, 0.5, capacity=frames.capacity)
-    many = js.Particles.from_arrays(rng.uniform(-1, 1, (frames.capacity, 3)), rng.uniform(9, 20, frames.capacity), 0.5)
-    for particles, depth in itertools.product((one, many), 10 ** rng.uniform(-3, 3, 12)):
-        near, length = rng.uniform(0.1, 2), rng.uniform(0.1, 5)
-        transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.ones((5, 3)), np.full(5, depth / length))
-        size = {"width": frames.width, "height": frames.height, "view_height": 2.5, "near": near, "far": near + length}
-        camera = js.Camera.orthographic((0, 0, 3), (0, 0, 0), **size)
-        image = js.render(js.Scene(particles=particles, transfer=transfer), camera, frames.settings, plan=frames.plan())
-        exact = np.exp(-float(transfer.extinction[0]) * (float(camera.far) - float(camera.near)))
-        assert np.abs(np.asarray(image.transmittance, np.float64) - exact).max() <= 4 * EPS
-        assert np.abs(np.asarray(image.color, np.float64) - (1 - exact)).max() <= 4 * EPS
-
-
-def test_a_particle_split_in_two_of_half_the_volume_changes_rounding_alone(frames):
-    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
-    parts = {name: np.asarray(getattr(scene.particles, name))[:12] for name in ("position", "support", "quantity", "volume")}
-    whole = js.Particles.from_arrays(**parts, capacity=frames.capacity)
-    halves = js.Particles.from_arrays(
-        **{name: np.repeat(value, 2, 0) for name, value in parts.items()} | {"volume": parts["volume"].repeat(2) / 2}
-    )
-    one, two = (
-        layers(js.render(dataclasses.replace(scene, particles=particles), camera, frames.settings, plan=frames.plan()))
-        for particles in (whole, halves)
-    )
-    assert np.abs(one - two).max() <= 4 * EPS
 
 
 def test_the_outermost_shell_of_a_support_is_seen(frames):

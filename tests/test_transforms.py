@@ -27,11 +27,10 @@ def test_eager_and_jit_give_the_same_image_but_for_rounding(frames):
 
 def test_jit_renders_in_bands_too(frames):
     rng = np.random.default_rng(0)
-    scene, camera = frames.scene(rng), dataclasses.replace(frames.camera(rng), height=40)
-    whole = js.plan(scene, camera, frames.settings)
-    banded = dataclasses.replace(whole, bands=3, lists=dataclasses.replace(whole.lists, tile_rows=1))
-    color = [jax.jit(lambda s, p=plan: js.render(s, camera, frames.settings, plan=p).color)(scene) for plan in (whole, banded)]
-    np.testing.assert_allclose(*color, atol=ROUNDING)
+    scene, camera, whole = frames.scene(rng), frames.camera(rng), frames.plan()
+    banded = dataclasses.replace(whole, bands=2, lists=dataclasses.replace(whole.lists, tile_rows=1))
+    color = jax.jit(lambda s: js.render(s, camera, frames.settings, plan=banded).color)(scene)
+    np.testing.assert_allclose(color, js.render(scene, camera, frames.settings, plan=whole).color, atol=ROUNDING)
 
 
 def test_vmap_over_cameras_and_over_quantities(frames):
@@ -44,12 +43,12 @@ def test_vmap_over_cameras_and_over_quantities(frames):
         np.testing.assert_allclose(color, js.render(scene, camera, frames.settings, plan=plan).color, atol=ROUNDING)
 
     def of(quantity):
-        particles = dataclasses.replace(scene.particles, quantity=quantity)
-        return js.render(dataclasses.replace(scene, particles=particles), cameras[0], frames.settings, plan=plan).color
+        other = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
+        return js.render(other, cameras[0], frames.settings, plan=plan).color
 
     quantities = jnp.asarray(rng.uniform(0, 1, (2, frames.capacity)), jnp.float32)
     batch = jax.vmap(of)(quantities)
-    np.testing.assert_allclose(batch[1], jax.jit(of)(quantities[1]), atol=ROUNDING)
+    np.testing.assert_allclose(batch[1], of(quantities[1]), atol=ROUNDING)
 
 
 def test_one_program_serves_moving_particles_turning_cameras_and_new_transfer_functions(frames):
@@ -89,18 +88,3 @@ def test_tracing_without_a_plan_says_how_to_make_one(frames):
 def test_importing_and_rendering_leave_x64_alone():
     code = "import jax, jaxsph; assert not jax.config.jax_enable_x64"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_forward_gradient_of_the_image_is_finite(frames):
-    rng = np.random.default_rng(0)
-    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
-
-    def of(extinction):
-        transfer = dataclasses.replace(scene.transfer, extinction=extinction)
-        return js.render(dataclasses.replace(scene, transfer=transfer), camera, frames.settings, plan=plan).color.sum()
-
-    extinction = scene.transfer.extinction
-    slope = jax.jvp(of, (extinction,), (jnp.ones_like(extinction),))[1]
-    step = 1e-2
-    difference = (of(extinction + step) - of(extinction - step)) / (2 * step)
-    assert float(slope) == pytest.approx(float(difference), rel=2e-2)

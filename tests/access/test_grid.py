@@ -136,7 +136,8 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
 def test_pixel_ranges_hold_every_ray_that_a_sphere_meets(frames, seed, decades, distance, projection):
     rng = np.random.default_rng(seed)
     scene, camera = frames.scene(rng, decades=decades), frames.camera(rng, projection, distance)
-    ordered, *_, (left, right, top, bottom) = grid(numbered(scene, np.float32), camera, frames.plan())
+    ordered, *_, ranges = grid(numbered(scene, np.float32), camera, frames.plan())
+    left, right, top, bottom = (np.asarray(end) for end in ranges)
     number = np.asarray(ordered.quantity).astype(int)
     hit = (weights(scene, camera, frames.samples, np.float32) > 0).any(-1)
     for rank in np.flatnonzero(np.asarray(ordered.live)):

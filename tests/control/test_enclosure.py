@@ -26,8 +26,11 @@ def pixels_and_bounds(scene, camera, parts, wished, *, plan, kernel, form):
     return jnp.concatenate([rays.color, 1 - rays.transmittance[None]]), bounds
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@pytest.mark.parametrize(("kernel", "slab_samples", "form"), [("poly6", 4, "lerp"), ("cubic_spline", 16, "paper")])
+@pytest.mark.parametrize(("kernel", "slab_samples", "form", "projection"), [
+    ("poly6", 4, "lerp", "perspective"), ("cubic_spline", 16, "paper", "orthographic"),
+    pytest.param("poly6", 4, "lerp", "orthographic", marks=pytest.mark.slow),
+    pytest.param("cubic_spline", 16, "paper", "perspective", marks=pytest.mark.slow),
+])  # fmt: skip
 @given(seed=st.integers(0, 2**32 - 1))
 def test_bounds_enclose_every_pixel_at_any_levels(adversary, stages, frames, kernel, slab_samples, form, projection, seed):
     rng = np.random.default_rng(seed)

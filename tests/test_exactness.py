@@ -1,0 +1,89 @@
+"""What holds to the bit, or to a stated multiple of eps: the same input twice, order and halves of particles, constants."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from extreme import EPS, Extreme, layers
+
+import jaxsph as js
+
+
+@pytest.fixture(scope="module")
+def jitted(frames):
+    return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
+
+
+def test_the_same_input_gives_the_same_bits_eager_and_jitted(frames, jitted):
+    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
+    for render in (jitted, lambda *frame: js.render(*frame, frames.settings, plan=frames.plan())):
+        first, second = render(scene, camera), render(scene, camera)
+        assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("color", "transmittance", "depth"))
+
+
+def test_the_order_of_particles_changes_a_pixel_by_rounding_alone(frames):
+    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    for seed in range(4):
+        order = np.random.default_rng(seed).permutation(frames.capacity)
+        shuffled = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[order], scene.particles))  # noqa: B023
+        other = js.render(shuffled, camera, frames.settings, plan=frames.plan())
+        assert np.abs(layers(other) - layers(image)).max() <= 4 * EPS
+
+
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e8])
+def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(frames, length):
+    """At a control point: nothing of the CSPH quotient is left, whatever the supports."""
+    extreme = Extreme(length=length, decades=4.3, volume="equal")
+    scene, camera = extreme.scene(frames), extreme.camera(frames)
+    transfer = scene.transfer
+    for i in (0, 2, 4):
+        quantity = jnp.full_like(scene.particles.quantity, transfer.values[i])
+        constant = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
+        flat = dataclasses.replace(
+            transfer,
+            colors=jnp.broadcast_to(transfer.colors[i], (5, 3)),
+            extinction=jnp.broadcast_to(transfer.extinction[i], (5,)),
+        )
+        image, same = (
+            js.render(s, camera, frames.settings, plan=frames.plan())
+            for s in (constant, dataclasses.replace(scene, transfer=flat))
+        )
+        assert np.array_equal(image.color, same.color) and np.array_equal(image.transmittance, same.transmittance)
+        alpha, color = 1 - np.asarray(image.transmittance, np.float64), np.asarray(transfer.colors[i], np.float64)
+        assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
+
+
+def test_a_uniform_medium_obeys_beer_lambert(frames):
+    """One support far larger than the view; and many of equal quantity that fill it. Optical depths from 1e-3 to 1e3."""
+    rng = np.random.default_rng(0)
+    one = js.Particles.from_arrays(np.zeros((1, 3)), 1e4, 0.5, capacity=frames.capacity)
+    many = js.Particles.from_arrays(rng.uniform(-1, 1, (frames.capacity, 3)), rng.uniform(9, 20, frames.capacity), 0.5)
+    for particles, depth in itertools.product((one, many), 10 ** rng.uniform(-3, 3, 12)):
+        near, length = rng.uniform(0.1, 2), rng.uniform(0.1, 5)
+        transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.ones((5, 3)), np.full(5, depth / length))
+        size = {"width": frames.width, "height": frames.height, "view_height": 2.5, "near": near, "far": near + length}
+        camera = js.Camera.orthographic((0, 0, 3), (0, 0, 0), **size)
+        image = js.render(js.Scene(particles=particles, transfer=transfer), camera, frames.settings, plan=frames.plan())
+        exact = np.exp(-float(transfer.extinction[0]) * (float(camera.far) - float(camera.near)))
+        assert np.abs(np.asarray(image.transmittance, np.float64) - exact).max() <= 4 * EPS
+        assert np.abs(np.asarray(image.color, np.float64) - (1 - exact)).max() <= 4 * EPS
+        half = near + np.log(2) * length / depth if exact < 0.5 else np.inf
+        np.testing.assert_allclose(image.depth, half, rtol=1e-5)
+
+
+def test_a_particle_split_in_two_of_half_the_volume_changes_rounding_alone(frames):
+    scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
+    parts = {name: np.asarray(getattr(scene.particles, name))[:12] for name in ("position", "support", "quantity", "volume")}
+    whole = js.Particles.from_arrays(**parts, capacity=frames.capacity)
+    halves = js.Particles.from_arrays(
+        **{name: np.repeat(value, 2, 0) for name, value in parts.items()} | {"volume": parts["volume"].repeat(2) / 2}
+    )
+    one, two = (
+        layers(js.render(dataclasses.replace(scene, particles=particles), camera, frames.settings, plan=frames.plan()))
+        for particles in (whole, halves)
+    )
+    assert np.abs(one - two).max() <= 4 * EPS
