@@ -2,9 +2,10 @@
 
 At most one pixel in 100,000 is over the tolerance, and none over twice. Full rate and the pilot estimator render the same scene
 in one process, in turns; compile time is apart. `estimate to error` is the estimated over the true error of pixels that differ
-from full rate. Writes `results/pilot.json`; ends in asserts on errors, as times and savings are for reading.
+from full rate. `oracle` is what `oracle.py` saves where it was run at the same size and tolerance. Writes `results/pilot.json`
+and `results/pilot.png`; ends in asserts on errors, as times and savings are for reading.
 
-    python benchmarks/pilot.py [--repeats 5] [--sizes 256 512 1024] [--scenes mixer radial]
+    python benchmarks/pilot.py [--repeats 5] [--sizes 256 512 1024] [--scenes mixer radial:2 FILE]
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pathlib
 import sys
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import oracle
 import peers
 import tolerance
 import workloads
@@ -23,9 +25,11 @@ import jaxsph as js
 
 CUBE = 46  # particles along an edge of the peers' filled cube
 SCENES = ("mixer", "radial", "checker_board", "dam_break", "cube")
+SEQUENCES = tuple(f"{name}:{frame}" for name in ("mixer", "dam_break") for frame in range(3))  # at the smallest size
+SHOWN_AT = 0.004  # in the figure
 MOST_OVER = 1e-5  # share of pixels
 RESULTS = peers.RESULTS.with_name("pilot.json")
-HEADER = "scene           size tolerance  saved full/frame max error     over estimate to error (1, 50, 99 %)"
+HEADER = "scene                 size tolerance  saved oracle full/frame max error     over estimate to error (1, 50, 99 %)"
 
 
 def contenders() -> dict[tuple[str, float | None], js.Settings]:
@@ -35,17 +39,36 @@ def contenders() -> dict[tuple[str, float | None], js.Settings]:
 
 
 def load(name: str, size: int) -> tuple[js.Scene, js.Camera]:
+    """A built-in scene, maybe of a frame (`mixer:2`), the peers' cube, or the particles of a file, framed."""
     if name == "cube":
         work = workloads.cube(CUBE, size=size)
         return work.scene("poly6"), work.camera()
-    return js.scenes.load(name, width=size, height=size)
+    if pathlib.Path(name).is_file():
+        particles = js.io.read_particles(name)
+        transfer = js.scenes.default_transfer(particles)
+        return js.Scene(particles=particles, transfer=transfer), js.Camera.framing(particles, width=size, height=size)
+    scene, _, frame = name.partition(":")
+    return js.scenes.load(scene, frame=int(frame) if frame else None, width=size, height=size)
+
+
+def oracles() -> dict[tuple[str, int, float], float]:
+    """The most that can be saved, by scene, size and tolerance, as far as it was measured."""
+    if not oracle.RESULTS.exists():
+        return {}
+    found = json.loads(oracle.RESULTS.read_text())
+    saved: dict[tuple[str, int, float], float] = {}
+    for record in found["records"]:
+        key = record["scene"], found["size"], record["tolerance"]
+        saved[key] = max(saved.get(key, 1), record["saved"])
+    return saved
 
 
 def row(record: dict) -> str:
     """Of the printed table, under HEADER."""
     ratios = " ".join(f"{ratio:.3g}" for ratio in record["estimate_to_error"] or [])
+    best = "-" if record["oracle"] is None else f"{record['oracle']:.2f}"
     return (
-        f"{record['scene']:14s} {record['size']:5d} {record['tolerance']:9g} {record['evaluations_saved']:6.2f} "
+        f"{record['scene'][-20:]:20s} {record['size']:5d} {record['tolerance']:9g} {record['evaluations_saved']:6.2f} {best:>6s} "
         f"{1 / record['total_to_full']:10.2f} {record['max_error']:9.6f} {record['pixels_over_tolerance']:8.1e} {ratios}"
     )
 
@@ -54,25 +77,59 @@ def keeps_its_word(record: dict) -> bool:
     return record["pixels_over_tolerance"] <= MOST_OVER and record["max_error"] <= 2 * record["tolerance"]
 
 
+def draw(records: list[dict], path: pathlib.Path) -> None:
+    """What is saved at `SHOWN_AT`, in evaluations and in time, and how the estimate compares with the error."""
+    import matplotlib.pyplot as plt
+
+    shown = [record for record in records if record["tolerance"] == SHOWN_AT and record["scene"] in SCENES]
+    names, sizes = (list(dict.fromkeys(record[key] for record in shown)) for key in ("scene", "size"))
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    titles = "evaluations saved (x oracle)", "time of full rate over the frame's", "estimate over error (1, 50, 99 %)"
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set(title=title, yscale="log", xticks=range(len(names)), xticklabels=names)
+        axis.axhline(1, color="0.7", linewidth=1)
+        axis.tick_params("x", rotation=20)
+    for k, size in enumerate(sizes):
+        here = [record for record in shown if record["size"] == size]
+        place = [names.index(record["scene"]) + 0.18 * (k - (len(sizes) - 1) / 2) for record in here]
+        label = f"{size} x {size}"
+        axes[0].plot(place, [record["evaluations_saved"] for record in here], "o", label=label)
+        axes[1].plot(place, [1 / record["total_to_full"] for record in here], "o", label=label)
+        some = [(at, record["estimate_to_error"]) for at, record in zip(place, here, strict=True) if record["estimate_to_error"]]
+        low, middle, high = ([ratios[i] for _, ratios in some] for i in range(3))
+        lines = axes[2].plot([at for at, _ in some], middle, "o", label=label)
+        axes[2].vlines([at for at, _ in some], low, high, color=lines[0].get_color())
+        best = [(at, record["oracle"]) for at, record in zip(place, here, strict=True) if record["oracle"]]
+        axes[0].plot([at for at, _ in best], [saved for _, saved in best], "kx")
+    axes[0].legend()
+    figure.suptitle(f"Pilot estimator at a tolerance of {SHOWN_AT:g}")
+    figure.savefig(path, dpi=130)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512, 1024], help="pixels on a side")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
+    parser.add_argument("--scenes", nargs="+", default=SCENES, help="names, with a frame after a colon, or particle files")
+    parser.add_argument("--sequences", nargs="*", default=SEQUENCES, help="the same, at the smallest size only")
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS, help="JSON; the figure is beside it")
     arguments = parser.parse_args()
-    records = []
+    records, known = [], oracles()
     print(HEADER)
     for size in arguments.sizes:
-        for name in arguments.scenes:
+        for name in [*arguments.scenes, *arguments.sequences * (size == min(arguments.sizes))]:
             scene, camera = load(name, size)
-            found = tolerance.measure(name, scene, camera, arguments.repeats, contenders())
+            label = pathlib.Path(name).name
+            found = tolerance.measure(label, scene, camera, arguments.repeats, contenders())
             found = [record | {"size": size} for record in found if record["tolerance"] is not None]
+            found = [record | {"oracle": known.get((label, size, record["tolerance"]))} for record in found]
             print("\n".join(row(record) for record in found), flush=True)
             records += found
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(
+    arguments.output.parent.mkdir(exist_ok=True)
+    arguments.output.write_text(
         json.dumps({"machine": peers.machine(), "repeats": arguments.repeats, "records": records}, indent=1) + "\n"
     )
+    draw(records, arguments.output.with_suffix(".png"))
     broken = [row(record) for record in records if not keeps_its_word(record)]
     assert not broken, "\n".join(["over the tolerance:", HEADER, *broken])
 

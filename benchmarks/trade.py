@@ -67,6 +67,18 @@ def on_the_front(rows: list[Measurement]) -> list[str]:
     return [method if tolerance is None else f"{method} {tolerance:g}" for method, tolerance in names]
 
 
+def beaten(rows: list[Measurement]) -> dict[str, str | None]:
+    """For every baseline, the setting with error control that takes no more time and errs no more; None where there is none."""
+    points = figures.summary(rows)
+    ours = [point for point in points if point.tolerance is not None]
+    found: dict[str, str | None] = {}
+    for baseline in (point for point in points if point.tolerance is None and point.method != "full rate"):
+        better = [one for one in ours if one.time <= baseline.time and one.error <= baseline.error]
+        best = min(better, key=lambda one: one.time, default=None)
+        found[baseline.method] = None if best is None else f"{best.method} {best.tolerance:g}"
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3)
@@ -78,15 +90,19 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS.with_suffix(""), help="folder of tables and figures")
     arguments = parser.parse_args()
     print(HEADER)
-    tables, fronts = {}, {}
+    tables, fronts, dominated = {}, {}, {}
     for name in arguments.scenes:
         tables[name] = measure(name, arguments)
         fronts[name] = on_the_front(tables[name])
+        dominated[name] = beaten(tables[name])
         print("\n".join(map(line, tables[name])))
-        print(f"{name:14s} front: {', '.join(fronts[name])}", flush=True)
+        print(f"{name:14s} front: {', '.join(fronts[name])}")
+        winners = [f"{baseline} by {by or 'nothing'}" for baseline, by in dominated[name].items()]
+        print(f"{name:14s} beaten: {', '.join(winners)}", flush=True)
     rows = [row for table in tables.values() for row in table]
     shape = {"size": arguments.size, "samples": arguments.samples, "repeats": arguments.repeats}
-    written = {"machine": peers.machine(), **shape, "fronts": fronts, "records": [dataclasses.asdict(row) for row in rows]}
+    records = [dataclasses.asdict(row) for row in rows]
+    written = {"machine": peers.machine(), **shape, "fronts": fronts, "beaten": dominated, "records": records}
     target = arguments.output.with_suffix(".json")
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(json.dumps(written, indent=1) + "\n")

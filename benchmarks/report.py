@@ -1,0 +1,203 @@
+"""Write `docs/how_accurate_how_fast.md` from the committed results: no number on that page is typed by hand.
+
+python benchmarks/report.py
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Callable, Iterable, Sequence
+
+HERE = pathlib.Path(__file__).parent
+RESULTS, PAGE = HERE / "results", HERE.parent / "docs" / "how_accurate_how_fast.md"
+
+# First paper, table 2 (GTX Titan, frame means) and table 3 (most over a sequence): particles, error, total time over full rate
+PAPER = {
+    ("flubber", 0.004): (0.5, "7.2e-4", 1.3),
+    ("checker_board", 0.001): (1.2, "3.3e-5", 1.08),
+    ("checker_board", 0.004): (1.2, "2.1e-4", 1.26),
+    ("checker_board", 0.01): (1.2, "1.1e-3", 1.38),
+    ("mixer", 0.001): (2.5, "1.06e-3", 1.36),
+    ("mixer", 0.004): (2.5, "2.7e-3", 1.43),
+    ("mixer", 0.01): (2.5, "5.6e-3", 1.5),
+    ("radial", 0.001): (10, "6.2e-4", 1.15),
+    ("radial", 0.004): (10, "1.3e-3", 1.44),
+    ("radial", 0.01): (10, "2.0e-3", 1.62),
+}
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def number(value: float | None, form: str = ".2g") -> str:
+    return "-" if value is None else format(value, form)
+
+
+def machine(found: dict) -> str:
+    about = found["machine"]
+    return f"{about['device']}, {about['cores']} cores, {about['dtype']}, jax {about['jax']}, Python {about['python']}"
+
+
+def trade(found: dict) -> str:
+    """Error against tolerance, and against time; what beats coarser sampling; the first paper's numbers."""
+    rows, promised = [], []
+    for record in found["records"]:
+        saved = record["evaluations_full"] / record["evaluations"] if record["evaluations"] else None
+        errors = number(record["max_error"]), number(record["mean_error"]), number(record["max_error_converged"])
+        rows.append([
+            record["scene"], record["method"], number(record["tolerance"], "g"), *errors, number(record["max_bound"]),
+            number(saved, ".2f"), number(record["full_total"] / record["total"], ".2f"),
+        ])  # fmt: skip
+        paper = PAPER.get((record["scene"], record["tolerance"]))
+        if paper and record["method"] in ("interval", "interval relaxed", "pilot"):
+            over = f"{100 * record['over_tolerance']:.2g} %"
+            speed = number(record["full_total"] / record["total"], ".2f")
+            ours = record["method"], f"{record['particles'] / 1e6:.2g} M", number(record["max_error"]), over, speed
+            promised.append([record["scene"], f"{record['tolerance']:g}", *ours, f"{paper[0]} M", paper[1], paper[2]])
+    beaten = [[scene, *pair] for scene, by in found["beaten"].items() for pair in by.items()]
+    header = "scene", "method", "tolerance", "max error", "mean error", "to converged", "bound", "evaluations saved", "speed-up"
+    against = (
+        "scene",
+        "tolerance",
+        "method",
+        "particles",
+        "max error",
+        "rays over",
+        "speed-up",
+        "paper: particles",
+        "error",
+        "speed-up",
+    )
+    lost = sum(by is None for *_, by in beaten)
+    beaten = [[scene, baseline, by or "nothing"] for scene, baseline, by in beaten]
+    shape = f"{found['size']} x {found['size']} pixels, {found['samples']} samples a ray, {machine(found)}"
+    return f"""## Error against tolerance against time
+{shape}.
+Errors are the largest difference of any colour channel or alpha to the same frame at full rate; "to converged" is that to an
+image of 8 times the samples, so that the error of full rate itself is seen too. Speed-up is the time of full rate over that of
+the setting, medians in turns. `interval` is certified; `interval relaxed` and `pilot` are estimates.
+
+{table(header, rows)}
+
+Which setting with error control takes no more time and errs no more than sampling coarser everywhere (`samples/K`), or than a
+smaller image scaled up (`size/K`):
+
+{table(("scene", "baseline", "beaten by"), beaten)}
+
+{lost} of {len(beaten)} baselines are not beaten in this sense. They are faster than any setting here, at the errors above: every
+sample is shaded whatever the tolerance, and slabs at a silhouette are marched at full rate. Small images have much of both;
+larger ones save more (see the pilot estimator below).
+
+### Beside the first paper
+Its tables 2 and 3 (GTX Titan, up to 10 M particles, relaxed). Data are of the same kind, not the same:
+compare shapes, not digits.
+
+{table(against, promised)}
+"""
+
+
+def scaling(found: dict) -> str:
+    parts = []
+    for kind, records in found["tables"].items():
+        names = list(records[0]["seconds"])
+        rows = [[f"{record[kind]:,}", *(f"{record['seconds'][name]['total']:.3f}" for name in names)] for record in records]
+        rows.append(["**exponent**", *(f"**{found['exponents'][kind][name]:.2f}**" for name in names)])
+        parts.append(table([kind, *(f"{name}, s" for name in names)], rows))
+    middle = "\n\n".join(parts)
+    return f"""## More particles, more pixels
+{found["scene"]}, {machine(found)}; grid, analysis and cast. The exponent is the slope of log time over log number.
+
+{middle}
+"""
+
+
+def pilots(found: dict) -> str:
+    rows = []
+    for record in found["records"]:
+        ratios = [number(ratio, ".3g") for ratio in record["estimate_to_error"] or []]
+        errors = number(record["max_error"]), f"{record['pixels_over_tolerance']:.1e}", *(ratios or ["-"] * 3)
+        saved = (
+            number(record["evaluations_saved"], ".2f"),
+            number(record["oracle"], ".2f"),
+            number(1 / record["total_to_full"], ".2f"),
+        )
+        rows.append([record["scene"], record["size"], number(record["tolerance"], "g"), *saved, *errors])
+    header = "scene", "size", "tolerance", "evaluations saved", "oracle", "speed-up", "max error", "pixels over"
+    return f"""## The pilot estimator
+{machine(found)}.
+The oracle is what could be saved if the error of every choice were known. The last columns are the estimated over the true error
+of a pixel, at 1, 50 and 99 % of the pixels that differ at all.
+
+![Evaluations saved, speed-up, and estimate over error](../benchmarks/results/pilot.png)
+
+{table((*header, "1 %", "50 %", "99 %"), rows)}
+"""
+
+
+def peers(found: dict) -> str:
+    rows = [[name, *(number(ratio) for ratio in ratios.values())] for name, ratios in found["ratios"].items()]
+    return f"""## Beside a hand-written marcher
+Time of a frame over that of a Numba packet marcher on the same particles, 512 x 512 x 256 samples, {machine(found)}.
+
+{table(("particles", *next(iter(found["ratios"].values()))), rows)}
+"""
+
+
+def grids(found: dict) -> str:
+    rows = []
+    for record in found["records"]:
+        errors = number(record["max_error"]), number(record["mean_error"])
+        seconds = [f"{record[stage]:.3f}" for stage in ("resample", "cast", "total")]
+        rows.append([record["scene"], record["contender"], *errors, *seconds])
+    size = found["records"][0]["size"]
+    header = "scene", "contender", "max error", "mean error", "resample, s", "cast, s", "in all, s"
+    return f"""## Beside resampling to a grid
+VTK {found["machine"]["vtk"]}, `vtkSPHInterpolator` to a grid and ray casting of that: {size} x {size} pixels,
+cubic spline kernel, {machine(found)}. Errors of colours against an image of 8 times the samples (VTK's
+images have 8 bits: 0.002 at least).
+
+{table(header, rows)}
+
+yt's projections are not in the table: they are integrals along the ray, without opacity or transfer function.
+"""
+
+
+def gradients(found: dict) -> str:
+    frames, scans = [], []
+    for record in found["frames"]:
+        ratios = record["backward_to_frame"], record["memory_to_frame"]
+        frames.append([record["scene"], record["size"], *(f"{ratio:.2f}" for ratio in ratios)])
+    for record in found["against_scan"]:
+        used = [record["programs"][program]["bytes"] / 2**20 for program in ("marched", "scanned")]
+        scans.append([record["samples"], *(f"{size:.1f}" for size in used)])
+    return f"""## Gradients
+By everything at once, {machine(found)}: what the backward pass takes beyond the frame, over the frame; and memory.
+
+{table(("scene", "size", "backward / frame", "memory / frame"), frames)}
+
+Memory in MiB beside plain automatic differentiation of a scan over samples, on a scene of 150 particles:
+
+{table(("samples", "jaxsph", "scan"), scans)}
+"""
+
+
+SECTIONS: dict[str, Callable[[dict], str]] = {
+    "trade": trade, "pilot": pilots, "scaling": scaling, "peers": peers, "vtk_grid": grids, "gradients": gradients,
+}  # fmt: skip
+
+
+def page() -> str:
+    """The page, from what is committed."""
+    sections = [make(json.loads((RESULTS / f"{name}.json").read_text())) for name, make in SECTIONS.items()]
+    head = """# How accurate, how fast
+Made by `python benchmarks/report.py` from `benchmarks/results/`, where each section has a file of its benchmark's name. Times are
+of shared machines: read ratios. What is promised, and over which range of inputs, is in `accuracy_and_limits.md`.
+"""
+    return "\n".join([head, *sections])
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
