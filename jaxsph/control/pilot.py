@@ -6,8 +6,9 @@ A cubic through four nodes errs by at most 3/128 of a fourth difference, about t
 tells how well it can be interpolated: fourth differences of $\sum q V W - Q \sum V W$ over $\sum V W$ are the error of Q, to
 first order. It is a residual of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab,
 its effect on light that times the mean square slope of the transfer function over the quantities met, and slabs' variances
-add up along a bundle. `DEVIATIONS` standard deviations are the estimate. Narrow bands need no rule of their own: every sample
-is shaded, and where Q meets a steep part, its mean square slope is large; a jump is never interpolated over.
+add up along a bundle. Along depth, errors differ from sample to sample; across it they stay alike for about as far as nodes are
+apart, and the samples within count as one. `DEVIATIONS` standard deviations are the estimate. Narrow bands need no rule of their
+own: every sample is shaded, and where Q meets a steep part, its mean square slope is large; a jump is never interpolated over.
 
 This is an estimate, not a bound. The second paper's a-posteriori error (its section 4) takes the same view of a finite element:
 the residual of the next order, weighted.
@@ -31,7 +32,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
 from jaxsph.numerics.staging import computed_once
 
-DEVIATIONS = 7.0  # standard deviations that pixels are taken to stay within
+DEVIATIONS = 5.5  # standard deviations that pixels are taken to stay within
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 CLEAR = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
@@ -140,11 +141,14 @@ def _deviations(
     longest = _pooled(path, jnp.maximum, down, across)
 
     at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer)
+    pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
 
     def one_slab(before: Array, slab: Array) -> tuple[Array, Array]:
         near = [lax.dynamic_slice(v, (slab * within * layer,), ((within + 1 + 2 * REACH) * layer,)) for v in (weight, weighted)]
-        spread, quantity, extinction = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments)
         border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
+        spacing = NODE_PIXELS * pixel * (border[-1] if camera.is_perspective else 1)
+        alike = jnp.maximum(slab_samples * spacing / (border[-1] - border[0]), 1)  # samples in a row that err alike laterally
+        spread, quantity, extinction = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments, alike)
         absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
 
         def pool(value: Array, combine: Combine) -> Array:
@@ -153,7 +157,8 @@ def _deviations(
         deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (ACROSS + 1) ** 2))
         low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
         front, taken = jnp.exp(-pool(before[None], jnp.minimum)), -jnp.expm1(-pool(absorbed[None], jnp.maximum))
-        *of_colors, of_extinction = _mean_square_slope(squares, low - 2 * deviation, high + 2 * deviation)
+        around = 2 * deviation / jnp.sqrt(alike)
+        *of_colors, of_extinction = _mean_square_slope(squares, low - around, high + around)
         length = (border[-1] - border[0]) * longest
         # a slab's samples err independently: their sum by the root of their number, their mean by one over it
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
@@ -179,7 +184,9 @@ def _in_a_row(value: Float[Array, "deep down across"], layers: int) -> Float[Arr
     return row.at[REACH : REACH + kept, :down, :across].set(value[:kept]).ravel()
 
 
-def _at_nodes(weight: Array, weighted: Array, origin: Array, segments: Segments, *, across: int, layer: int) -> tuple[Array, ...]:
+def _at_nodes(
+    weight: Array, weighted: Array, origin: Array, segments: Segments, alike: Array, *, across: int, layer: int
+) -> tuple[Array, ...]:
     """Variance of Q between nodes, Q, and extinction, (layers, nodes of a layer), of all layers but `REACH` on either side.
 
     The variance is infinite where the sum of weights is not clear of zero.
@@ -205,7 +212,8 @@ def _at_nodes(weight: Array, weighted: Array, origin: Array, segments: Segments,
     for stride in (1, across, layer):
         of_weight = fourth(weight, stride)
         unsure += CUBIC * jnp.abs(of_weight)
-        spread += (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
+        error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
+        spread += error if stride == layer else alike * error
     spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
     quantity = origin + ratio
     found = spread, quantity, jnp.where(inside, look_up(segments, quantity)[3], 0)

@@ -146,6 +146,21 @@ def test_jit_agrees_with_eager():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("size", [128, 256])
+def test_the_estimate_holds_however_dense_samples_are_along_the_ray(size):
+    """Where nodes across are far apart, neighbouring samples err alike: their errors do not average out."""
+    scene, camera = js.scenes.load("checker_board", width=size, height=size)
+    for samples in (128, 512):
+        full = js.Settings(samples=samples)
+        truth = js.render(scene, camera, full)
+        image = js.render(scene, camera, dataclasses.replace(PILOT, samples=samples))
+        error = error_of(image, truth)
+        off, estimate = error > 1e-6, np.asarray(image.error_bound)
+        assert not off.any() or np.percentile(estimate[off] / error[off], 1) >= 1.3
+        assert (error > PILOT.tolerance).sum() <= 2 and error.max() <= 2 * PILOT.tolerance
+
+
+@pytest.mark.slow
 def test_bands_keep_the_tolerance_too():
     scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
