@@ -21,7 +21,7 @@ from jaxsph.access.footprint import pixel_ranges
 from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES
 from jaxsph.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.access.ordering import order_particles
-from jaxsph.cast.points import CastPlan
+from jaxsph.cast.stretches import CastPlan
 from jaxsph.control.adapt import ControlPlan
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.model.camera import Camera

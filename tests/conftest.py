@@ -13,7 +13,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.access.lists import ListPlan
-from jaxsph.cast.points import CastPlan
+from jaxsph.cast.stretches import CastPlan
 
 hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
 hypothesis.settings.load_profile("jaxsph")

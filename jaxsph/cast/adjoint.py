@@ -23,11 +23,11 @@ from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
-from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import RAYS, unlit
 from jaxsph.cast.moments import COLUMNS, WIDTH, owe_particles
-from jaxsph.cast.points import CastPlan, Rays, cast_points, gather_field, order_by_fullness, sample_depths
+from jaxsph.cast.points import Rays, cast_points, gather_field
 from jaxsph.cast.shading import shade
+from jaxsph.cast.stretches import CastPlan, stretches_of, with_room
 from jaxsph.cast.worth import Seen, owe_transfer, pathwise, unseen, value_samples, value_slabs
 from jaxsph.control.worklist import Worklist
 from jaxsph.model.camera import Camera
@@ -170,29 +170,17 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
     """Cotangents of `values`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
     plan = dataclasses.replace(plan, held=max(plan.held // (2 * plan.chunk), 1) * plan.chunk)  # as twice as much is held of each
     grid, camera = _of(values, held)
-    work, perspective = held.work, camera.is_perspective
-    slabs, num_bundles = work.count.shape
-    dtype = grid.half_steps.dtype
-    beyond = (0, 2 * ((slabs + 1) * plan.slab_samples - grid.samples))
-    half_steps, pull_half_steps = jax.vjp(lambda depths: jnp.pad(depths, beyond, mode="edge"), grid.half_steps)
-    stacks = stack(work.filled)
-    order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
-    segments = values.transfer.segments()
-    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
-    points = segments.start.shape[0]
-
-    def item_at(at: Array) -> tuple[Worklist, Array, Array]:
-        slab, bundle = at // num_bundles, at % num_bundles
-        return jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded), slab, bundle
+    stretches, segments = stretches_of(grid, held.work, plan), values.transfer.segments()
+    perspective, half_steps, dtype = camera.is_perspective, stretches.half_steps, grid.half_steps.dtype
 
     def rays_at(bundle: Array) -> tuple[Array, Array]:
         return tuple(rays.T for rays in grid.rays(camera, bundle))  # type: ignore[return-value]
 
     def march(at: Array) -> tuple[list[Array], tuple[Array, Array]]:
         """What the slabs `at` emit, and the sums at their samples."""
-        item, slab, bundle = item_at(at)
+        item, slab, bundle = stretches.item(at)
         u, v = rays_at(bundle)
-        s, border = sample_depths(item, slab, half_steps, plan)
+        s, border = stretches.depths(item, slab)
         sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
         *light, _ = shade(sums, (u, v, border), segments, item, perspective)
         sums = sums.reshape(*sums.shape[:2], RAYS)
@@ -201,9 +189,9 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
     def settle(at: Array, sums: tuple[Array, Array], worth: Array, owed: tuple[Array, ...]) -> tuple[Array, ...]:
         """Add what the slabs `at` owe, being `worth` that much."""
         table, opening, depths, control = owed
-        item, slab, bundle = item_at(at)
+        item, slab, bundle = stretches.item(at)
         u, v = rays_at(bundle)
-        (s, border), pull_depths = jax.vjp(lambda depths: sample_depths(item, slab, depths, plan), half_steps)
+        (s, border), pull_depths = jax.vjp(lambda depths: stretches.depths(item, slab, depths), half_steps)
         square = (u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, RAYS)
         slant = jnp.sqrt(1 + square) if perspective else jnp.ones_like(square)
         path = pathwise(border, slant)
@@ -223,45 +211,39 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
             of_opening += (samples.path * (border[:, 1:] - border[:, :-1])[:, :, None] * (square / slant)[:, None]).sum()
         return paid.table, opening + of_opening, depths + pull_depths((of_s.T, of_border))[0], control
 
-    def pull_batch(batch: Array, carry: tuple[Seen, Any, tuple[Array, ...]]) -> tuple[Seen, Any, tuple[Array, ...]]:
+    def pull_stretch(nth: Array, carry: tuple[Seen, Any, tuple[Array, ...]]) -> tuple[Seen, Any, tuple[Array, ...]]:
         seen, (light, sums), owed = carry
-        first = batch * plan.held
-        items = lax.dynamic_slice(order, (first,), (plan.held,))
-        nth, number = order_by_fullness(padded.count.ravel()[items], items < slabs * num_bundles)
-        fullest = items[nth]
-        held_at = jnp.zeros(plan.held, jnp.int32).at[nth].set(jnp.arange(plan.held, dtype=jnp.int32))
-        chunks = (number + plan.chunk - 1) // plan.chunk
+        stretch = stretches.stretch(nth)
 
         def march_chunk(chunk: Array, store: Any) -> Any:
-            begin = chunk * plan.chunk
-            found = march(lax.dynamic_slice(fullest, (begin,), (plan.chunk,)))
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), store, found)
+            at, begin = stretches.chunk(stretch, chunk)
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), store, march(at))
 
-        light, sums = lax.fori_loop(0, chunks, march_chunk, (light, sums))
-        seen, worth = value_slabs(seen, tuple(light), held_at, stacks.start, first, number)
+        light, sums = lax.fori_loop(0, stretch.chunks, march_chunk, (light, sums))
+        seen, worth = value_slabs(seen, tuple(light), stretch.held_at, stretches.stacks.start, stretch.first, stretch.number)
 
         def settle_chunk(chunk: Array, owed: tuple[Array, ...]) -> tuple[Array, ...]:
-            begin = chunk * plan.chunk
+            at, begin = stretches.chunk(stretch, chunk)
             here = [lax.dynamic_slice_in_dim(value, begin, plan.chunk) for value in sums]
             worths = lax.dynamic_slice_in_dim(worth, begin, plan.chunk, 1)
-            return settle(lax.dynamic_slice(fullest, (begin,), (plan.chunk,)), (here[0], here[1]), worths, owed)
+            return settle(at, (here[0], here[1]), worths, owed)
 
-        return seen, (light, sums), lax.fori_loop(0, chunks, settle_chunk, owed)
+        return seen, (light, sums), lax.fori_loop(0, stretch.chunks, settle_chunk, owed)
 
     *light, thickness = unlit(plan.held + 1, plan.slab_samples, dtype)
     owed = (
         jnp.zeros((grid.ordered.x.shape[0], WIDTH), dtype),
         jnp.zeros((), dtype),
         jnp.zeros_like(half_steps),
-        jnp.zeros((5, points), dtype),
+        jnp.zeros((5, segments.start.shape[0]), dtype),
     )
-    carry = unseen(image, worth, stacks.place), (light, (thickness, thickness)), owed
-    batches = (stacks.start[-1] + plan.held - 1) // plan.held
-    table, opening, depths, control = lax.fori_loop(0, batches, pull_batch, carry)[2]
+    carry = unseen(image, worth, stretches.stacks.place), (light, (thickness, thickness)), owed
+    table, opening, depths, control = lax.fori_loop(0, stretches.number, pull_stretch, carry)[2]
+    _, pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, held.work.count.shape[0], plan), grid.half_steps)
     columns = {name: table[:, i] for i, name in enumerate(COLUMNS)}
     transfer = TransferFunction(control[4], control[:3].T, control[3])
     half_height = opening / camera.half_height.astype(dtype)
-    total = Values(columns, pull_half_steps(depths)[0], half_height, transfer)
+    total = Values(columns, pull_room(depths)[0], half_height, transfer)
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, values)
 
 

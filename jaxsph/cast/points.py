@@ -2,11 +2,10 @@ r"""Ray casting of particles: thread-coherent marching of the first paper's sect
 
 Flow: worklist -> [points] -> image.
 
-What a slab of samples does to light does not depend on what lies in front of it. So the slabs of all bundles, stacked front
-to back without gaps (`access.stacks`), are taken `held` at a time and marched in order of how many particles they have, such
-that those marched together take equally long; what they emit and absorb is held, and then put into the rays' state layer by
-layer (`composite`). Blocks of `BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are
-(chunk, samples of a slab, 8 rows, 8 columns).
+What a slab of samples does to light does not depend on what lies in front of it. So a stretch of slabs (`stretches`) is marched
+in any order; what they emit and absorb is held, and then put into the rays' state layer by layer (`composite`). Blocks of
+`BLOCK` particles are added to all samples of a slab at once. Shapes, once: accumulators are (chunk, samples of a slab, 8 rows,
+8 columns).
 
 The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$
 (perspective) or 1 (orthographic), so the squared distance in supports is $A_{kc} + D_{kr}$ with $A_{kc} = ((a_k u_c - X) / H)^2$
@@ -21,24 +20,22 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import NODE_PIXELS, Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
-from jaxsph.access.stacks import stack
 from jaxsph.cast.composite import Light, State, composite, fresh, unlit
 from jaxsph.cast.nodes import interpolate
 from jaxsph.cast.shading import shade
-from jaxsph.control.worklist import COARSEST, Worklist
+from jaxsph.cast.stretches import BLOCK, CastPlan, stretches_of
+from jaxsph.control.worklist import Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.staging import computed_once
-
-BLOCK = 16  # particles unrolled in the inner loop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,28 +46,6 @@ class Rays:
     transmittance: Float[Array, "bundles 8 8"]
     depth: Float[Array, "bundles 8 8"]
     evaluations: Float[Array, " bundles"]
-
-
-@dataclasses.dataclass(frozen=True)
-class CastPlan:
-    """Static sizes of the march.
-
-    Attributes:
-        chunk: slabs marched together.
-        slab_samples: samples that share a window of particles.
-        held: slabs whose light is held before it is put into the rays' state; a multiple of `chunk`.
-    """
-
-    chunk: int
-    slab_samples: int
-    held: int
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 1:
-                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
-        if self.held % self.chunk:
-            raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
 
 
 def cast_points(
@@ -89,65 +64,43 @@ def cast_points(
         kernel: name of the smoothing kernel.
         lattice: where the sums of interpolated slabs come from.
     """
-    slabs, num_bundles = work.count.shape
-    dtype = grid.half_steps.dtype
-    # samples past the end have length zero; the dummy slab lies there
-    half_steps = jnp.pad(grid.half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - grid.samples)), mode="edge")
-    stacks = stack(work.filled)
-    order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
-    segments = transfer.segments()
-    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
+    stretches, segments = stretches_of(grid, work, plan), transfer.segments()
+    perspective = camera.is_perspective
 
     def march(at: Array) -> Light:
         """What the slabs `at` emit, as seen from right in front of each, and their samples' optical thickness."""
-        slab, bundle = at // num_bundles, at % num_bundles
-        item = jax.tree.map(lambda leaf: leaf[..., slab, bundle], padded)
+        item, slab, bundle = stretches.item(at)
         u, v = (rays.T for rays in grid.rays(camera, bundle))
-        s, border = sample_depths(item, slab, half_steps, plan)
-        sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), camera.is_perspective, kernel)
+        s, border = stretches.depths(item, slab)
+        sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
         if lattice is not None:
             sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
-        return shade(sums, (u, v, border), segments, item, camera.is_perspective)
+        return shade(sums, (u, v, border), segments, item, perspective)
 
-    def march_batch(batch: Array, state: tuple[State, Light]) -> tuple[State, Light]:
+    def march_stretch(nth: Array, state: tuple[State, Light]) -> tuple[State, Light]:
         rays, light = state
-        first = batch * plan.held
-        items = lax.dynamic_slice(order, (first,), (plan.held,))
-        nth, number = order_by_fullness(padded.count.ravel()[items], items < slabs * num_bundles)
-        fullest = items[nth]
-        held_at = jnp.zeros(plan.held, jnp.int32).at[nth].set(jnp.arange(plan.held, dtype=jnp.int32))
+        stretch = stretches.stretch(nth)
 
         def march_chunk(chunk: Array, light: Light) -> Light:
-            begin = chunk * plan.chunk
-            found = march(lax.dynamic_slice(fullest, (begin,), (plan.chunk,)))
+            at, begin = stretches.chunk(stretch, chunk)
+            found = march(at)
             return tuple(lax.dynamic_update_slice_in_dim(old, new, begin, 0) for old, new in zip(light, found, strict=True))
 
-        light = lax.fori_loop(0, (number + plan.chunk - 1) // plan.chunk, march_chunk, light)
+        light = lax.fori_loop(0, stretch.chunks, march_chunk, light)
 
         def border(at: Array) -> Array:
-            slab = items[at] // num_bundles
-            item = jax.tree.map(lambda leaf: leaf[..., slab, items[at] % num_bundles], padded)
-            return sample_depths(item, slab, half_steps, plan)[1]
+            item, slab, _ = stretches.item(stretch.items[at])
+            return stretches.depths(item, slab)[1]
 
-        return composite(rays, light, held_at, border, stacks.start, first, number), light
+        return composite(rays, light, stretch.held_at, border, stretches.stacks.start, stretch.first, stretch.number), light
 
-    batches = (stacks.start[-1] + plan.held - 1) // plan.held
-    state = fresh(num_bundles, dtype), unlit(plan.held + 1, plan.slab_samples, dtype)
-    *color, transmittance, depth = (
-        field[stacks.place].reshape(-1, BUNDLE, BUNDLE) for field in lax.fori_loop(0, batches, march_batch, state)[0]
-    )
+    dtype = grid.half_steps.dtype
+    state = fresh(work.count.shape[1], dtype), unlit(plan.held + 1, plan.slab_samples, dtype)
+    state = lax.fori_loop(0, stretches.number, march_stretch, state)
+    *color, transmittance, depth = (field[stretches.stacks.place].reshape(-1, BUNDLE, BUNDLE) for field in state[0])
     spent = evaluations(work, grid.samples, plan)
     spent = spent if lattice is None else spent + lattice.evaluations
     return Rays(jnp.stack(color), transmittance, depth, spent)
-
-
-def order_by_fullness(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
-    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are."""
-    bits = (count.shape[0] - 1).bit_length()
-    blocks = jnp.minimum((count + BLOCK - 1) // BLOCK, (1 << (31 - bits)) - 2)
-    key = jnp.where(real, (1 << (31 - bits)) - 2 - blocks, (1 << (31 - bits)) - 1).astype(jnp.uint32) << bits
-    key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
-    return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32), real.sum(dtype=jnp.int32)
 
 
 def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " bundles"]:
@@ -155,21 +108,6 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
     beyond = (jnp.arange(work.count.shape[0]) + 1) * plan.slab_samples - samples
     in_slab = plan.slab_samples - jnp.maximum(beyond, 0)[:, None] * (work.level == 0)
     return (work.count.astype(jnp.float32) * in_slab.astype(jnp.float32)).sum(0)
-
-
-def sample_depths(item: Worklist, slab: Array, half_steps: Array, plan: CastPlan) -> tuple[Array, Array]:
-    """View depths of an item's samples, and of the borders between them.
-
-    A coarse sample sits at the sample-space middle of its window. A super-pixel is a single sample as long as the cell.
-    """
-    step = (1 << item.level)[:, None]
-    first = (slab * plan.slab_samples)[:, None]
-    border = first + step * jnp.arange(plan.slab_samples + 1, dtype=jnp.int32)
-    middle = 2 * border[:, :-1] + step
-    if item.painted is not None:
-        border = jnp.where(item.painted[:, None], jnp.minimum(border, first + (1 << COARSEST)), border)
-    last = half_steps.shape[0] - 1
-    return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
 
 
 def _from_lattice(lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], sums: Array, plan: CastPlan) -> Array:

@@ -1,0 +1,148 @@
+"""Stretches of the stacks: which slabs are marched together, and where their samples are.
+
+Flow: worklist -> [stretches] -> points, adjoint.
+
+The slabs of all bundles, stacked front to back (`access.stacks`), are taken `held` at a time. Within such a stretch they are
+marched in order of how many particles they have, such that those of a chunk take equally long.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.grid import Grid
+from jaxsph.access.stacks import Stacks, stack
+from jaxsph.control.worklist import COARSEST, Worklist
+
+BLOCK = 16  # particles unrolled in the inner loop
+
+
+@dataclasses.dataclass(frozen=True)
+class CastPlan:
+    """Static sizes of the march.
+
+    Attributes:
+        chunk: slabs marched together.
+        slab_samples: samples that share a window of particles.
+        held: slabs whose light is held before it is put into the rays' state; a multiple of `chunk`.
+    """
+
+    chunk: int
+    slab_samples: int
+    held: int
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if getattr(self, field.name) < 1:
+                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+        if self.held % self.chunk:
+            raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """Some slabs of the stacks.
+
+    Attributes:
+        items: `slab * bundles + bundle` of each, in the order of the stacks.
+        fullest: the same, in the order in which they are marched.
+        held_at: where in that order each of `items` is.
+        first, number: where the stretch begins in the stacks, and how many of its slabs are real.
+        chunks: how many chunks that is.
+    """
+
+    items: Int[Array, " held"]
+    fullest: Int[Array, " held"]
+    held_at: Int[Array, " held"]
+    first: Int[Array, ""]
+    number: Int[Array, ""]
+    chunks: Int[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretches:
+    """All stretches of a band; the last slab of `work` is a dummy.
+
+    Attributes:
+        half_steps: depths of samples and their borders, see `Grid`, with room for the dummy slab: what lies past the last
+            sample has length zero.
+        order: the items of `stacks`, and dummies up to a whole stretch.
+    """
+
+    work: Worklist
+    half_steps: Float[Array, " two_samples_and_more"]
+    stacks: Stacks
+    order: Int[Array, " items"]
+    plan: CastPlan
+
+    @property
+    def num_bundles(self) -> int:
+        """How many bundles the band has."""
+        return self.work.count.shape[1]
+
+    @property
+    def number(self) -> Array:
+        """How many stretches there are."""
+        return (self.stacks.start[-1] + self.plan.held - 1) // self.plan.held
+
+    def stretch(self, nth: Array) -> Stretch:
+        """The slabs of one stretch, in the order of the stacks and by fullness."""
+        first = nth * self.plan.held
+        items = lax.dynamic_slice(self.order, (first,), (self.plan.held,))
+        dummy = (self.work.count.shape[0] - 1) * self.num_bundles
+        place, number = _by_fullness(self.work.count.ravel()[items], items < dummy)
+        held_at = jnp.zeros(self.plan.held, jnp.int32).at[place].set(jnp.arange(self.plan.held, dtype=jnp.int32))
+        return Stretch(items, items[place], held_at, first, number, (number + self.plan.chunk - 1) // self.plan.chunk)
+
+    def chunk(self, stretch: Stretch, nth: Array) -> tuple[Array, Array]:
+        """Items of a chunk of a stretch, and where they begin in it."""
+        begin = nth * self.plan.chunk
+        return lax.dynamic_slice(stretch.fullest, (begin,), (self.plan.chunk,)), begin
+
+    def item(self, at: Int[Array, " some"]) -> tuple[Worklist, Array, Array]:
+        """What is to be done for items, their slabs and their bundles."""
+        slab, bundle = at // self.num_bundles, at % self.num_bundles
+        return jax.tree.map(lambda leaf: leaf[..., slab, bundle], self.work), slab, bundle
+
+    def depths(self, item: Worklist, slab: Int[Array, " some"], half_steps: Array | None = None) -> tuple[Array, Array]:
+        """View depths of items' samples, and of the borders between them, read from `half_steps` if given.
+
+        A coarse sample sits at the sample-space middle of its window. A super-pixel is a single sample as long as the cell.
+        """
+        half_steps = self.half_steps if half_steps is None else half_steps
+        step, slab_samples = (1 << item.level)[:, None], self.plan.slab_samples
+        first = (slab * slab_samples)[:, None]
+        border = first + step * jnp.arange(slab_samples + 1, dtype=jnp.int32)
+        middle = 2 * border[:, :-1] + step
+        if item.painted is not None:
+            border = jnp.where(item.painted[:, None], jnp.minimum(border, first + (1 << COARSEST)), border)
+        last = half_steps.shape[0] - 1
+        return half_steps[jnp.minimum(middle, last)], half_steps[jnp.minimum(2 * border, last)]
+
+
+def stretches_of(grid: Grid, work: Worklist, plan: CastPlan) -> Stretches:
+    """The stretches that `work` is marched in."""
+    slabs, num_bundles = work.count.shape
+    stacks = stack(work.filled)
+    order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
+    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
+    return Stretches(padded, with_room(grid.half_steps, grid.samples, slabs, plan), stacks, order, plan)
+
+
+def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Array:
+    """Half steps for a slab past the last."""
+    return jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
+
+
+def _by_fullness(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
+    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are."""
+    bits = (count.shape[0] - 1).bit_length()
+    blocks = jnp.minimum((count + BLOCK - 1) // BLOCK, (1 << (31 - bits)) - 2)
+    key = jnp.where(real, (1 << (31 - bits)) - 2 - blocks, (1 << (31 - bits)) - 1).astype(jnp.uint32) << bits
+    key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
+    return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32), real.sum(dtype=jnp.int32)
