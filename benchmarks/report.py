@@ -57,6 +57,7 @@ def trade(found: dict) -> str:
             speed = number(record["full_total"] / record["total"], ".2f")
             ours = record["method"], f"{record['particles'] / 1e6:.2g} M", number(record["max_error"]), over, speed
             promised.append([record["scene"], f"{record['tolerance']:g}", *ours, f"{paper[0]} M", paper[1], paper[2]])
+    chosen = [row for scene in found["beaten"] for row in at_tolerances([r for r in found["records"] if r["scene"] == scene])]
     beaten = [[scene, *pair] for scene, by in found["beaten"].items() for pair in by.items()]
     header = "scene", "method", "tolerance", "max error", "mean error", "to converged", "bound", "evaluations saved", "speed-up"
     against = (
@@ -82,6 +83,11 @@ the setting, medians in turns. `interval` is certified; `interval relaxed` and `
 
 {table(header, rows)}
 
+What keeps to a tolerance in least time, with error control and without (`full rate`, `samples/K`, `size/K`), and the time of the
+latter over that of the former:
+
+{table(("scene", "tolerance", "without", "with", "speed-up"), chosen)}
+
 Which setting with error control takes no more time and errs no more than sampling coarser everywhere (`samples/K`), or than a
 smaller image scaled up (`size/K`):
 
@@ -97,6 +103,23 @@ compare shapes, not digits.
 
 {table(against, promised)}
 """
+
+
+def at_tolerances(records: list[dict]) -> list[list[str]]:
+    """At each tolerance, the fastest uniform sampling whose error keeps to it, and the fastest setting with error control."""
+    rows = []
+    for limit in sorted({record["tolerance"] for record in records} - {None}):
+        within = [record for record in records if record["max_error"] <= limit]
+        uniform = min((r for r in within if r["tolerance"] is None), key=share)
+        control = min((r for r in within if r["tolerance"] == limit), key=share)
+        ratio = share(uniform) / share(control)
+        rows.append([uniform["scene"], f"{limit:g}", uniform["method"], control["method"], f"{ratio:.2f}"])
+    return rows
+
+
+def share(record: dict) -> float:
+    """Time, over that of full rate in the same turns."""
+    return record["total"] / record["full_total"]
 
 
 def scaling(found: dict) -> str:

@@ -3,9 +3,9 @@
 `jaxsph.sweep` measures every estimator at every tolerance, coarser sampling and smaller images for five scenes, those of the
 first paper's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is measured on where
 an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are for reading. Most of
-the time is compiling: some two minutes a scene on two busy cores.
+the time is compiling: some three minutes a scene on two busy cores.
 
-    python benchmarks/trade.py [--repeats 3] [--size 256] [--scenes mixer radial] [--particles 50000] [--frames 0 2]
+    python benchmarks/trade.py [--repeats 3] [--size 512] [--scenes mixer radial] [--particles 50000] [--frames 0 2]
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def beaten(rows: list[Measurement]) -> dict[str, str | None]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--size", type=int, default=256, help="pixels on a side")
+    parser.add_argument("--size", type=int, default=512, help="pixels on a side")
     parser.add_argument("--samples", type=int, default=256, help="along a ray")
     parser.add_argument("--particles", type=int, help="instead of each scene's own number")
     parser.add_argument("--frames", type=float, nargs="+", help="a sequence, instead of the frame that shows a scene best")

@@ -1,5 +1,6 @@
 """The README keeps its word: its Python runs as pasted, its commands and files exist."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -43,6 +44,13 @@ def test_commands_that_are_named_exist(capsys):
         assert cli.main([command, "--help"]) == 0
     for target in set(re.findall(r"`make (\w+)`", README)):
         assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def test_the_page_of_results_is_what_the_results_make_of_it():
+    spec = importlib.util.spec_from_file_location("report", ROOT / "benchmarks" / "report.py")
+    report = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(report)
+    assert report.PAGE.read_text(encoding="utf-8") == report.page(), "python benchmarks/report.py"
 
 
 def test_every_scene_and_format_is_named():

@@ -1,0 +1,79 @@
+"""Stretches: every filled slab is marched once, those of a chunk are about as full, and samples sit where the contract says."""
+
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsph.cast.stretches import BLOCK, CastPlan, stretches_of
+from jaxsph.control.worklist import COARSEST, Worklist
+
+SLABS, BUNDLES, PLAN = 11, 13, CastPlan(chunk=8, slab_samples=4, held=24)
+
+
+def work_of(rng, level=None, painted=None):
+    filled = rng.uniform(size=(SLABS, BUNDLES)) < 0.6
+    count = np.where(filled, rng.integers(1, 200, filled.shape), 0)
+    level = np.zeros_like(count) if level is None else np.full_like(count, level)
+    columns = (filled, level, count[None] * 0, count[None], count, np.zeros(filled.shape, np.float32))
+    painted = None if painted is None else jnp.full(filled.shape, painted)
+    paint = None if painted is None else jnp.zeros((4, *filled.shape))
+    return Worklist(*(jnp.asarray(column) for column in columns), painted, paint)
+
+
+def stretches(work, samples=SLABS * 4 - 1):
+    grid = types.SimpleNamespace(half_steps=jnp.arange(2 * samples + 1, dtype=jnp.float32) / 2, samples=samples)
+    return stretches_of(grid, work, PLAN)
+
+
+def test_every_filled_slab_is_in_one_chunk():
+    work = work_of(np.random.default_rng(0))
+    found, seen = stretches(work), []
+    for nth in range(int(found.number)):
+        stretch = found.stretch(jnp.int32(nth))
+        of_stretch = []
+        for chunk in range(int(stretch.chunks)):
+            items, begin = found.chunk(stretch, jnp.int32(chunk))
+            assert int(begin) == chunk * PLAN.chunk
+            of_stretch += items.tolist()
+        number = int(stretch.number)
+        of_stretch = of_stretch[:number]
+        assert [int(stretch.fullest[k]) for k in stretch.held_at[: int(stretch.number)]] == stretch.items[
+            : int(stretch.number)
+        ].tolist()
+        blocks = [-(-int(work.count.ravel()[item]) // BLOCK) for item in of_stretch]
+        assert blocks == sorted(blocks, reverse=True)
+        seen += of_stretch
+    assert sorted(seen) == np.flatnonzero(np.asarray(work.filled)).tolist()
+
+
+@pytest.mark.parametrize("level", range(COARSEST + 1))
+def test_a_coarse_sample_sits_in_the_middle_of_its_window(level):
+    found = stretches(work_of(np.random.default_rng(1), level))
+    item, slab, _ = found.item(jnp.arange(BUNDLES))
+    middle, border = found.depths(item, slab)
+    windows = np.arange(PLAN.slab_samples + 1) * 2**level
+    last = SLABS * 4 - 1
+    np.testing.assert_array_equal(border[0], np.minimum(windows, last))
+    np.testing.assert_array_equal(middle[0], np.minimum(windows[:-1] + 2**level / 2, last))
+
+
+def test_a_super_pixel_is_one_sample_as_long_as_a_cell():
+    found = stretches(work_of(np.random.default_rng(2), COARSEST, painted=True))
+    item, slab, _ = found.item(jnp.arange(BUNDLES))
+    border = np.asarray(found.depths(item, slab)[1])
+    np.testing.assert_array_equal(border[0], [0, *[1 << COARSEST] * PLAN.slab_samples])
+
+
+def test_what_lies_past_the_last_sample_has_no_length():
+    found = stretches(work_of(np.random.default_rng(3)), samples=SLABS * 4 - 3)
+    item, slab, _ = found.item((SLABS - 1) * BUNDLES + jnp.arange(BUNDLES))
+    lengths = np.diff(np.asarray(found.depths(item, slab)[1]), axis=1)
+    np.testing.assert_array_equal(lengths[0], [1, 0, 0, 0])
+
+
+@pytest.mark.parametrize("sizes", [{"chunk": 0}, {"slab_samples": 0}, {"held": 0}, {"held": 12}])
+def test_sizes_that_do_not_fit_are_refused(sizes):
+    with pytest.raises(ValueError, match="must be"):
+        CastPlan(**({"chunk": 8, "slab_samples": 4, "held": 24} | sizes))
