@@ -6,9 +6,9 @@ A cubic through four nodes errs by at most 3/128 of a fourth difference, about t
 tells how well it can be interpolated: fourth differences of $\sum q V W - Q \sum V W$ over $\sum V W$ are the error of Q, to
 first order. It is a residual of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab,
 its effect on light that times the mean square slope of the transfer function over the quantities met, and slabs' variances
-add up along a bundle. Along depth, errors differ from sample to sample; across it they stay alike for about as far as nodes are
-apart, and the samples within count as one. `DEVIATIONS` standard deviations are the estimate. Narrow bands need no rule of their
-own: every sample is shaded, and where Q meets a steep part, its mean square slope is large; a jump is never interpolated over.
+add up along a bundle. Errors stay alike for about as far as nodes are apart, across or in depth, whatever lies nearer: samples
+within count as one. `DEVIATIONS` standard deviations are the estimate. Narrow bands need no rule of their own: every sample is
+shaded, and where Q meets a steep part, its mean square slope is large; a jump is never interpolated over.
 
 This is an estimate, not a bound. The second paper's a-posteriori error (its section 4) takes the same view of a finite element:
 the residual of the next order, weighted.
@@ -32,7 +32,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
 from jaxsph.numerics.staging import computed_once
 
-DEVIATIONS = 5.5  # standard deviations that pixels are taken to stay within
+DEVIATIONS = 5.25  # standard deviations that pixels are taken to stay within
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 CLEAR = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
@@ -147,7 +147,7 @@ def _deviations(
         near = [lax.dynamic_slice(v, (slab * within * layer,), ((within + 1 + 2 * REACH) * layer,)) for v in (weight, weighted)]
         border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
         spacing = NODE_PIXELS * pixel * (border[-1] if camera.is_perspective else 1)
-        alike = jnp.maximum(slab_samples * spacing / (border[-1] - border[0]), 1)  # samples in a row that err alike laterally
+        alike = jnp.maximum(slab_samples * spacing / (border[-1] - border[0]), 1)  # samples in a row that err alike across
         spread, quantity, extinction = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments, alike)
         absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
 
@@ -213,7 +213,7 @@ def _at_nodes(
         of_weight = fourth(weight, stride)
         unsure += CUBIC * jnp.abs(of_weight)
         error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
-        spread += error if stride == layer else alike * error
+        spread += (NODE_SAMPLES if stride == layer else alike) * error
     spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
     quantity = origin + ratio
     found = spread, quantity, jnp.where(inside, look_up(segments, quantity)[3], 0)
