@@ -1,9 +1,9 @@
 """Claim: the pilot estimator saves several times the evaluations, and its estimate holds.
 
-Over all frames at most one pixel in 100,000 is over the tolerance, and in each none over twice. Full rate and the pilot estimator render the same scene
-in one process, in turns; compile time is apart. `estimate to error` is the estimated over the true error of pixels that differ
-from full rate. `oracle` is what `oracle.py` saves where it was run at the same size and tolerance. Writes `results/pilot.json`
-and `results/pilot.png`; ends in asserts on errors, as times and savings are for reading.
+Over all frames at most one pixel in 100,000 is over the tolerance, and in each none over twice. Full rate and the pilot
+estimator render the same scene in one process, in turns; compile time is apart. `estimate to error` is the estimated over the
+true error of pixels that differ from full rate. `oracle` is what `oracle.py` saves where it was run at the same size and
+tolerance. Writes `results/pilot.json` and `results/pilot.png`; ends in asserts on errors, as times and savings are for reading.
 
     python benchmarks/pilot.py [--repeats 5] [--sizes 256 512 1024] [--scenes mixer radial:2 FILE]
 """

@@ -5,7 +5,7 @@ kernel (cubic spline), camera and transfer function are rendered by jaxsph; the 
 are compared, as VTK's image has 8 bits a channel (an error of 0.002 at least). All take turns in one process; compile time is
 apart. Writes `results/vtk_grid.json`; ends in an assert on errors and times.
 
-    pip install vtk; python benchmarks/vtk_grid.py [--size 256] [--grids 128 256] [--repeats 3]
+    pip install ".[vtk]"; python benchmarks/vtk_grid.py [--size 256] [--grids 128 256] [--repeats 3]
 """
 
 from __future__ import annotations
