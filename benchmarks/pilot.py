@@ -15,6 +15,8 @@ import json
 import pathlib
 import sys
 
+import jax
+
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import oracle
 import peers
@@ -121,6 +123,7 @@ def main() -> None:
             found = [record | {"oracle": known.get((label, size, record["tolerance"]))} for record in found]
             print("\n".join(row(record) for record in found), flush=True)
             records += found
+            jax.clear_caches()  # compiled programs hold memory maps, of which a process may have only so many
     arguments.output.parent.mkdir(exist_ok=True)
     arguments.output.write_text(
         json.dumps({"machine": peers.machine(), "repeats": arguments.repeats, "records": records}, indent=1) + "\n"

@@ -375,7 +375,7 @@ class _Clock:
 
 
 _PROGRAMS: dict[Hashable, Any] = {}
-MOST_PROGRAMS = 32  # compiled stages that are kept, the oldest goes first: each takes up to 1500 of the 65530 memory maps
+MOST_PROGRAMS = 24  # compiled stages that are kept, the oldest goes first: each takes up to 2000 of the 65530 memory maps
 
 
 def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
