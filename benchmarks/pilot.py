@@ -84,7 +84,7 @@ def draw(records: list[dict], path: pathlib.Path) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     titles = "evaluations saved (x oracle)", "time of full rate over the frame's", "estimate over error (1, 50, 99 %)"
     for axis, title in zip(axes, titles, strict=True):
-        axis.set(title=title, yscale="log", xticks=range(len(names)), xticklabels=names)
+        axis.set(title=title, xticks=range(len(names)), xticklabels=names)
         axis.axhline(1, color="0.7", linewidth=1)
         axis.tick_params("x", rotation=20)
     for k, size in enumerate(sizes):
@@ -99,7 +99,10 @@ def draw(records: list[dict], path: pathlib.Path) -> None:
         axes[2].vlines([at for at, _ in some], low, high, color=lines[0].get_color())
         best = [(at, record["oracle"]) for at, record in zip(place, here, strict=True) if record["oracle"]]
         axes[0].plot([at for at, _ in best], [saved for _, saved in best], "kx")
-    axes[0].legend()
+    for axis in (axes[0], axes[2]):
+        axis.set_yscale("log")
+    axes[1].set_ylim(0, None)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper")
     figure.suptitle(f"Pilot estimator at a tolerance of {SHOWN_AT:g}")
     figure.savefig(path, dpi=130)
 
