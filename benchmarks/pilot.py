@@ -1,6 +1,6 @@
 """Claim: the pilot estimator saves several times the evaluations, and its estimate holds.
 
-Over all frames at most one pixel in 100,000 is over the tolerance, and in each none over twice. Full rate and the pilot
+In every frame at most one pixel in 100,000 is over the tolerance, and none over twice. Full rate and the pilot
 estimator render the same scene in one process, in turns; compile time is apart. `estimate to error` is the estimated over the
 true error of pixels that differ from full rate. `oracle` is what `oracle.py` saves where it was run at the same size and
 tolerance. Writes `results/pilot.json` and `results/pilot.png`; ends in asserts on errors, as times and savings are for reading.
@@ -29,7 +29,7 @@ CUBE = 46  # particles along an edge of the peers' filled cube
 SCENES = ("mixer", "radial", "checker_board", "dam_break", "cube")
 SEQUENCES = tuple(f"{name}:{frame}" for name in ("mixer", "dam_break") for frame in range(3))  # at the smallest size
 SHOWN_AT = 0.004  # in the figure
-MOST_OVER = 1e-5  # share of the pixels of all frames
+MOST_OVER = 1e-5  # share of pixels
 RESULTS = peers.RESULTS.with_name("pilot.json")
 HEADER = "scene                 size tolerance  saved oracle full/frame max error     over estimate to error (1, 50, 99 %)"
 
@@ -73,6 +73,10 @@ def row(record: dict) -> str:
         f"{record['scene'][-20:]:20s} {record['size']:5d} {record['tolerance']:9g} {record['evaluations_saved']:6.2f} {best:>6s} "
         f"{1 / record['total_to_full']:10.2f} {record['max_error']:9.6f} {record['pixels_over_tolerance']:8.1e} {ratios}"
     )
+
+
+def keeps_its_word(record: dict) -> bool:
+    return record["pixels_over_tolerance"] <= MOST_OVER and record["max_error"] <= 2 * record["tolerance"]
 
 
 def draw(records: list[dict], path: pathlib.Path) -> None:
@@ -132,13 +136,8 @@ def main() -> None:
         json.dumps({"machine": peers.machine(), "repeats": arguments.repeats, "records": records}, indent=1) + "\n"
     )
     draw(records, arguments.output.with_suffix(".png"))
-    twice = [row(record) for record in records if record["max_error"] > 2 * record["tolerance"]]
-    assert not twice, "\n".join(["over twice the tolerance:", HEADER, *twice])
-    pixels = sum(record["size"] ** 2 for record in records)
-    over = sum(record["size"] ** 2 * record["pixels_over_tolerance"] for record in records) / pixels
-    worst = max(records, key=lambda record: record["pixels_over_tolerance"])
-    print(f"pixels over the tolerance: {over:.1e} of all, most in\n{row(worst)}")
-    assert over <= MOST_OVER
+    broken = [row(record) for record in records if not keeps_its_word(record)]
+    assert not broken, "\n".join(["over the tolerance:", HEADER, *broken])
 
 
 if __name__ == "__main__":

@@ -120,19 +120,19 @@ def test_a_camera_inside_a_particle_that_covers_the_screen(frames, compare):
     assert float(image.alpha.min()) > 0.1
 
 
-def test_bands_give_the_same_image_bit_for_bit(frames):
+@pytest.mark.parametrize("rows", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
+def test_bands_give_the_same_image_bit_for_bit(frames, rows):
     rng = np.random.default_rng(0)
     scene = frames.scene(rng, decades=1)
     camera = dataclasses.replace(frames.camera(rng), height=75)
     whole = js.plan(scene, camera, frames.settings)
-    for rows in (1, 2):
-        lists = dataclasses.replace(whole.lists, tile_rows=rows)
-        banded = dataclasses.replace(whole, bands=-(-5 // rows), lists=lists)
-        calls = []
-        image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))  # noqa: B023
-        assert calls[-1] == (banded.bands, banded.bands)
-        for layer in ("color", "transmittance", "depth", "evaluations"):
-            assert np.array_equal(getattr(image, layer), getattr(js.render(scene, camera, frames.settings, plan=whole), layer))
+    lists = dataclasses.replace(whole.lists, tile_rows=rows)
+    banded = dataclasses.replace(whole, bands=-(-5 // rows), lists=lists)
+    calls = []
+    image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))
+    assert calls[-1] == (banded.bands, banded.bands)
+    for layer in ("color", "transmittance", "depth", "evaluations"):
+        assert np.array_equal(getattr(image, layer), getattr(js.render(scene, camera, frames.settings, plan=whole), layer))
 
 
 def test_the_memory_limit_makes_bands_and_too_little_is_refused(frames):

@@ -26,6 +26,7 @@ from jaxsph.access.footprint import pixel_ranges, side_distances, touches
 from jaxsph.access.ordering import Ordered
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
+from jaxsph.numerics.checks import require_sizes
 from jaxsph.numerics.staging import computed_once
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
@@ -51,9 +52,7 @@ class ListPlan:
     list_capacity: int
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 1:
-                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+        require_sizes(self)
 
     @property
     def num_tiles(self) -> int:

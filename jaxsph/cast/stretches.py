@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.grid import Grid
 from jaxsph.access.stacks import Stacks, stack
 from jaxsph.control.worklist import COARSEST, Worklist
+from jaxsph.numerics.checks import require_sizes
 
 BLOCK = 16  # particles unrolled in the inner loop
 
@@ -37,9 +38,7 @@ class CastPlan:
     held: int
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if getattr(self, field.name) < 1:
-                raise ValueError(f"`{field.name}` must be at least 1, got {getattr(self, field.name)}")
+        require_sizes(self)
         if self.held % self.chunk:
             raise ValueError(f"`held` must be a multiple of `chunk`, got {self.held} and {self.chunk}")
 

@@ -160,7 +160,7 @@ def _deviations(
         around = 2 * deviation / jnp.sqrt(alike)
         *of_colors, of_extinction = _mean_square_slope(squares, low - around, high + around)
         length = (border[-1] - border[0]) * longest
-        # a slab's samples err independently: their sum by the root of their number, their mean by one over it
+        # what errs alike is in the deviation; the rest is independent: a sum grows by the root of its number, a mean falls so
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
         return before + absorbed, front**2 * deviation**2 * light / slab_samples
 
@@ -189,9 +189,10 @@ def _at_nodes(
 ) -> tuple[Array, ...]:
     """Variance of Q between nodes, Q, and extinction, (layers, nodes of a layer), of all layers but `REACH` on either side.
 
-    The variance is infinite where the sum of weights is not clear of zero.
+    The variance is that of one sample times how many in a row err alike; infinite where the sum of weights is not clear of zero.
 
     Args:
+        alike: how many samples in a row err alike across.
         weight, weighted: sums at nodes in a row.
         across, layer: how far apart neighbours are down and in depth.
     """

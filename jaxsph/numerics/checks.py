@@ -6,6 +6,7 @@ and bad data becomes a fault bit (`jaxsph.numerics.faults`).
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -15,6 +16,13 @@ import numpy as np
 def is_traced(*values: Any) -> bool:
     """Whether any leaf of `values` is an abstract tracer, so that its numbers cannot be looked at."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
+
+
+def require_sizes(plan: Any) -> None:
+    """Raise `ValueError` unless all fields of a dataclass of sizes are at least 1."""
+    for field in dataclasses.fields(plan):
+        if getattr(plan, field.name) < 1:
+            raise ValueError(f"`{field.name}` must be at least 1, got {getattr(plan, field.name)}")
 
 
 def require_shape(name: str, value: Any, shape: tuple[int | None, ...], remedy: str) -> None:
