@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.access.lists import BUNDLE
+from jaxsph.numerics.staging import computed_once
 
 RAYS = BUNDLE * BUNDLE  # of a bundle, in one row: short rows do not vectorise
 TOGETHER = 256  # bundles of a layer that are composited together
@@ -83,7 +84,8 @@ def composite(
             place = jnp.where(inside, place, 0)
             at = jnp.where(inside, held_at[place], light[0].shape[0] - 1)
             here = bundle + chunk * TOGETHER
-            rays = tuple(lax.dynamic_slice_in_dim(field, here, TOGETHER) for field in state)
+            # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
+            rays = computed_once(here >= 0, _slice_of, state, here)
             rays = _put(rays, light, at, borders(place))
             return tuple(lax.dynamic_update_slice_in_dim(old, new, here, 0) for old, new in zip(state, rays, strict=True))
 
@@ -92,6 +94,10 @@ def composite(
     top = jnp.searchsorted(starts, first, side="right").astype(jnp.int32) - 1
     bottom = jnp.searchsorted(starts, first + number, side="left").astype(jnp.int32)
     return lax.fori_loop(top, bottom, put_layer, state)
+
+
+def _slice_of(state: State, begin: Array) -> State:
+    return tuple(lax.dynamic_slice_in_dim(field, begin, TOGETHER) for field in state)
 
 
 def _put(rays: State, light: Light, at: Array, border: Array) -> State:
