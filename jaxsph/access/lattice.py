@@ -12,15 +12,20 @@ import dataclasses
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 NODE_PIXELS = 4
 NODE_SAMPLES = 2
+REACH = 2  # nodes to either side that a fourth difference takes
+GAP = REACH + 1  # nodes without anything past the last along each axis: a fourth difference, and the far border of a slab
 
 
 @dataclasses.dataclass(frozen=True)
 class Lattice:
     """Sums at the nodes of a band, up to one common factor.
+
+    With `REACH` layers of zeros in front and `GAP` zeros past the last node along each axis: one after the other in memory,
+    neighbours along any axis are then one shift away.
 
     Attributes:
         weight: of V W.
@@ -29,10 +34,16 @@ class Lattice:
         evaluations: kernel evaluations that the nodes took, for each ray of a bundle.
     """
 
-    weight: Float[Array, "deep down across"]
-    weighted: Float[Array, "deep down across"]
+    weight: Float[Array, "layers rows columns"]
+    weighted: Float[Array, "layers rows columns"]
     origin: Float[Array, ""]
     evaluations: Float[Array, " bundles"]
+
+
+def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> Int[Array, "*any"]:
+    """Where in memory nodes are, of a lattice of (layers, rows, columns) in all."""
+    _, rows, columns = shape
+    return ((REACH + layer) * rows + row) * columns + column
 
 
 def between(cells: int, every: int) -> Float[np.ndarray, "points nodes"]:

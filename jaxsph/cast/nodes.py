@@ -8,6 +8,7 @@ A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie sid
 from __future__ import annotations
 
 import functools
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES, Lattice, between
+from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, between, node_at
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
@@ -52,26 +53,27 @@ def sum_at_nodes(
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
+    across = 2 * ACROSS * tile_columns
+    shape = REACH + cells * DEEP + GAP, bundles * ACROSS * ACROSS // across + GAP, across + GAP
+    deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (DEEP, ACROSS, ACROSS))
 
-    def march(step: Array, table: Array) -> Array:
+    def march(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
         real = step * chunk + jnp.arange(chunk, dtype=jnp.int32) < number
         cell, bundle = at // bundles, at % bundles
         u, v = (rays[::NODE_PIXELS] for rays in grid.rays(camera, bundle))
-        deep = jnp.arange(DEEP, dtype=jnp.int32)[:, None] * NODE_SAMPLES
-        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep) + 1, last)]
+        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * NODE_SAMPLES) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
-        sums = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        target = jnp.where(real, at, cells * bundles)
-        return table.at[target].set(jnp.moveaxis(sums.reshape(2, -1, chunk), -1, 0))
+        found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
+        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - grid.row[0], grid.column - grid.column[0]))
+        place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
+        target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
+        return tuple(old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
 
-    table = jnp.zeros((cells * bundles + 1, 2, DEEP * ACROSS * ACROSS), grid.ordered.x.dtype)
-    table = lax.fori_loop(0, (number + chunk - 1) // chunk, march, table)[:-1]
-    table = table.reshape(cells, -1, tile_columns, 2, 2, 2, DEEP, ACROSS, ACROSS)
-    table = jnp.transpose(table, (5, 0, 6, 1, 3, 7, 2, 4, 8))
-    weight, weighted = table.reshape(2, cells * DEEP, -1, 2 * ACROSS * tile_columns)
+    nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
+    weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
-    return Lattice(weight, weighted, origin, spent)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, spent)
 
 
 def _summed(
@@ -123,12 +125,11 @@ def interpolate(
     Returns:
         V W as real, (q - origin) V W as imaginary part.
     """
-    deep, down, across = lattice.weight.shape
     within = slab_samples // NODE_SAMPLES
-    shape = (within + 3, ACROSS + 3, ACROSS + 3)
-    offset = np.arange(shape[0])[:, None, None] * down * across + np.arange(shape[1])[:, None] * across + np.arange(shape[2])
-    first = ((slab * within - 1) * down + corner[0] - 1) * across + corner[1] - 1
-    at = jnp.clip(first[:, None, None] + offset.reshape(shape[0], -1).astype(np.int32), 0, deep * down * across - 1)
+    layer, row, column = (jnp.arange(-1, n + 2, dtype=jnp.int32) for n in (within, ACROSS, ACROSS))
+    place = layer[:, None, None] + slab[:, None, None, None] * within, row[:, None] + corner[0][:, None, None, None]
+    at = node_at(lattice.weight.shape, *place, column + corner[1][:, None, None, None])
+    at = jnp.clip(at.reshape(slab.shape[0], within + 3, -1), 0, lattice.weight.size - 1)
     dtype = lattice.weight.dtype
     across_cell = between(ACROSS, NODE_PIXELS)
     lateral = jnp.asarray(np.kron(across_cell, across_cell).T, dtype)

@@ -16,6 +16,8 @@ $1 - D_{kr}$. Differences to the particle are taken before they are squared, so 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -72,9 +74,8 @@ def cast_points(
         item, slab, bundle = stretches.item(at)
         u, v = (rays.T for rays in grid.rays(camera, bundle))
         s, border = stretches.depths(item, slab)
-        sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
-        if lattice is not None:
-            sums = _from_lattice(lattice, grid, item, (slab, bundle), sums, plan)
+        marched = functools.partial(gather_field, grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
+        sums = marched() if lattice is None else _with_lattice(lattice, grid, item, (slab, bundle), marched, plan)
         return shade(sums, (u, v, border), segments, item, perspective)
 
     def march_stretch(nth: Array, state: tuple[State, Light]) -> tuple[State, Light]:
@@ -110,19 +111,24 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
     return (work.count.astype(jnp.float32) * in_slab.astype(jnp.float32)).sum(0)
 
 
-def _from_lattice(lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], sums: Array, plan: CastPlan) -> Array:
-    """`sums`, but those of interpolated slabs from the lattice."""
+def _with_lattice(
+    lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], marched: Callable[[], Array], plan: CastPlan
+) -> Array:
+    """Sums of items, `marched` or from the lattice. A chunk has those with particles, those without, or both."""
     slab, bundle = at
     inside = item.interpolated
     assert inside is not None
 
-    def replaced(sums: Array) -> Array:
+    def found() -> Array:
         # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
         corner = (grid.row[bundle] - grid.row[0]) // NODE_PIXELS, (grid.column[bundle] - grid.column[0]) // NODE_PIXELS
-        found = interpolate(lattice, slab, corner, plan.slab_samples)
-        return jnp.where(inside[:, None, None, None], found.reshape(sums.shape), sums)
+        return interpolate(lattice, slab, corner, plan.slab_samples).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
 
-    return lax.cond(inside.any(), replaced, lambda sums: sums, sums)
+    def both() -> Array:
+        return jnp.where(inside[:, None, None, None], found(), marched())
+
+    some, all_ = inside.any(), (item.count == 0).all()
+    return lax.switch(some.astype(jnp.int32) + (some & all_), [marched, both, found])
 
 
 def gather_field(

@@ -65,7 +65,7 @@ class Stretch:
 
 @dataclasses.dataclass(frozen=True)
 class Stretches:
-    """All stretches of a band; the last slab of `work` is a dummy.
+    """All stretches of a band; a slab past the last of `work` is a dummy.
 
     Attributes:
         half_steps: depths of samples and their borders, see `Grid`, with room for the dummy slab: what lies past the last
@@ -93,8 +93,8 @@ class Stretches:
         """The slabs of one stretch, in the order of the stacks and by fullness."""
         first = nth * self.plan.held
         items = lax.dynamic_slice(self.order, (first,), (self.plan.held,))
-        dummy = (self.work.count.shape[0] - 1) * self.num_bundles
-        place, number = _by_fullness(self.work.count.ravel()[items], items < dummy)
+        dummy = self.work.count.size
+        place, number = _by_fullness(self.work.count.ravel()[jnp.minimum(items, dummy - 1)], items < dummy)
         held_at = jnp.zeros(self.plan.held, jnp.int32).at[place].set(jnp.arange(self.plan.held, dtype=jnp.int32))
         return Stretch(items, items[place], held_at, first, number, (number + self.plan.chunk - 1) // self.plan.chunk)
 
@@ -104,9 +104,12 @@ class Stretches:
         return lax.dynamic_slice(stretch.fullest, (begin,), (self.plan.chunk,)), begin
 
     def item(self, at: Int[Array, " some"]) -> tuple[Worklist, Array, Array]:
-        """What is to be done for items, their slabs and their bundles."""
+        """What is to be done for items, their slabs and their bundles; a dummy has no particles."""
         slab, bundle = at // self.num_bundles, at % self.num_bundles
-        return jax.tree.map(lambda leaf: leaf[..., slab, bundle], self.work), slab, bundle
+        inside = jnp.minimum(slab, self.work.count.shape[0] - 1)
+        item = jax.tree.map(lambda leaf: leaf[..., inside, bundle], self.work)
+        real = inside == slab
+        return dataclasses.replace(item, length=jnp.where(real, item.length, 0), count=jnp.where(real, item.count, 0)), slab, bundle
 
     def depths(self, item: Worklist, slab: Int[Array, " some"], half_steps: Array | None = None) -> tuple[Array, Array]:
         """View depths of items' samples, and of the borders between them, read from `half_steps` if given.
@@ -129,8 +132,7 @@ def stretches_of(grid: Grid, work: Worklist, plan: CastPlan) -> Stretches:
     slabs, num_bundles = work.count.shape
     stacks = stack(work.filled)
     order = jnp.pad(stacks.item, (0, plan.held), constant_values=slabs * num_bundles)
-    padded = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 2) + [(0, 1), (0, 0)]), work)
-    return Stretches(padded, with_room(grid.half_steps, grid.samples, slabs, plan), stacks, order, plan)
+    return Stretches(work, with_room(grid.half_steps, grid.samples, slabs, plan), stacks, order, plan)
 
 
 def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Array:

@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES, Lattice
+from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.control.worklist import Worklist, full_rate
 from jaxsph.model.camera import Camera
@@ -42,8 +42,6 @@ HALVINGS = 16  # of the range of prices in octaves
 NARROWEST = 1e-3  # of the transfer function's domain that a slope is averaged over, at least
 ACROSS = BUNDLE // NODE_PIXELS
 Combine = Callable[[Array, Array], Array]
-REACH = 2  # nodes to either side that a fourth difference takes
-GAP = REACH + 1  # nodes without anything past the last of a row: a fourth difference, and the far border of a slab
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,10 +130,10 @@ def _deviations(
     """
     slabs = grid.cells.count.shape[0]
     within = slab_samples // NODE_SAMPLES
-    down, across = lattice.weight.shape[1:]
+    down, across = (side - GAP for side in lattice.weight.shape[1:])
     rows, columns = down // ACROSS, across // ACROSS
     layer = (down + GAP) * (across + GAP)
-    weight, weighted = (_in_a_row(value, slabs * within + 1) for value in (lattice.weight, lattice.weighted))
+    weight, weighted = (value.ravel() for value in (lattice.weight, lattice.weighted))
     segments, squares = transfer.segments(), _squared_slopes(transfer)
     path = _slant(grid, camera, down + GAP, across + GAP).ravel()
     longest = _pooled(path, jnp.maximum, down, across)
@@ -174,14 +172,6 @@ def _deviations(
     spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
     variance = _by_bundle(jnp.where(spared, variance, jnp.inf))
     return variance, jnp.isfinite(variance)
-
-
-def _in_a_row(value: Float[Array, "deep down across"], layers: int) -> Float[Array, " nodes"]:
-    """All nodes one after the other, with zeros between rows and layers: neighbours along any axis are then one shift away."""
-    deep, down, across = value.shape
-    kept = min(deep, layers + REACH)
-    row = jnp.zeros((layers + 2 * REACH, down + GAP, across + GAP), value.dtype)
-    return row.at[REACH : REACH + kept, :down, :across].set(value[:kept]).ravel()
 
 
 def _at_nodes(
