@@ -58,19 +58,20 @@ def _windows(lists: BundleLists, first: Array, last: Array) -> Cells:
 
 
 def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
-    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (class, slab) pairs."""
-    shape = (*wanted.shape, low.shape[0])
-    low, high = jnp.broadcast_to(low, shape), jnp.broadcast_to(high, shape)
+    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (class, slab) pairs.
+
+    By steps of powers of two from `low`, as long as all that is stepped over is smaller: one array goes round the loop, where
+    of two ends XLA copies both in every turn.
+    """
+    bits = 32 - lax.clz((high - low).max(initial=0))
     wanted = wanted[..., None]
 
-    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = (low + high) // 2
-        smaller = (rank[jnp.minimum(middle, rank.shape[0] - 1)] < wanted) & (low < high)
-        return jnp.where(smaller, middle + 1, low), jnp.where(smaller, high, jnp.maximum(middle, low))
+    def step(turn: Array, position: Array) -> Array:
+        past = position + (1 << (bits - 1 - turn))
+        smaller = rank[jnp.minimum(past, rank.shape[0]) - 1] < wanted
+        return jnp.where((past <= high) & smaller, past, position)
 
-    longest = (high - low).max(initial=0)
-    return lax.fori_loop(0, 32 - lax.clz(longest), halve, (low, high))[0]
+    return lax.fori_loop(0, bits, step, jnp.broadcast_to(low, (*wanted.shape[:-1], low.shape[0])))
 
 
 jax.tree_util.register_dataclass(Cells, data_fields=["begin", "length", "count"], meta_fields=[])

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.cast.composite import RAYS, TOGETHER, Light, emitted, transmitted
 from jaxsph.control.worklist import Worklist
 from jaxsph.model.transfer import SELECT_ALL, Segments, locate, look_up
+from jaxsph.numerics.staging import computed_once
 
 SMALLEST_WEIGHT = 2.0**20  # times the least normal number: below it a sample owes nothing, as one over it could overflow
 
@@ -75,10 +76,12 @@ def value_slabs(
             inside = place < past
             at = jnp.where(inside, held_at[jnp.where(inside, place, 0)], light[0].shape[0] - 1)
             here = bundle + chunk * TOGETHER
-            rays = jax.tree.map(lambda field: lax.dynamic_slice_in_dim(field, here, TOGETHER, field.ndim - 2), seen)
+            # at hand before any is put back, see `composite`
+            rays = computed_once(here >= 0, _slice_of, seen, here)
             color, transmittance, found = _value(rays, [field[at] for field in light[:4]])
-            put = dataclasses.replace(rays, color_so_far=color, transmittance_so_far=transmittance)
-            seen = jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, here, old.ndim - 2), seen, put)
+            color = lax.dynamic_update_slice_in_dim(seen.color_so_far, color, here, 1)
+            transmittance = lax.dynamic_update_slice_in_dim(seen.transmittance_so_far, transmittance, here, 0)
+            seen = dataclasses.replace(seen, color_so_far=color, transmittance_so_far=transmittance)
             return seen, worth.at[:, at].set(found)
 
         return lax.fori_loop(0, (past - begin + TOGETHER - 1) // TOGETHER, put_chunk, carry)
@@ -86,6 +89,10 @@ def value_slabs(
     top = jnp.searchsorted(starts, first, side="right").astype(jnp.int32) - 1
     bottom = jnp.searchsorted(starts, first + number, side="left").astype(jnp.int32)
     return lax.fori_loop(top, bottom, put_layer, (seen, jnp.zeros((4, *light[0].shape), light[0].dtype)))
+
+
+def _slice_of(seen: Seen, begin: Array) -> Seen:
+    return jax.tree.map(lambda field: lax.dynamic_slice_in_dim(field, begin, TOGETHER, field.ndim - 2), seen)
 
 
 def _value(rays: Seen, light: list[Array]) -> tuple[Array, Array, Array]:
