@@ -116,7 +116,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         rays = clock.run("cast", _cast, (*view, decided.work, decided.lattice), plan=shapes, kernel=scene.particles.kernel)
         words.append(grid.lists.faults)
         counts += [float(count) for count in _counts(grid)]
-        bands.append(_unbundle(rays, decided, plan))
+        bands.append(clock.run("image", _unbundle, (rays, decided.bound, decided.full, decided.levels), plan=shapes))
         if progress is not None:
             progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
@@ -145,7 +145,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         view = (grid, camera, transfer)
         decided = _adapt(*view, _limits(settings, ordered), plan=plan, kernel=scene.particles.kernel)
         rays = _cast(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
-        return _unbundle(rays, decided, plan), grid.lists.faults, _counts(grid)
+        return _unbundle(rays, decided.bound, decided.full, decided.levels, plan=plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
@@ -277,9 +277,10 @@ def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
     return camera.depth(u, plan.samples).astype(like.dtype)
 
 
-def _unbundle(rays: Rays, decided: _Decided, plan: Plan) -> tuple[Array, ...]:
+@functools.partial(jax.jit, static_argnames="plan")
+def _unbundle(rays: Rays, bound: Array, full: Array, levels: Array | None, *, plan: Plan) -> tuple[Array, ...]:
     """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
-    and of bundles.
+    and levels of bundles.
     """
     rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
 
@@ -290,10 +291,10 @@ def _unbundle(rays: Rays, decided: _Decided, plan: Plan) -> tuple[Array, ...]:
         value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
         return value.reshape(rows * 2 * down, columns * 2 * across, *value.shape[6:])
 
-    of_bundles = (rays.evaluations, decided.bound, decided.full)
+    of_bundles = (rays.evaluations, bound, full)
     of_rays = [jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in of_bundles]
     layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, *of_rays)]
-    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in [decided.levels] if v is not None))
+    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in [levels] if v is not None))
 
 
 def _stack(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:

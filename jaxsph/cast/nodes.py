@@ -68,8 +68,10 @@ def sum_at_nodes(
         row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - grid.row[0], grid.column - grid.column[0]))
         place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
-        return tuple(old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
+        weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
+        return weight, weighted
 
+    nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)

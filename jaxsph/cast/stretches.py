@@ -109,7 +109,8 @@ class Stretches:
         inside = jnp.minimum(slab, self.work.count.shape[0] - 1)
         item = jax.tree.map(lambda leaf: leaf[..., inside, bundle], self.work)
         real = inside == slab
-        return dataclasses.replace(item, length=jnp.where(real, item.length, 0), count=jnp.where(real, item.count, 0)), slab, bundle
+        length, count = (jnp.where(real, value, 0) for value in (item.length, item.count))
+        return dataclasses.replace(item, length=length, count=count), slab, bundle
 
     def depths(self, item: Worklist, slab: Int[Array, " some"], half_steps: Array | None = None) -> tuple[Array, Array]:
         """View depths of items' samples, and of the borders between them, read from `half_steps` if given.
