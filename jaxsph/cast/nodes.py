@@ -72,7 +72,6 @@ def sum_at_nodes(
         return weight, weighted
 
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
-    nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
     return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, spent)
