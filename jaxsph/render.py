@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Hashable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -26,6 +27,7 @@ from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.cast.adjoint import KEPT, cast
 from jaxsph.cast.nodes import sum_at_nodes
+from jaxsph.cast.parts import joined, part, parts_at_hand, plan_of_part
 from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import adapt
 from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
@@ -107,16 +109,17 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     particles, transfer = _in_own_units(scene, *clock.run("grid", _rescaled, (scene, camera)))
     ordered = clock.run("grid", _order, (particles, camera), plan=shapes)
     bands, words = [], [_input_faults(scene, camera, plan.samples) | ordered.faults]
-    counts = np.zeros(2)
+    counts, parts = np.zeros(2), parts_at_hand(ordered.x)
     for band in range(plan.bands):
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", _grid, (ordered, camera, first_row), plan=shapes))
         view = (grid, camera, transfer)
         decided = clock.run("adapt", _adapt, (*view, _limits(settings, ordered)), plan=plan, kernel=scene.particles.kernel)
-        rays = clock.run("cast", _cast, (*view, decided.work, decided.lattice), plan=shapes, kernel=scene.particles.kernel)
+        inputs = [(*view, decided.work, decided.lattice, jnp.int32(nth)) for nth in range(parts)]
+        rays = clock.run_all("cast", _cast_part, inputs, parts=parts, plan=shapes, kernel=scene.particles.kernel)
         words.append(grid.lists.faults)
         counts += [float(count) for count in _counts(grid)]
-        bands.append(clock.run("image", _unbundle, (rays, decided.bound, decided.full, decided.levels), plan=shapes))
+        bands.append(clock.run("image", _unbundle, (tuple(rays), decided.bound, decided.full, decided.levels), plan=shapes))
         if progress is not None:
             progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
@@ -145,7 +148,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         view = (grid, camera, transfer)
         decided = _adapt(*view, _limits(settings, ordered), plan=plan, kernel=scene.particles.kernel)
         rays = _cast(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
-        return _unbundle(rays, decided.bound, decided.full, decided.levels, plan=plan), grid.lists.faults, _counts(grid)
+        return _unbundle((rays,), decided.bound, decided.full, decided.levels, plan=plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
@@ -271,6 +274,24 @@ def _cast(
     return cast(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
+@functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
+def _cast_part(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    work: Worklist,
+    lattice: Lattice | None,
+    nth: Int[Array, ""],
+    *,
+    parts: int,
+    plan: Plan,
+    kernel: str,
+) -> Rays:
+    grid, work, lattice = part(grid, work, lattice, nth, parts)
+    plan = dataclasses.replace(plan, cast=plan_of_part(plan.cast, parts))
+    return _cast(grid, camera, transfer, work, lattice, plan=plan, kernel=kernel)
+
+
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
     """View depths s(0), s(1/2), ... s(N): fine samples sit at the odd entries, between borders at the even ones."""
     u = jnp.arange(2 * plan.samples + 1, dtype=like.dtype) / 2
@@ -278,11 +299,11 @@ def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def _unbundle(rays: Rays, bound: Array, full: Array, levels: Array | None, *, plan: Plan) -> tuple[Array, ...]:
+def _unbundle(parts: tuple[Rays, ...], bound: Array, full: Array, levels: Array | None, *, plan: Plan) -> tuple[Array, ...]:
     """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
     and levels of bundles.
     """
-    rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
+    rays, rows, columns = joined(parts), plan.lists.tile_rows, plan.lists.tile_columns
 
     def lay_out(value: Array) -> Array:
         """(bundles, 8, 8, ...) or (bundles, 1, 1, ...) to rows and columns."""
@@ -368,11 +389,19 @@ class _Clock:
 
     def run(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """Compile `function` for `arguments` if need be, run it, and book both."""
-        program = _compiled(function, arguments, static)
+        return self.run_all(stage, function, [arguments], **static)[0]
+
+    def run_all(self, stage: str, function: Any, inputs: list[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        """The same for several arguments of the same shapes, side by side."""
+        program = _compiled(function, inputs[0], static)
         self.mark("compile")
-        result = jax.block_until_ready(program(*arguments))
+        if len(inputs) == 1:
+            results = [jax.block_until_ready(program(*inputs[0]))]
+        else:
+            with ThreadPoolExecutor(len(inputs)) as threads:
+                results = list(threads.map(lambda arguments: jax.block_until_ready(program(*arguments)), inputs))
         self.mark(stage)
-        return result
+        return results
 
 
 _PROGRAMS: dict[Hashable, Any] = {}

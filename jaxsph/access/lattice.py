@@ -31,12 +31,14 @@ class Lattice:
         weight: of V W.
         weighted: of (q - origin) V W.
         origin: a quantity amid the particles'.
+        row: pixel row of the first nodes.
         evaluations: kernel evaluations that the nodes took, for each ray of a bundle.
     """
 
     weight: Float[Array, "layers rows columns"]
     weighted: Float[Array, "layers rows columns"]
     origin: Float[Array, ""]
+    row: Int[Array, ""]
     evaluations: Float[Array, " bundles"]
 
 

@@ -74,7 +74,7 @@ def sum_at_nodes(
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
-    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, spent)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, grid.row[0], spent)
 
 
 def _summed(

@@ -54,7 +54,7 @@ def test_a_cubic_field_is_interpolated_exactly(x64):
     cubic = rng.normal(size=(4, 4, 4))
     field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
     field = jnp.pad(field, ((REACH, GAP), (0, GAP), (0, GAP)))
-    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.zeros(1))
+    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.int32(0), jnp.zeros(1))
     slab, row, column = jnp.asarray([1, 3]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
     found = jax.jit(interpolate, static_argnames="slab_samples")(lattice, slab, (row, column), slab_samples=4)
     for k in range(2):

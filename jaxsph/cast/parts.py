@@ -1,0 +1,65 @@
+"""Parts of a band that are cast side by side.
+
+Flow: worklist -> [parts] -> points -> image.
+
+XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1 to 1.3
+times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out like cards, which gives every part about
+as much to do wherever the fluid is, and each part is a run of the same program. What a bundle's rays meet does not depend on
+what it is marched with, so the image is the same bit for bit (interpolated slabs but for rounding).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import Lattice
+from jaxsph.cast.points import Rays
+from jaxsph.cast.stretches import CastPlan
+from jaxsph.control.worklist import Worklist
+
+MOST = 4  # a tile has four bundles, so that many divide any band
+
+
+def parts_at_hand(array: Array) -> int:
+    """How many parts the device that holds `array` is to be given at once: a power of two, 1 but on CPUs."""
+    if any(device.platform != "cpu" for device in array.devices()):
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(MOST, 1 << (cores.bit_length() - 1))
+
+
+def plan_of_part(plan: CastPlan, parts: int) -> CastPlan:
+    """The plan of one part: all together they hold as much light as the plan for all does."""
+    return dataclasses.replace(plan, held=max(plan.held // (parts * plan.chunk), 1) * plan.chunk)
+
+
+def part(
+    grid: Grid, work: Worklist, lattice: Lattice | None, nth: Int[Array, ""], parts: int
+) -> tuple[Grid, Worklist, Lattice | None]:
+    """What belongs to every `parts`-th bundle from the `nth` on."""
+
+    def dealt(value: Array) -> Array:
+        return value.reshape(*value.shape[:-1], -1, parts)[..., nth]
+
+    grid = dataclasses.replace(grid, row=dealt(grid.row), column=dealt(grid.column))
+    if lattice is not None:
+        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations))
+    return grid, jax.tree.map(dealt, work), lattice
+
+
+def joined(rays: tuple[Rays, ...]) -> Rays:
+    """All bundles, of those of the parts."""
+
+    def mixed(axis: int, *values: Any) -> Array:
+        shape = values[0].shape
+        return jnp.stack(values, axis + 1).reshape(*shape[:axis], -1, *shape[axis + 1 :])
+
+    axes = Rays(color=1, transmittance=0, depth=0, evaluations=0)  # type: ignore[arg-type]
+    return jax.tree.map(mixed, axes, *rays)
