@@ -2,7 +2,8 @@
 
 Both render the same particles in one process, in turns; compile time is apart. `jaxsph` is grid + cast; the marcher is its grid
 build + march. Its samples are uniform in depth and ours geometric, so images differ by the discretisation and are compared
-loosely. Writes `results/peers.json`; ends in asserts on the ratios of medians.
+loosely. Beside them stands a frame of the pilot estimator, whose analysis counts as cast. Writes `results/peers.json`; ends in
+asserts on the ratios of medians.
 
     python benchmarks/peers.py [--repeats 5] [--check]
 """
@@ -19,6 +20,7 @@ import statistics
 import subprocess
 import sys
 import time
+from typing import Any
 
 import jax
 import numba
@@ -31,6 +33,8 @@ import workloads
 import jaxsph as js
 
 LIMITS = {"cube 97336": 1.5, "cube 1000000": 1.5, "dam break": 0.8}
+TOLERANCE = 0.004
+PILOT = f"pilot {TOLERANCE} poly6"
 PAUSE = 0.5  # seconds between turns: OpenMP threads spin for some 0.2 s after a march, on the next contender's cores
 RESULTS = pathlib.Path(__file__).parent / "results" / "peers.json"
 
@@ -56,8 +60,8 @@ def peer(load: workloads.Workload, kernel: str, steps: int):
     return frame, time.perf_counter() - started
 
 
-def ours(load: workloads.Workload, kernel: str):
-    scene, camera, settings = load.scene(kernel), load.camera(), js.Settings(samples=load.samples)
+def ours(load: workloads.Workload, kernel: str, **control: Any):
+    scene, camera, settings = load.scene(kernel), load.camera(), js.Settings(samples=load.samples, **control)
     started = time.perf_counter()
     plan = js.plan(scene, camera, settings)
     image = js.render(scene, camera, settings, plan=plan)
@@ -65,7 +69,8 @@ def ours(load: workloads.Workload, kernel: str):
 
     def frame():
         image = js.render(scene, camera, settings, plan=plan)
-        return image.stats["seconds"]["grid"], image.stats["seconds"]["cast"], image
+        seconds = image.stats["seconds"]
+        return seconds["grid"], seconds["adapt"] + seconds["cast"], image
 
     return frame, {"first_frame": first, "compile": image.stats["seconds"]["compile"], "plan": plan}
 
@@ -79,6 +84,8 @@ def measure(load: workloads.Workload, kernels: list[str], repeats: int) -> list[
         for steps in (4, 2):
             name = f"numba 8x{steps} {kernel}"
             contenders[name], compile_seconds[name] = peer(load, kernel, steps)
+    contenders[PILOT], notes[PILOT] = ours(load, "poly6", tolerance=TOLERANCE, estimator="pilot")
+    compile_seconds[PILOT] = notes[PILOT]["compile"]
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
     images = {}
     for _ in range(repeats):
@@ -127,6 +134,7 @@ def ratios(records: list[dict]) -> dict[str, dict[str, float]]:
         table[load] = {
             "poly6 / peer with cubic spline": total["jaxsph poly6"] / best["cubic_spline"],
             "poly6 / peer with poly6": total["jaxsph poly6"] / best["poly6"],
+            f"{PILOT} / peer with cubic spline": total[PILOT] / best["cubic_spline"],
             "cubic spline / peer with cubic spline": total["jaxsph cubic_spline"] / best["cubic_spline"],
         }
     return table
@@ -145,8 +153,9 @@ def main() -> None:
     arguments = parser.parse_args()
     records = []
     for load in (workloads.cube(46), workloads.cube(100), workloads.dam_break()):
-        records += measure(load, ["poly6", "cubic_spline"], arguments.repeats)
-        for record in records[-6:]:
+        found = measure(load, ["poly6", "cubic_spline"], arguments.repeats)
+        records += found
+        for record in found:
             rate = f"{record['g_evaluations_per_second']:5.1f} G/s" if "evaluations" in record else ""
             print(
                 f"{record['workload']:13s} {record['contender']:24s} grid {record['grid']:.3f}  cast {record['cast']:.3f}"

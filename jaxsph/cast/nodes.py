@@ -65,7 +65,7 @@ def sum_at_nodes(
         s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * NODE_SAMPLES) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - grid.row[0], grid.column - grid.column[0]))
+        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - grid.row[0], grid.column))
         place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
         weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))

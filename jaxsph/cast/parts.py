@@ -5,7 +5,7 @@ Flow: worklist -> [parts] -> points -> image.
 XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1 to 1.3
 times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out like cards, which gives every part about
 as much to do wherever the fluid is, and each part is a run of the same program. What a bundle's rays meet does not depend on
-what it is marched with, so the image is the same bit for bit (interpolated slabs but for rounding).
+what it is marched with, so the image is the same bit for bit.
 """
 
 from __future__ import annotations

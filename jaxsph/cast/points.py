@@ -121,7 +121,7 @@ def _with_lattice(
 
     def found() -> Array:
         # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
-        corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, (grid.column[bundle] - grid.column[0]) // NODE_PIXELS
+        corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, grid.column[bundle] // NODE_PIXELS
         return interpolate(lattice, slab, corner, plan.slab_samples).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
 
     def both() -> Array:

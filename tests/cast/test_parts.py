@@ -30,13 +30,13 @@ def test_parts_divide_any_band():
 
 @pytest.mark.parametrize("estimator", [None, "interval", "pilot"])
 def test_any_number_of_parts_makes_the_same_image(monkeypatch, estimator):
-    scene, camera = js.scenes.load("checker_board", 6000, width=90, height=70)
-    settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.02, estimator=estimator)
+    scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
+    settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.05, estimator=estimator)
     plan, images = js.plan(scene, camera, settings), []
     for parts in (1, MOST):
         monkeypatch.setattr(importlib.import_module("jaxsph.render"), "parts_at_hand", lambda _, parts=parts: parts)
         images.append(js.render(scene, camera, settings, plan=plan))
-    # what is interpolated may be rounded otherwise beside other slabs, where XLA compiles another path for them
-    close = np.testing.assert_array_equal if estimator != "pilot" else lambda a, b: np.testing.assert_allclose(a, b, atol=3e-6)
+    if estimator == "pilot":  # slabs are interpolated
+        assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
     for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
-        close(*(np.asarray(getattr(image, layer)) for image in images))
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
