@@ -1,4 +1,5 @@
 # make setup: .venv with everything. make test: lint and the whole suite. make demo: one picture. Nothing but Python is needed.
+# make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
 SHELL := /bin/bash
 VENV := .venv
 PYTHON ?=
@@ -7,7 +8,7 @@ JOBS ?= 2
 PYTEST_ARGS ?=
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
-.PHONY: setup test test-slow lint format demo clean
+.PHONY: setup test test-slow lint format demo results clean
 
 setup: $(VENV)/.installed-all
 
@@ -49,6 +50,18 @@ format: $(VENV)/.installed-test
 
 demo: $(VENV)/.installed-all
 	@$(VENV)/bin/jaxsph demo -o demo
+
+# A benchmark whose claim does not hold says so at its end; what it measured is written all the same.
+results: $(VENV)/.installed-all
+	rm -rf benchmarks/results/trade benchmarks/results/sequences
+	-$(VENV)/bin/python benchmarks/trade.py
+	-$(VENV)/bin/python benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 -o benchmarks/results/sequences
+	-$(VENV)/bin/python benchmarks/scaling.py --repeats 2
+	-$(VENV)/bin/python benchmarks/vtk_grid.py
+	-$(VENV)/bin/python benchmarks/pilot.py --repeats 3
+	-$(VENV)/bin/python benchmarks/peers.py
+	-$(VENV)/bin/python benchmarks/gradients.py --repeats 3
+	$(VENV)/bin/python benchmarks/report.py
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache demo.exr demo.png
