@@ -33,7 +33,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.cast.points import gather_field
 from jaxsph.control.worklist import CELL, full_rate, origins
 from jaxsph.model.transfer import Segments, look_up
-from jaxsph.render import _grid, _order
+from jaxsph.stages import grid_parts, order
 
 CHUNK = 64  # cells at a time
 HALVINGS = 60
@@ -193,8 +193,8 @@ def cut(scene: js.Scene, camera: js.Camera) -> Cut:
 
 
 def grid_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Grid:
-    ordered = _order(scene.particles, camera, plan=plan)
-    return Grid(ordered, *_grid(ordered, camera, jnp.int32(0), plan=plan))
+    ordered = order(scene.particles, camera, plan=plan)
+    return Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

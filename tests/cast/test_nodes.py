@@ -11,15 +11,15 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
 from jaxsph.cast.nodes import interpolate, sum_at_nodes
 from jaxsph.model import kernels
-from jaxsph.render import _grid, _order
+from jaxsph.stages import grid_parts, order
 
 
 def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
     rng = np.random.default_rng(5)
     scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
     plan = js.plan(scene, camera, frames.settings)
-    ordered = _order(scene.particles, camera, plan=plan)
-    grid = Grid(ordered, *_grid(ordered, camera, jnp.int32(0), plan=plan))
+    ordered = order(scene.particles, camera, plan=plan)
+    grid = Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
     lattice = sum_at_nodes(
         grid, camera, scene.particles.kernel, plan.cast.slab_samples, plan.lists.tile_columns, jnp.float64(0.4)
     )

@@ -9,14 +9,14 @@ import pytest
 
 from jaxsph.access.grid import Grid
 from jaxsph.control.worklist import origins
-from jaxsph.render import _grid, _order
+from jaxsph.stages import grid_parts, order
 
 
 @functools.partial(jax.jit, static_argnames="plan")
 def grid_of(particles, camera, *, plan):
     """The grid of a frame of one band, and what its sums are taken relative to."""
-    ordered = _order(particles, camera, plan=plan)
-    grid = Grid(ordered, *_grid(ordered, camera, 0, plan=plan))
+    ordered = order(particles, camera, plan=plan)
+    grid = Grid(ordered, *grid_parts(ordered, camera, 0, plan=plan))
     return grid, origins(grid.cells, grid.lists.rank, ordered.quantity)
 
 
