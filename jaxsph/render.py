@@ -30,7 +30,20 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.programs import Clock
 from jaxsph.plan import Plan
 from jaxsph.plan import plan as make_plan
-from jaxsph.stages import cast_band, cast_part, decide, grid_parts, in_own_units, input_faults, limits_of, order, rescale
+from jaxsph.stages import (
+    add_lattices,
+    cast_band,
+    cast_part,
+    decide,
+    grid_parts,
+    in_own_units,
+    input_faults,
+    judge_part,
+    limits_of,
+    order,
+    rescale,
+    sum_part,
+)
 from jaxsph.version import __version__
 
 Progress = Callable[[int, int], None]
@@ -103,7 +116,9 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", grid_parts, (ordered, camera, first_row), plan=shapes))
         view = (grid, camera, transfer)
-        decided = clock.run("adapt", decide, (*view, limits_of(settings, ordered)), plan=plan, kernel=scene.particles.kernel)
+        run = functools.partial(clock.run_all, "adapt")
+        piloted = _piloted(view, plan, scene.particles.kernel, parts, run)
+        (decided,) = run(decide, [(*view, limits_of(settings, ordered), piloted)], plan=plan)
         inputs = [(*view, decided.work, decided.lattice, jnp.int32(nth)) for nth in range(parts)]
         rays = clock.run_all("cast", cast_part, inputs, parts=parts, plan=shapes, kernel=scene.particles.kernel)
         words.append(grid.lists.faults)
@@ -135,7 +150,8 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         first_row = band * plan.band_height
         grid = Grid(ordered, *grid_parts(ordered, camera, first_row, plan=plan))
         view = (grid, camera, transfer)
-        decided = decide(*view, limits_of(settings, ordered), plan=plan, kernel=scene.particles.kernel)
+        piloted = _piloted(view, plan, scene.particles.kernel, 1, _run_traced)
+        decided = decide(*view, limits_of(settings, ordered), piloted, plan=plan)
         rays = cast_band(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
         return unbundle((rays,), decided.bound, decided.full, decided.levels, plan=plan), grid.lists.faults, _counts(grid)
 
@@ -155,6 +171,22 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     stats = {"evaluations": spent, "evaluations_full": full.sum(), "cells": cells_found, "pairs": pairs}
     certified = _certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, stats=stats)
+
+
+def _piloted(view: tuple[Any, ...], plan: Plan, kernel: str, parts: int, run_all: Callable[..., list[Any]]) -> Any:
+    """What the pilot estimator looks at: the lattice, and how well it can be interpolated."""
+    if not isinstance(plan.control, PilotPlan):
+        return None
+    grid, camera, transfer = view
+    each = [jnp.int32(nth) for nth in range(parts)]
+    lattices = run_all(sum_part, [(*view, nth) for nth in each], parts=parts, plan=plan, kernel=kernel)
+    (lattice,) = run_all(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
+    judged = run_all(judge_part, [(grid, lattice, camera, transfer, nth) for nth in each], parts=parts, plan=plan)
+    return lattice, tuple(judged)
+
+
+def _run_traced(function: Any, inputs: list[tuple[Any, ...]], **static: Any) -> list[Any]:
+    return [function(*arguments, **static) for arguments in inputs]
 
 
 def _certifies(plan: Plan) -> bool:

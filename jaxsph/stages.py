@@ -1,6 +1,6 @@
 """The stages of a frame, each a program of its own: what `render` calls, eagerly one by one or under one trace.
 
-Flow: rescale -> order -> grid_parts -> decide -> cast_band -> layers.
+Flow: rescale -> order -> grid_parts -> (sum_part -> judge_part) -> decide -> cast_band -> layers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice
+from jaxsph.access.lattice import Lattice, added
 from jaxsph.access.lists import BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.access.quantities import rescaled, too_small
@@ -28,6 +28,7 @@ from jaxsph.cast.parts import part, plan_of_part
 from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import adapt
 from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
+from jaxsph.control.residuals import Residuals, all_rows, residuals
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
@@ -96,11 +97,44 @@ def grid_parts(
     return lists, find_cells(ordered, lists), *bundle_origins(plan.lists, first_row), half_steps
 
 
-@functools.partial(jax.jit, static_argnames=("plan", "kernel"))
+@functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
+def sum_part(
+    grid: Grid, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan, kernel: str
+) -> Lattice:
+    """The lattice of the `nth` of `parts` of a band, for the pilot estimator."""
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
+    wanted = worthwhile(grid, camera, plan.cast.slab_samples)
+    amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
+    tiles = plan.lists.tile_rows, plan.lists.tile_columns
+    return sum_at_nodes(
+        grid, camera, kernel, plan.cast.slab_samples, tiles, amid.astype(grid.half_steps.dtype), wanted, nth, parts
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("parts", "plan"))
+def judge_part(
+    grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan
+) -> Residuals:
+    """What interpolating from the lattice would err by, in the `nth` of `parts` of a band."""
+    camera, transfer = jax.tree.map(lax.stop_gradient, (camera, transfer))
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    return residuals(grid, lattice, camera, transfer, plan.cast.slab_samples, nth, parts)
+
+
+add_lattices = jax.jit(added)
+
+
+@functools.partial(jax.jit, static_argnames="plan")
 def decide(
-    grid: Grid, camera: Camera, transfer: TransferFunction, limits: tuple[Array, Array] | None, *, plan: Plan, kernel: str
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    limits: tuple[Array, Array] | None,
+    piloted: tuple[Lattice, tuple[Residuals, ...]] | None = None,
+    *,
+    plan: Plan,
 ) -> Decided:
-    """How each cell is sampled. Decisions carry no gradient."""
+    """How each cell is sampled, `piloted` by the lattice and what it tells. Decisions carry no gradient."""
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
     limits = None if limits is None else (lax.stop_gradient(limits[0]), lax.stop_gradient(limits[1]))
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
@@ -113,10 +147,10 @@ def decide(
         return Decided(work, full, jnp.zeros(full.shape, dtype), None)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     if isinstance(plan.control, PilotPlan):
-        wanted = worthwhile(grid, camera, plan.cast.slab_samples)
-        amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
-        lattice = sum_at_nodes(grid, camera, kernel, plan.cast.slab_samples, plan.lists.tile_columns, amid, wanted)
-        work, bound = pilot(grid, lattice, camera, transfer, origin, limits[0], plan.cast.slab_samples)
+        assert piloted is not None
+        lattice, judged = piloted
+        found = all_rows(judged, full.shape[0])
+        work, bound = pilot(grid, lattice, found, camera, origin, limits[0], plan.cast.slab_samples)
         return Decided(work, full, bound, None, lattice)
     work, bound, levels = adapt(grid, camera, transfer, origin, *limits, plan.cast.slab_samples, plan.control)
     return Decided(work, full, bound, levels)

@@ -11,11 +11,16 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
+
+from jaxsph.access.lists import BUNDLE
 
 NODE_PIXELS = 4
 NODE_SAMPLES = 2
+ACROSS = BUNDLE // NODE_PIXELS  # nodes of a bundle, down and across
 REACH = 2  # nodes to either side that a fourth difference takes
 GAP = REACH + 1  # nodes without anything past the last along each axis: a fourth difference, and the far border of a slab
 
@@ -48,6 +53,25 @@ def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> 
     return ((REACH + layer) * rows + row) * columns + column
 
 
+def of_rows(lattice: Lattice, first: Int[Array, ""], number: int) -> Lattice:
+    """The lattice of some rows of bundles, with what lies `GAP` nodes below them; `evaluations` stay those of all.
+
+    Before the first row is what is below the last: fourth differences there mean nothing.
+    """
+    begin, number = first * ACROSS, number * ACROSS + GAP
+    weight, weighted = (lax.dynamic_slice_in_dim(sums, begin, number, 1) for sums in (lattice.weight, lattice.weighted))
+    return Lattice(weight, weighted, lattice.origin, lattice.row + first * BUNDLE, lattice.evaluations)
+
+
+def added(parts: tuple[Lattice, ...]) -> Lattice:
+    """The lattice of all bundles, of those whose other bundles' nodes are zero: every `len(parts)`-th bundle each."""
+    weight, weighted = (
+        sum(values[1:], values[0]) for values in zip(*((part.weight, part.weighted) for part in parts), strict=True)
+    )
+    evaluations = jnp.stack([part.evaluations for part in parts], -1).ravel()
+    return Lattice(weight, weighted, parts[0].origin, parts[0].row, evaluations)
+
+
 def between(cells: int, every: int) -> Float[np.ndarray, "points nodes"]:
     """Weights of the cubic through the nearest four nodes, for points that divide `cells` cells by `every`.
 
@@ -55,11 +79,14 @@ def between(cells: int, every: int) -> Float[np.ndarray, "points nodes"]:
     """
     table = np.zeros((cells * every, cells + 3))
     for point in range(cells * every):
-        cell, t = point // every, point % every / every
-        table[point, cell : cell + 4] = (
-            -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
-        )  # fmt: skip
+        cell = point // every
+        table[point, cell : cell + 4] = cubic(point % every / every)
     return table
+
+
+def cubic(t: float) -> tuple[float, float, float, float]:
+    """Weights of nodes at -1, 0, 1 and 2 for the cubic through them at `t`."""
+    return -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
 
 
 jax.tree_util.register_dataclass(Lattice, data_fields=[field.name for field in dataclasses.fields(Lattice)], meta_fields=[])

@@ -7,6 +7,7 @@ A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie sid
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 
@@ -17,8 +18,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, between, node_at
+from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, between, cubic, node_at
 from jaxsph.access.lists import BUNDLE
+from jaxsph.access.parts import dealt
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
 from jaxsph.control.worklist import CELL
@@ -28,7 +30,7 @@ from jaxsph.numerics.staging import computed_once
 
 CHUNK = 256  # cells at once
 BLOCK = 8  # particles unrolled in the inner loop
-ACROSS, DEEP = BUNDLE // NODE_PIXELS, CELL // NODE_SAMPLES  # nodes of a cell
+DEEP = CELL // NODE_SAMPLES  # layers of nodes of a cell
 
 
 def sum_at_nodes(
@@ -36,15 +38,21 @@ def sum_at_nodes(
     camera: Camera,
     kernel: str,
     slab_samples: int,
-    tile_columns: int,
+    tiles: tuple[int, int],
     origin: Float[Array, ""],
     wanted: Bool[Array, ""] | bool = True,
+    nth: Int[Array, ""] | int = 0,
+    parts: int = 1,
 ) -> Lattice:
-    """Sums at all nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
+    """Sums at the nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
 
     Args:
+        tiles: rows and columns of tiles of the band.
         origin: quantity that sums are taken relative to.
+        nth, parts: only those of every `parts`-th bundle from the `nth` on.
     """
+    first = grid.row[0]
+    grid = dataclasses.replace(grid, **dealt({name: getattr(grid, name) for name in ("cells", "row", "column")}, nth, parts))
     cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
     windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
@@ -53,8 +61,7 @@ def sum_at_nodes(
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
-    across = 2 * ACROSS * tile_columns
-    shape = REACH + cells * DEEP + GAP, bundles * ACROSS * ACROSS // across + GAP, across + GAP
+    shape = REACH + cells * DEEP + GAP, *(2 * ACROSS * number + GAP for number in tiles)
     deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (DEEP, ACROSS, ACROSS))
 
     def march(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -65,7 +72,7 @@ def sum_at_nodes(
         s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * NODE_SAMPLES) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - grid.row[0], grid.column))
+        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - first, grid.column))
         place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
         weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
@@ -74,7 +81,7 @@ def sum_at_nodes(
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
-    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, grid.row[0], spent)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, first, spent)
 
 
 def _summed(
@@ -114,7 +121,7 @@ def _summed(
 
 
 def interpolate(
-    lattice: Lattice, slab: Int[Array, " chunk"], corner: tuple[Array, Array], slab_samples: int
+    lattice: Lattice, slab: Int[Array, " chunk"], corner: tuple[Array, Array], slab_samples: int, level: int = 0
 ) -> Complex[Array, "chunk samples 64"]:
     """Sums at all samples of slabs, by the tensor product of cubics through the nearest four nodes along each axis.
 
@@ -122,25 +129,39 @@ def interpolate(
         slab: slabs that lie inside the lattice, with a node to spare on every side.
         corner: first node of their bundles, down and across.
         slab_samples: samples of a slab.
+        level: samples are `2**level` fine samples apart.
 
     Returns:
         V W as real, (q - origin) V W as imaginary part.
     """
-    within = slab_samples // NODE_SAMPLES
-    layer, row, column = (jnp.arange(-1, n + 2, dtype=jnp.int32) for n in (within, ACROSS, ACROSS))
+    within, step = slab_samples // NODE_SAMPLES, 1 << level
+    layer, row, column = (jnp.arange(-1, n + 2, dtype=jnp.int32) for n in (within * step, ACROSS, ACROSS))
     place = layer[:, None, None] + slab[:, None, None, None] * within, row[:, None] + corner[0][:, None, None, None]
     at = node_at(lattice.weight.shape, *place, column + corner[1][:, None, None, None])
-    at = jnp.clip(at.reshape(slab.shape[0], within + 3, -1), 0, lattice.weight.size - 1)
+    at = jnp.clip(at.reshape(slab.shape[0], layer.shape[0], -1), 0, lattice.weight.size - 1)
     dtype = lattice.weight.dtype
     across_cell = between(ACROSS, NODE_PIXELS)
     lateral = jnp.asarray(np.kron(across_cell, across_cell).T, dtype)
     taps = jnp.asarray(between(1, NODE_SAMPLES), dtype)[..., None]  # of the samples past a node
 
+    def across(nodes: Array) -> Array:
+        return jnp.matmul(nodes, lateral, precision=lax.Precision.HIGHEST)
+
     def spread(sums: Array) -> Array:
         nodes = sums.ravel().at[at].get(mode="promise_in_bounds")
-        layers = jnp.matmul(nodes, lateral, precision=lax.Precision.HIGHEST)[:, :, None]
+        if level:
+            return across(_every(step, nodes, slab_samples))
+        layers = across(nodes)[:, :, None]
         # broadcast over the samples past a node rather than stacked: of a stack XLA evaluates every row apart
         samples = functools.reduce(jnp.add, (taps[:, k] * layers[:, k : k + within] for k in range(4)))
         return samples.reshape(-1, slab_samples, BUNDLE * BUNDLE)
 
     return lax.complex(spread(lattice.weight), spread(lattice.weighted))
+
+
+def _every(step: int, nodes: Float[Array, "chunk layers nodes"], samples: int) -> Float[Array, "chunk samples nodes"]:
+    """Layers in the middle of every `step` fine samples: all are equally far past a layer of nodes."""
+    first, past = divmod((step - 1) / 2 / NODE_SAMPLES, 1)
+    begin, stride = int(first), step // NODE_SAMPLES
+    near = (nodes[:, begin + k :: stride][:, :samples] for k in range(4))
+    return functools.reduce(jnp.add, (weight * layers for weight, layers in zip(cubic(past), near, strict=True)))

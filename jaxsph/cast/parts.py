@@ -20,6 +20,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice
+from jaxsph.access.parts import dealt
 from jaxsph.cast.points import Rays
 from jaxsph.cast.stretches import CastPlan
 from jaxsph.control.worklist import Worklist
@@ -44,14 +45,10 @@ def part(
     grid: Grid, work: Worklist, lattice: Lattice | None, nth: Int[Array, ""], parts: int
 ) -> tuple[Grid, Worklist, Lattice | None]:
     """What belongs to every `parts`-th bundle from the `nth` on."""
-
-    def dealt(value: Array) -> Array:
-        return value.reshape(*value.shape[:-1], -1, parts)[..., nth]
-
-    grid = dataclasses.replace(grid, row=dealt(grid.row), column=dealt(grid.column))
+    row, column, work = dealt((grid.row, grid.column, work), nth, parts)
     if lattice is not None:
-        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations))
-    return grid, jax.tree.map(dealt, work), lattice
+        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations, nth, parts))
+    return dataclasses.replace(grid, row=row, column=column), work, lattice
 
 
 def joined(rays: tuple[Rays, ...]) -> Rays:

@@ -33,6 +33,7 @@ from jaxsph.cast.composite import Light, State, composite, fresh, unlit
 from jaxsph.cast.nodes import interpolate
 from jaxsph.cast.shading import shade
 from jaxsph.cast.stretches import BLOCK, CastPlan, stretches_of
+from jaxsph.control.spacing import WIDEST
 from jaxsph.control.worklist import Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
@@ -119,16 +120,24 @@ def _with_lattice(
     inside = item.interpolated
     assert inside is not None
 
-    def found() -> Array:
-        # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
-        corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, grid.column[bundle] // NODE_PIXELS
-        return interpolate(lattice, slab, corner, plan.slab_samples).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
+    # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
+    corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, grid.column[bundle] // NODE_PIXELS
+    levels = jnp.where(inside, item.level, -1)
 
-    def both() -> Array:
-        return jnp.where(inside[:, None, None, None], found(), marched())
+    def found(level: int) -> Array:
+        return interpolate(lattice, slab, corner, plan.slab_samples, level).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
 
-    some, all_ = inside.any(), (item.count == 0).all()
-    return lax.switch(some.astype(jnp.int32) + (some & all_), [marched, both, found])
+    def mixed() -> Array:
+        sums = marched()
+        for level in range(WIDEST + 1):
+            sums = jnp.where((levels == level)[:, None, None, None], found(level), sums)
+        return sums
+
+    highest = levels.max()
+    lowest = jnp.where(slab < grid.cells.count.shape[0], levels, highest).min()
+    kind = jnp.where(lowest == highest, highest + 2, 0)
+    every = [functools.partial(found, level) for level in range(WIDEST + 1)]
+    return lax.switch(kind, [mixed, marched, *every])
 
 
 def gather_field(

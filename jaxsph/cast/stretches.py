@@ -94,7 +94,9 @@ class Stretches:
         first = nth * self.plan.held
         items = lax.dynamic_slice(self.order, (first,), (self.plan.held,))
         dummy = self.work.count.size
-        place, number = _by_fullness(self.work.count.ravel()[jnp.minimum(items, dummy - 1)], items < dummy)
+        inside = jnp.minimum(items, dummy - 1)
+        level = self.work.level.ravel()[inside] if self.work.interpolated is not None else None
+        place, number = _by_fullness(self.work.count.ravel()[inside], level, items < dummy)
         held_at = jnp.zeros(self.plan.held, jnp.int32).at[place].set(jnp.arange(self.plan.held, dtype=jnp.int32))
         return Stretch(items, items[place], held_at, first, number, (number + self.plan.chunk - 1) // self.plan.chunk)
 
@@ -141,10 +143,18 @@ def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Ar
     return jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
 
 
-def _by_fullness(count: Int[Array, " held"], real: Bool[Array, " held"]) -> tuple[Array, Array]:
-    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are."""
+def _by_fullness(
+    count: Int[Array, " held"], level: Int[Array, " held"] | None, real: Bool[Array, " held"]
+) -> tuple[Array, Array]:
+    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are.
+
+    With `level`, slabs of no particles are in order of level.
+    """
     bits = (count.shape[0] - 1).bit_length()
-    blocks = jnp.minimum((count + BLOCK - 1) // BLOCK, (1 << (31 - bits)) - 2)
-    key = jnp.where(real, (1 << (31 - bits)) - 2 - blocks, (1 << (31 - bits)) - 1).astype(jnp.uint32) << bits
+    most = (1 << (31 - bits)) - 2
+    rank = (count + BLOCK - 1) // BLOCK
+    if level is not None:
+        rank = jnp.where(count > 0, rank + COARSEST, COARSEST - jnp.minimum(level, COARSEST))
+    key = jnp.where(real, most - jnp.minimum(rank, most), most + 1).astype(jnp.uint32) << bits
     key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
     return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32), real.sum(dtype=jnp.int32)

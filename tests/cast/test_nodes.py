@@ -21,7 +21,12 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
     ordered = order(scene.particles, camera, plan=plan)
     grid = Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
     lattice = sum_at_nodes(
-        grid, camera, scene.particles.kernel, plan.cast.slab_samples, plan.lists.tile_columns, jnp.float64(0.4)
+        grid,
+        camera,
+        scene.particles.kernel,
+        plan.cast.slab_samples,
+        (plan.lists.tile_rows, plan.lists.tile_columns),
+        jnp.float64(0.4),
     )
 
     kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.control.pilot import _mean_square_slope, _squared_slopes
+from jaxsph.control.residuals import _mean_square_slope, _squared_slopes
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
 FULL = js.Settings(samples=128)

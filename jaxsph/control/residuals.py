@@ -1,0 +1,247 @@
+r"""How wrong light would be if slabs were interpolated from the lattice: by the lattice's own fourth differences.
+
+Flow: lattice -> [residuals] -> pilot -> worklist.
+
+A cubic through four nodes errs by at most 3/128 of a fourth difference, about the middle between two nodes. So the lattice
+tells how well it can be interpolated: fourth differences of $\\sum q V W - Q \\sum V W$ over $\\sum V W$ are the error of Q, to
+first order. It is a residual of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab,
+its effect on light that times the mean square slope of the transfer function over the quantities met, and slabs' variances
+add up along a bundle. Errors stay alike for about as far as nodes are apart, across or in depth, whatever lies nearer: samples
+within count as one. Narrow bands need no rule of their own: every sample is shaded, and where Q meets a steep part, its mean
+square slope is large; a jump is never interpolated over.
+
+The second paper's a-posteriori error (its section 4) takes the same view of a finite element: the residual of the next order,
+weighted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxsph.access.grid import Grid
+from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, of_rows
+from jaxsph.control.spacing import bends
+from jaxsph.model.camera import Camera
+from jaxsph.model.transfer import Segments, TransferFunction, look_up
+from jaxsph.numerics.staging import computed_once
+
+CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
+CLEAR = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
+LEAST = 8  # eps: what interpolated samples differ by, at least
+NARROWEST = 1e-3  # of the transfer function's domain that a slope is averaged over, at least
+Combine = Callable[[Array, Array], Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Residuals:
+    """Of slabs, bundle by bundle or (slabs, rows, columns) of bundles.
+
+    Attributes:
+        variance: of the light of a slab, if it is interpolated, as it reaches the eye; infinite where it cannot be.
+        bend: root mean square over the nodes of how much light bends along a slab, see `spacing.bends`.
+    """
+
+    variance: Float[Array, "slabs *bundles"]
+    bend: Float[Array, "slabs *bundles"]
+
+
+jax.tree_util.register_dataclass(Residuals, data_fields=["variance", "bend"], meta_fields=[])
+
+
+def residuals(
+    grid: Grid,
+    lattice: Lattice,
+    camera: Camera,
+    transfer: TransferFunction,
+    slab_samples: int,
+    nth: Int[Array, ""] | int = 0,
+    parts: int = 1,
+) -> Residuals:
+    """Residuals of the `nth` of `parts` of a band's rows of bundles, with a row more on either side: see `all_rows`."""
+    rows = (lattice.weight.shape[1] - GAP) // ACROSS
+    share, number = _share(rows, parts)
+    first = jnp.clip(nth * share - 1, 0, rows - number)
+
+    def found() -> Residuals:
+        return _residuals(grid, of_rows(lattice, first, number), camera, transfer, slab_samples)
+
+    def nothing() -> Residuals:
+        shape = jax.eval_shape(found)
+        return Residuals(jnp.full(shape.variance.shape, jnp.inf, shape.variance.dtype), jnp.zeros_like(shape.bend))
+
+    return lax.cond((lattice.evaluations > 0).any(), found, nothing)
+
+
+def all_rows(parts: tuple[Residuals, ...], bundles: int) -> Residuals:
+    """Residuals of all `bundles` of a band, of those of its parts."""
+    _, number, columns = parts[0].variance.shape
+    rows = bundles // columns
+    share, _ = _share(rows, len(parts))
+    owned = []
+    for nth in range(len(parts)):
+        first = max(0, min(nth * share - 1, rows - number))
+        owned.append(slice(nth * share - first, min(rows, (nth + 1) * share) - first))
+    return jax.tree.map(
+        lambda *values: _by_bundle(jnp.concatenate([v[:, own] for v, own in zip(values, owned, strict=True)], 1)), *parts
+    )
+
+
+def _share(rows: int, parts: int) -> tuple[int, int]:
+    """Rows of bundles that a part answers for, and that it looks at."""
+    share = -(-rows // parts)
+    return share, min(rows, share + 2)
+
+
+def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> Residuals:
+    """Slab by slab from front to back, such that what is at hand stays in the cache.
+
+    Infinite variance where a stencil may leave the lattice: at its first and last slabs, rows and columns.
+    """
+    slabs = grid.cells.count.shape[0]
+    within = slab_samples // NODE_SAMPLES
+    down, across = (side - GAP for side in lattice.weight.shape[1:])
+    rows, columns = down // ACROSS, across // ACROSS
+    layer = (down + GAP) * (across + GAP)
+    weight, weighted = (value.ravel() for value in (lattice.weight, lattice.weighted))
+    segments, squares = transfer.segments(), _squared_slopes(transfer)
+    path = _slant(lattice, camera, down + GAP, across + GAP).ravel()
+    longest = _pooled(path, jnp.maximum, down, across)
+
+    at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer)
+    pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
+
+    def one_slab(state: tuple[Array, ...], slab: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        before, previous, *first = state
+        begin, number = (slab * within + 1) * layer, (within + 2 * REACH) * layer
+        near = [lax.dynamic_slice_in_dim(value, begin, number) for value in (weight, weighted)]
+        border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
+        spacing = NODE_PIXELS * pixel * (border[-1] if camera.is_perspective else 1)
+        alike = jnp.maximum(slab_samples * spacing / (border[-1] - border[0]), 1)  # samples in a row that err alike across
+        new = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments, alike)
+        spread, quantity, *colors, extinction = ([a, *b] for a, b in zip(first, new, strict=True))
+        absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
+
+        def pool(layers: list[Array], combine: Combine) -> Array:
+            return _pooled(functools.reduce(combine, layers), combine, down, across)
+
+        deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (ACROSS + 1) ** 2))
+        low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
+        front, taken = jnp.exp(-pool([before], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
+        around = 2 * deviation / jnp.sqrt(alike)
+        *of_colors, of_extinction = _mean_square_slope(squares, low - around, high + around)
+        length = (border[-1] - border[0]) * longest
+        # what errs alike is in the deviation; the rest is independent: a sum grows by the root of its number, a mean falls so
+        light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
+        step = (border[1:] - border[:-1])[:, None] * path
+        bend, previous = computed_once(slab >= 0, bends, colors, extinction, step, before, previous)
+        bend = jnp.sqrt(_pooled(bend**2, jnp.add, down, across)) / (ACROSS + 1)
+        return (before + absorbed, previous, *(layers[-1] for layers in new)), (
+            front**2 * deviation**2 * light / slab_samples,
+            bend,
+        )
+
+    # one more border than there are samples, and layers past the last
+    last = grid.half_steps.shape[0] - 1
+    edges = grid.half_steps[jnp.minimum(2 * NODE_SAMPLES * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
+    # the first layer counts as empty: its slab is not interpolated anyway
+    start = jnp.zeros_like(path), jnp.zeros((4, *path.shape), path.dtype), *([jnp.zeros_like(path)] * 6)
+    _, (variance, bend) = lax.scan(one_slab, start, jnp.arange(slabs, dtype=jnp.int32))
+    variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
+    slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
+    spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // NODE_SAMPLES)
+    spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
+    return Residuals(jnp.where(spared, variance, jnp.inf), bend)
+
+
+def _at_nodes(
+    weight: Array, weighted: Array, origin: Array, segments: Segments, alike: Array, *, across: int, layer: int
+) -> tuple[Array, ...]:
+    """Variance of Q between nodes, Q, red, green, blue and extinction, (layers, nodes of a layer), but `REACH` on either side.
+
+    The variance is that of one sample times how many in a row err alike; infinite where the sum of weights is not clear of zero.
+
+    Args:
+        alike: how many samples in a row err alike across.
+        weight, weighted: sums at nodes in a row.
+        across, layer: how far apart neighbours are down and in depth.
+    """
+    number = weight.shape[0] - 2 * REACH * layer
+
+    def shifted(value: Array, by: int) -> Array:
+        return value[REACH * layer + by :][:number]
+
+    def fourth(value: Array, stride: int) -> Array:
+        left2, left, middle, right, right2 = (shifted(value, by * stride) for by in range(-REACH, REACH + 1))
+        return (left2 + right2) - 4 * (left + right) + 6 * middle
+
+    here = shifted(weight, 0)
+    inside = here > 0
+    inverse = jnp.where(inside, 1 / jnp.where(inside, here, 1), 0)
+    ratio = shifted(weighted, 0) * inverse
+    spread, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio)
+    for stride in (1, across, layer):
+        of_weight = fourth(weight, stride)
+        unsure += CUBIC * jnp.abs(of_weight)
+        error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
+        spread += (NODE_SAMPLES if stride == layer else alike) * error
+    spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
+    quantity = origin + ratio
+    *colors, extinction = look_up(segments, quantity)
+    found = spread, quantity, *colors, jnp.where(inside, extinction, 0)
+    return tuple(value.reshape(-1, layer) for value in found)
+
+
+def _slant(lattice: Lattice, camera: Camera, down: int, across: int) -> Array:
+    """Path length of the nodes' rays a unit of depth, (down, across)."""
+    dtype = lattice.weight.dtype
+    if not camera.is_perspective:
+        return jnp.ones((down, across), dtype)
+    u = camera.column(NODE_PIXELS * jnp.arange(across, dtype=dtype) + 0.5)
+    v = camera.row((lattice.row + NODE_PIXELS * jnp.arange(down, dtype=jnp.int32)).astype(dtype) + 0.5)
+    return jnp.sqrt(1 + u**2 + v[:, None] ** 2)
+
+
+def _pooled(value: Float[Array, " nodes"], combine: Combine, down: int, across: int) -> Float[Array, "rows columns"]:
+    """Nodes of a layer combined over each bundle, those on the far borders as well."""
+    for stride in (1, across + GAP):
+        number = value.shape[0] - ACROSS * stride
+        value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(ACROSS + 1)))
+    return value[: down * (across + GAP)].reshape(down, -1)[::ACROSS, :across:ACROSS]
+
+
+def _by_bundle(value: Array) -> Array:
+    """(slabs, rows, columns) to (slabs, bundles), four bundles a tile."""
+    slabs, rows, columns = value.shape
+    value = value.reshape(slabs, rows // 2, 2, columns // 2, 2)
+    return jnp.transpose(value, (0, 1, 3, 2, 4)).reshape(slabs, -1)
+
+
+def _squared_slopes(transfer: TransferFunction) -> Segments:
+    """Integrals from the first control point on of the squared slopes of red, green, blue and extinction; number of jumps."""
+    segments = transfer.segments()
+    run = jnp.append(transfer.values[1:] - transfer.values[:-1], 0)
+    change = jnp.where(run > 0, segments.change / jnp.where(run > 0, run, 1), 0) ** 2 * run
+    jumps = ((run <= 0) & (segments.change != 0).any(0)).astype(run.dtype)
+    added = jnp.append(change, jumps[None], 0)
+    return dataclasses.replace(segments, base=jnp.cumsum(added, 1) - added, change=added.at[-1].set(0))
+
+
+def _mean_square_slope(squares: Segments, low: Array, high: Array) -> list[Array]:
+    """Mean over `[low, high]` of the squared slope of red, green, blue and extinction; infinite with a jump inside.
+
+    With what the difference of two integrals may have lost to rounding.
+    """
+    least = NARROWEST * (squares.start[-1] - squares.start[0])
+    extent = jnp.maximum(high - low, jnp.where(least > 0, least, 1))
+    *upper, jumps = look_up(squares, low + extent)
+    *lower, before = look_up(squares, low)
+    lost = 4 * jnp.finfo(low.dtype).eps
+    means = [((b - a) + lost * b) / extent for a, b in zip(lower, upper, strict=True)]
+    return [jnp.where(jumps > before, jnp.inf, mean) for mean in means]
