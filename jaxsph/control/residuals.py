@@ -152,7 +152,15 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     edges = grid.half_steps[jnp.minimum(2 * NODE_SAMPLES * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
     # the first layer counts as empty: its slab is not interpolated anyway
     start = jnp.zeros_like(path), jnp.zeros((4, *path.shape), path.dtype), *([jnp.zeros_like(path)] * 6)
-    _, (variance, bend) = lax.scan(one_slab, start, jnp.arange(slabs, dtype=jnp.int32))
+
+    def skip(state: tuple[Array, ...], _: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        nothing = jnp.zeros((rows, columns), path.dtype)
+        return (state[0], *(jnp.zeros_like(value) for value in state[1:])), (nothing, nothing)
+
+    filled = jnp.append((grid.cells.count > 0).any(1), False)
+    near_filled = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
+    each = jnp.arange(slabs, dtype=jnp.int32), near_filled
+    _, (variance, bend) = lax.scan(lambda state, x: lax.cond(x[1], one_slab, skip, state, x[0]), start, each)
     variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
     spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // NODE_SAMPLES)

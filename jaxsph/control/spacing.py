@@ -19,7 +19,7 @@ from jaxsph.access.lattice import NODE_SAMPLES
 from jaxsph.control.budget import cheapest
 
 WIDEST = 2  # level of the most widely spaced samples
-UNSEEN = 2.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
+UNSEEN = 3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
 LEAST = 8  # eps: what they differ by, at least
 
 
