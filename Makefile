@@ -55,12 +55,12 @@ demo: $(VENV)/.installed-all
 results: $(VENV)/.installed-all
 	rm -rf benchmarks/results/trade benchmarks/results/sequences
 	-$(VENV)/bin/python benchmarks/trade.py
-	-$(VENV)/bin/python benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 -o benchmarks/results/sequences
-	-$(VENV)/bin/python benchmarks/scaling.py --repeats 2
+	-$(VENV)/bin/python benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
+	-$(VENV)/bin/python benchmarks/scaling.py --repeats 1
 	-$(VENV)/bin/python benchmarks/vtk_grid.py
-	-$(VENV)/bin/python benchmarks/pilot.py --repeats 3
-	-$(VENV)/bin/python benchmarks/peers.py
-	-$(VENV)/bin/python benchmarks/gradients.py --repeats 3
+	-$(VENV)/bin/python benchmarks/pilot.py --repeats 2
+	-$(VENV)/bin/python benchmarks/peers.py --repeats 3
+	-$(VENV)/bin/python benchmarks/gradients.py --repeats 2
 	$(VENV)/bin/python benchmarks/report.py
 
 clean:

@@ -21,6 +21,7 @@ import peers
 
 import jaxsph as js
 from jaxsph import figures
+from jaxsph.contenders import BASELINES
 from jaxsph.measurement import Measurement
 
 SCENES = ("mixer", "checker_board", "radial", "letters", "flubber")
@@ -37,6 +38,7 @@ def measure(name: str, arguments: argparse.Namespace) -> list[Measurement]:
     place = (scenes, cameras) if arguments.frames else views[0]
     folder = arguments.output / name
     chosen = {"name": name, "frames": arguments.frames, "repeats": arguments.repeats, "folder": folder}
+    chosen |= {"baselines": arguments.baselines, "converged": arguments.converged}
     rows = js.sweep(*place, js.Settings(samples=arguments.samples), **chosen)
     figures.draw(rows, folder)
     return rows
@@ -86,6 +88,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=256, help="along a ray")
     parser.add_argument("--particles", type=int, help="instead of each scene's own number")
     parser.add_argument("--frames", type=float, nargs="+", help="a sequence, instead of the frame that shows a scene best")
+    parser.add_argument("--baselines", nargs="*", default=BASELINES, help="coarser sampling and smaller images; none at all")
+    parser.add_argument(
+        "--converged", type=int, default=8, help="times the samples, of the image that full rate is compared with"
+    )
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS.with_suffix(""), help="folder of tables and figures")
     arguments = parser.parse_args()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsph as js
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
 from jaxsph.cast.nodes import interpolate, sum_at_nodes
+from jaxsph.control.spacing import WIDEST
 from jaxsph.model import kernels
 from jaxsph.stages import grid_parts, order
 
@@ -53,18 +55,21 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
     assert weight.max() > 0
 
 
-def test_a_cubic_field_is_interpolated_exactly(x64):
+@pytest.mark.parametrize("level", range(WIDEST + 1))
+def test_a_cubic_field_is_interpolated_exactly(level, x64):
     rng = np.random.default_rng(0)
-    z, y, x = np.meshgrid(np.arange(12.0), np.arange(9.0), np.arange(8.0), indexing="ij")
+    z, y, x = np.meshgrid(np.arange(16.0), np.arange(9.0), np.arange(8.0), indexing="ij")
     cubic = rng.normal(size=(4, 4, 4))
     field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
     field = jnp.pad(field, ((REACH, GAP), (0, GAP), (0, GAP)))
     lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.int32(0), jnp.zeros(1))
-    slab, row, column = jnp.asarray([1, 3]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
-    found = jax.jit(interpolate, static_argnames="slab_samples")(lattice, slab, (row, column), slab_samples=4)
+    slab, row, column = jnp.asarray([1, 2]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
+    found = jax.jit(interpolate, static_argnames=("slab_samples", "level"))(
+        lattice, slab, (row, column), slab_samples=4, level=level
+    )
     for k in range(2):
         at = [
-            np.arange(4) / NODE_SAMPLES + 2 * float(slab[k]),
+            (((np.arange(4) + 0.5) * 2**level) - 0.5) / NODE_SAMPLES + 2 * float(slab[k]),  # middles of 2**level samples
             np.arange(8) / NODE_PIXELS + float(row[k]),
             np.arange(8) / NODE_PIXELS + float(column[k]),
         ]

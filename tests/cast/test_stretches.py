@@ -1,5 +1,6 @@
 """Stretches: every filled slab is marched once, those of a chunk are about as full, and samples sit where the contract says."""
 
+import dataclasses
 import types
 
 import jax.numpy as jnp
@@ -46,6 +47,19 @@ def test_every_filled_slab_is_in_one_chunk():
         assert blocks == sorted(blocks, reverse=True)
         seen += of_stretch
     assert sorted(seen) == np.flatnonzero(np.asarray(work.filled)).tolist()
+
+
+def test_slabs_from_the_lattice_go_by_level():
+    work = work_of(np.random.default_rng(2))
+    level = jnp.asarray(np.random.default_rng(3).integers(0, 3, work.count.shape), jnp.int32)
+    count = jnp.where(level > 0, 0, work.count)
+    found = stretches(dataclasses.replace(work, count=count, level=level, interpolated=count == 0))
+    for nth in range(int(found.number)):
+        stretch = found.stretch(jnp.int32(nth))
+        items = np.asarray(stretch.fullest)[: int(stretch.number)]
+        blocks, levels = -(-np.asarray(count).ravel()[items] // BLOCK), np.asarray(level).ravel()[items]
+        assert (np.diff(blocks) <= 0).all()
+        assert (np.diff(levels[blocks == 0]) >= 0).all()
 
 
 @pytest.mark.parametrize("level", range(COARSEST + 1))
