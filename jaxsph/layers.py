@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxsph.access.lists import BUNDLE
+from jaxsph.access.parts import gathered
 from jaxsph.cast.parts import joined
 from jaxsph.cast.points import Rays
 from jaxsph.model.camera import Camera
@@ -21,11 +22,16 @@ from jaxsph.plan import Plan
 
 
 @functools.partial(jax.jit, static_argnames="plan")
-def unbundle(parts: tuple[Rays, ...], bound: Array, full: Array, levels: Array | None, *, plan: Plan) -> tuple[Array, ...]:
+def unbundle(cast: tuple[Rays, ...], decided: tuple[tuple[Array, ...], ...], *, plan: Plan) -> tuple[Array, ...]:
     """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
     and levels of bundles.
+
+    Args:
+        cast: of all parts of the band.
+        decided: the same; error bound, full evaluations, and levels if there are any.
     """
-    rays, rows, columns = joined(parts), plan.lists.tile_rows, plan.lists.tile_columns
+    (bound, full, *levels), rays = gathered(decided), joined(cast)
+    rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
 
     def lay_out(value: Array) -> Array:
         """(bundles, 8, 8, ...) or (bundles, 1, 1, ...) to rows and columns."""
@@ -37,7 +43,7 @@ def unbundle(parts: tuple[Rays, ...], bound: Array, full: Array, levels: Array |
     of_bundles = (rays.evaluations, bound, full)
     of_rays = [jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in of_bundles]
     layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, *of_rays)]
-    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in [levels] if v is not None))
+    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in levels))
 
 
 def stacked(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:

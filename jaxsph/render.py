@@ -1,6 +1,6 @@
 """The verb: particles in, image out.
 
-Flow: order -> grid -> decide -> cast -> layers -> Image, band by band: the programs of `stages`.
+Flow: order -> grid -> decide -> cast -> layers -> Image, band by band: the programs of `stages`, part by part.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from jaxtyping import Array, Int
 from jaxsph.access.grid import Grid
 from jaxsph.cast.adjoint import KEPT
 from jaxsph.cast.parts import parts_at_hand
+from jaxsph.cast.points import Rays
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.layers import assemble, blank_if, stacked, unbundle
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.programs import Clock
@@ -32,14 +34,14 @@ from jaxsph.plan import Plan
 from jaxsph.plan import plan as make_plan
 from jaxsph.stages import (
     add_lattices,
-    cast_band,
     cast_part,
-    decide,
+    decide_part,
     grid_parts,
     in_own_units,
     input_faults,
     judge_part,
     limits_of,
+    look_part,
     order,
     rescale,
     sum_part,
@@ -47,6 +49,9 @@ from jaxsph.stages import (
 from jaxsph.version import __version__
 
 Progress = Callable[[int, int], None]
+View = tuple[Grid, Camera, TransferFunction]
+RunAll = Callable[..., list[Any]]
+"""Called as `run_all(stage, function, inputs, **static)`: one call of a program for each of the inputs."""
 
 
 class CapacityError(ValueError):
@@ -116,14 +121,10 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", grid_parts, (ordered, camera, first_row), plan=shapes))
         view = (grid, camera, transfer)
-        run = functools.partial(clock.run_all, "adapt")
-        piloted = _piloted(view, plan, scene.particles.kernel, parts, run)
-        (decided,) = run(decide, [(*view, limits_of(settings, ordered), piloted)], plan=plan)
-        inputs = [(*view, decided.work, decided.lattice, jnp.int32(nth)) for nth in range(parts)]
-        rays = clock.run_all("cast", cast_part, inputs, parts=parts, plan=shapes, kernel=scene.particles.kernel)
+        decided, rays = _parts(view, limits_of(settings, ordered), plan, scene.particles.kernel, parts, clock.run_all)
         words.append(grid.lists.faults)
         counts += [float(count) for count in _counts(grid)]
-        bands.append(clock.run("image", unbundle, (tuple(rays), decided.bound, decided.full, decided.levels), plan=shapes))
+        bands.append(clock.run("image", unbundle, (rays, decided), plan=shapes))
         if progress is not None:
             progress(band + 1, plan.bands)
     word = int(functools.reduce(lambda a, b: a | b, words))
@@ -150,10 +151,8 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         first_row = band * plan.band_height
         grid = Grid(ordered, *grid_parts(ordered, camera, first_row, plan=plan))
         view = (grid, camera, transfer)
-        piloted = _piloted(view, plan, scene.particles.kernel, 1, _run_traced)
-        decided = decide(*view, limits_of(settings, ordered), piloted, plan=plan)
-        rays = cast_band(*view, decided.work, decided.lattice, plan=plan, kernel=scene.particles.kernel)
-        return unbundle((rays,), decided.bound, decided.full, decided.levels, plan=plan), grid.lists.faults, _counts(grid)
+        decided, rays = _parts(view, limits_of(settings, ordered), plan, scene.particles.kernel, 1, _run_traced)
+        return unbundle(rays, decided, plan=plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
@@ -173,19 +172,32 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
-def _piloted(view: tuple[Any, ...], plan: Plan, kernel: str, parts: int, run_all: Callable[..., list[Any]]) -> Any:
-    """What the pilot estimator looks at: the lattice, and how well it can be interpolated."""
-    if not isinstance(plan.control, PilotPlan):
-        return None
-    grid, camera, transfer = view
-    each = [jnp.int32(nth) for nth in range(parts)]
-    lattices = run_all(sum_part, [(*view, nth) for nth in each], parts=parts, plan=plan, kernel=kernel)
-    (lattice,) = run_all(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
-    judged = run_all(judge_part, [(grid, lattice, camera, transfer, nth) for nth in each], parts=parts, plan=plan)
-    return lattice, tuple(judged)
+def _parts(
+    view: View, limits: Any, plan: Plan, kernel: str, parts: int, run_all: RunAll
+) -> tuple[tuple[Any, ...], tuple[Rays, ...]]:
+    """What is decided for the parts of a band, as far as the image shows it; and what their rays meet."""
+    each, shapes = [jnp.int32(nth) for nth in range(parts)], dataclasses.replace(plan, control=None)
+    adapt, lattice = functools.partial(run_all, "adapt"), None
+    seen: list[Any] = [None] * parts
+    if isinstance(plan.control, PilotPlan):
+        grid, camera, transfer = view
+        lattices = adapt(sum_part, [(*view, nth) for nth in each], parts=parts, plan=shapes, kernel=kernel)
+        (lattice,) = adapt(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
+        judged = adapt(judge_part, [(grid, lattice, camera, transfer, nth) for nth in each], parts=parts, plan=shapes)
+        seen = [(lattice, tuple(judged))] * parts
+    elif plan.control is not None:
+        grid, _, transfer = view
+        probes = adapt(look_part, [(grid, transfer, limits, nth) for nth in each], parts=parts, plan=plan)
+        shares = tuple((probe.held, probe.all_held) for probe in probes)
+        seen = [(probe.promising, shares) for probe in probes]
+    inputs = [(*view, limits, of_part, nth) for of_part, nth in zip(seen, each, strict=True)]
+    decided = adapt(decide_part, inputs, parts=parts, plan=plan)
+    work = [(*view, choice.work, lattice, nth) for choice, nth in zip(decided, each, strict=True)]
+    rays = run_all("cast", cast_part, work, parts=parts, plan=shapes, kernel=kernel)
+    return tuple(choice.layers for choice in decided), tuple(rays)
 
 
-def _run_traced(function: Any, inputs: list[tuple[Any, ...]], **static: Any) -> list[Any]:
+def _run_traced(_: str, function: Any, inputs: list[tuple[Any, ...]], **static: Any) -> list[Any]:
     return [function(*arguments, **static) for arguments in inputs]
 
 

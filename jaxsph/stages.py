@@ -1,6 +1,6 @@
 """The stages of a frame, each a program of its own: what `render` calls, eagerly one by one or under one trace.
 
-Flow: rescale -> order -> grid_parts -> (sum_part -> judge_part) -> decide -> cast_band -> layers.
+Flow: rescale -> order -> grid_parts -> (sum_part -> judge_part, or look_part) -> decide_part -> cast_part -> layers.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import Lattice, added
 from jaxsph.access.lists import BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
+from jaxsph.access.parts import dealt, part_of
 from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.cast.adjoint import cast
 from jaxsph.cast.nodes import sum_at_nodes
-from jaxsph.cast.parts import part, plan_of_part
+from jaxsph.cast.parts import plan_of_part
 from jaxsph.cast.points import Rays, evaluations
-from jaxsph.control.adapt import adapt
-from jaxsph.control.pilot import PilotPlan, pilot, worthwhile
+from jaxsph.control.adapt import ControlPlan, adapt, look
+from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
+from jaxsph.control.probe import Probe, worthwhile
 from jaxsph.control.residuals import Residuals, all_rows, residuals
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
@@ -60,10 +62,14 @@ class Decided:
     full: Array
     bound: Array
     levels: Array | None
-    lattice: Lattice | None = None
+
+    @property
+    def layers(self) -> tuple[Array, ...]:
+        """What the image shows of it: error bound, evaluations at full rate, and levels if there are any."""
+        return (self.bound, self.full) if self.levels is None else (self.bound, self.full, self.levels)
 
 
-jax.tree_util.register_dataclass(Decided, data_fields=["work", "full", "bound", "levels", "lattice"], meta_fields=[])
+jax.tree_util.register_dataclass(Decided, data_fields=["work", "full", "bound", "levels"], meta_fields=[])
 
 
 @jax.jit
@@ -103,12 +109,11 @@ def sum_part(
 ) -> Lattice:
     """The lattice of the `nth` of `parts` of a band, for the pilot estimator."""
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    wanted = worthwhile(grid, camera, plan.cast.slab_samples)
+    slab_samples, tiles = plan.cast.slab_samples, (plan.lists.tile_rows, plan.lists.tile_columns)
+    wanted = worth_a_lattice(grid, camera, slab_samples)
     amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
-    tiles = plan.lists.tile_rows, plan.lists.tile_columns
-    return sum_at_nodes(
-        grid, camera, kernel, plan.cast.slab_samples, tiles, amid.astype(grid.half_steps.dtype), wanted, nth, parts
-    )
+    amid = amid.astype(grid.half_steps.dtype)
+    return sum_at_nodes(part_of(grid, nth, parts), camera, kernel, slab_samples, tiles, grid.row[0], amid, wanted)
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan"))
@@ -116,60 +121,65 @@ def judge_part(
     grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan
 ) -> Residuals:
     """What interpolating from the lattice would err by, in the `nth` of `parts` of a band."""
-    camera, transfer = jax.tree.map(lax.stop_gradient, (camera, transfer))
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     return residuals(grid, lattice, camera, transfer, plan.cast.slab_samples, nth, parts)
+
+
+@functools.partial(jax.jit, static_argnames=("parts", "plan"))
+def look_part(
+    grid: Grid, transfer: TransferFunction, limits: tuple[Array, Array], nth: Int[Array, ""], *, parts: int, plan: Plan
+) -> Probe:
+    """What may be worth bounding, in the `nth` of `parts` of a band."""
+    grid, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, transfer, limits))
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    assert isinstance(plan.control, ControlPlan)
+    tolerance, relax = limits
+    return look(part_of(grid, nth, parts), transfer, tolerance, relax, plan.cast.slab_samples, plan.control)
 
 
 add_lattices = jax.jit(added)
 
 
-@functools.partial(jax.jit, static_argnames="plan")
-def decide(
+@functools.partial(jax.jit, static_argnames=("parts", "plan"))
+def decide_part(
     grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
     limits: tuple[Array, Array] | None,
-    piloted: tuple[Lattice, tuple[Residuals, ...]] | None = None,
+    seen: Any,
+    nth: Int[Array, ""],
     *,
+    parts: int,
     plan: Plan,
 ) -> Decided:
-    """How each cell is sampled, `piloted` by the lattice and what it tells. Decisions carry no gradient."""
-    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    limits = None if limits is None else (lax.stop_gradient(limits[0]), lax.stop_gradient(limits[1]))
+    """How each cell is sampled, in the `nth` of `parts` of a band. Decisions carry no gradient.
+
+    Args:
+        seen: what the decision rests on. Nothing at full rate; of the pilot, the lattice and the residuals of all parts; else
+            the cells of this part that are promising, and the shares of work that they hold in all parts.
+    """
+    grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
+    dtype, bundles = grid.half_steps.dtype, grid.row.shape[0]
+    grid = part_of(grid, nth, parts)
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     # an origin far beyond what is shown would cost the digits of what is
     origin = jnp.clip(origin, transfer.values[0], transfer.values[-1])
     work = full_rate(grid.cells, origin)
     full = evaluations(work, plan.samples, plan.cast)
-    dtype = grid.half_steps.dtype
     if limits is None or plan.control is None:
         return Decided(work, full, jnp.zeros(full.shape, dtype), None)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    tolerance, relax = limits
     if isinstance(plan.control, PilotPlan):
-        assert piloted is not None
-        lattice, judged = piloted
-        found = all_rows(judged, full.shape[0])
-        work, bound = pilot(grid, lattice, found, camera, origin, limits[0], plan.cast.slab_samples)
-        return Decided(work, full, bound, None, lattice)
-    work, bound, levels = adapt(grid, camera, transfer, origin, *limits, plan.cast.slab_samples, plan.control)
+        lattice, judged = seen
+        found = dealt(all_rows(judged, bundles), nth, parts)
+        work, bound = pilot(grid, lattice, found, camera, origin, tolerance, plan.cast.slab_samples)
+        return Decided(work, full, bound, None)
+    promising, shares = seen
+    wanted = promising & worthwhile(shares)
+    work, bound, levels = adapt(grid, camera, transfer, origin, wanted, tolerance, relax, plan.cast.slab_samples, plan.control)
     return Decided(work, full, bound, levels)
-
-
-@functools.partial(jax.jit, static_argnames=("plan", "kernel"))
-def cast_band(
-    grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction,
-    work: Worklist,
-    lattice: Lattice | None = None,
-    *,
-    plan: Plan,
-    kernel: str,
-) -> Rays:
-    """What all rays of a band meet."""
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    return cast(grid, work, camera, transfer, kernel, plan.cast, lattice)
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
@@ -185,10 +195,11 @@ def cast_part(
     plan: Plan,
     kernel: str,
 ) -> Rays:
-    """What the rays of the `nth` of `parts` of a band meet."""
-    grid, work, lattice = part(grid, work, lattice, nth, parts)
-    plan = dataclasses.replace(plan, cast=plan_of_part(plan.cast, parts))
-    return cast_band(grid, camera, transfer, work, lattice, plan=plan, kernel=kernel)
+    """What the rays of the `nth` of `parts` of a band meet; `work` is of this part, grid and lattice are of the whole."""
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    if lattice is not None:
+        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations, nth, parts))
+    return cast(part_of(grid, nth, parts), work, camera, transfer, kernel, plan_of_part(plan.cast, parts), lattice)
 
 
 def _half_steps(camera: Camera, like: Any, plan: Plan) -> Array:

@@ -51,8 +51,7 @@ def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], 
 
 
 def _windows(lists: BundleLists, first: Array, last: Array) -> Cells:
-    low, high = lists.start[:-1], lists.start[1:]
-    begin, end = (_bisect(lists.rank, wanted, low, high) for wanted in (first, last))
+    begin, end = (_bisect(lists.rank, wanted, lists.start, lists.end) for wanted in (first, last))
     length = jnp.maximum(end - begin, 0)
     return Cells(begin, length, length.sum(0, dtype=jnp.int32))
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.access.lists import BUNDLE
+from jaxsph.access.parts import gathered
 
 NODE_PIXELS = 4
 NODE_SAMPLES = 2
@@ -68,8 +68,7 @@ def added(parts: tuple[Lattice, ...]) -> Lattice:
     weight, weighted = (
         sum(values[1:], values[0]) for values in zip(*((part.weight, part.weighted) for part in parts), strict=True)
     )
-    evaluations = jnp.stack([part.evaluations for part in parts], -1).ravel()
-    return Lattice(weight, weighted, parts[0].origin, parts[0].row, evaluations)
+    return Lattice(weight, weighted, parts[0].origin, parts[0].row, gathered(tuple(part.evaluations for part in parts)))
 
 
 def between(cells: int, every: int) -> Float[np.ndarray, "points nodes"]:

@@ -67,13 +67,14 @@ class ListPlan:
 
 @dataclasses.dataclass(frozen=True)
 class BundleLists:
-    """Ranks of the particles that can touch each bundle: `rank[start[b] : start[b + 1]]`, ascending.
+    """Ranks of the particles that can touch each bundle: `rank[start[b] : end[b]]`, ascending.
 
     What `rank` holds past the last list is of no meaning.
     """
 
     rank: Int[Array, " pairs"]
-    start: Int[Array, " bundles_and_one"]
+    start: Int[Array, " bundles"]
+    end: Int[Array, " bundles"]
     faults: Int[Array, ""]
 
 
@@ -235,7 +236,8 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
 
     # the last entry takes what belongs to no list: to drop half of the entries is to mispredict half of the branches
     rank = lax.fori_loop(0, runs, place, jnp.zeros(plan.list_capacity + 1, jnp.int32))
-    return BundleLists(rank, jnp.minimum(begins[::runs], plan.list_capacity), overflow)
+    borders = jnp.minimum(begins[::runs], plan.list_capacity)
+    return BundleLists(rank, borders[:-1], borders[1:], overflow)
 
 
 def _touched_children(

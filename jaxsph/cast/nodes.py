@@ -7,7 +7,6 @@ A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie sid
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 
@@ -20,7 +19,6 @@ from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, between, cubic, node_at
 from jaxsph.access.lists import BUNDLE
-from jaxsph.access.parts import dealt
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
 from jaxsph.control.worklist import CELL
@@ -39,20 +37,18 @@ def sum_at_nodes(
     kernel: str,
     slab_samples: int,
     tiles: tuple[int, int],
+    first_row: Int[Array, ""] | int,
     origin: Float[Array, ""],
     wanted: Bool[Array, ""] | bool = True,
-    nth: Int[Array, ""] | int = 0,
-    parts: int = 1,
 ) -> Lattice:
-    """Sums at the nodes of a band, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
+    """Sums at the nodes of all bundles, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
 
     Args:
+        grid: of a band, or of a part of it.
         tiles: rows and columns of tiles of the band.
+        first_row: first pixel row of the band.
         origin: quantity that sums are taken relative to.
-        nth, parts: only those of every `parts`-th bundle from the `nth` on.
     """
-    first = grid.row[0]
-    grid = dataclasses.replace(grid, **dealt({name: getattr(grid, name) for name in ("cells", "row", "column")}, nth, parts))
     cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
     windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
@@ -72,7 +68,7 @@ def sum_at_nodes(
         s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * NODE_SAMPLES) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - first, grid.column))
+        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - first_row, grid.column))
         place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
         weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
@@ -81,7 +77,7 @@ def sum_at_nodes(
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
-    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, first, spent)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, jnp.asarray(first_row), spent)
 
 
 def _summed(

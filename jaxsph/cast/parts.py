@@ -3,9 +3,9 @@
 Flow: worklist -> [parts] -> points -> image.
 
 XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1 to 1.3
-times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out like cards, which gives every part about
-as much to do wherever the fluid is, and each part is a run of the same program. What a bundle's rays meet does not depend on
-what it is marched with, so the image is the same bit for bit.
+times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out (`access.parts`), and each part is a
+run of the same program. What a bundle's rays meet does not depend on what it is marched with, so the image is the same bit for
+bit.
 """
 
 from __future__ import annotations
@@ -16,14 +16,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
-from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice
-from jaxsph.access.parts import dealt
 from jaxsph.cast.points import Rays
 from jaxsph.cast.stretches import CastPlan
-from jaxsph.control.worklist import Worklist
 
 MOST = 4  # a tile has four bundles, so that many divide any band
 
@@ -39,16 +35,6 @@ def parts_at_hand(array: Array) -> int:
 def plan_of_part(plan: CastPlan, parts: int) -> CastPlan:
     """The plan of one part: all together they hold as much light as the plan for all does."""
     return dataclasses.replace(plan, held=max(plan.held // (parts * plan.chunk), 1) * plan.chunk)
-
-
-def part(
-    grid: Grid, work: Worklist, lattice: Lattice | None, nth: Int[Array, ""], parts: int
-) -> tuple[Grid, Worklist, Lattice | None]:
-    """What belongs to every `parts`-th bundle from the `nth` on."""
-    row, column, work = dealt((grid.row, grid.column, work), nth, parts)
-    if lattice is not None:
-        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations, nth, parts))
-    return dataclasses.replace(grid, row=row, column=column), work, lattice
 
 
 def joined(rays: tuple[Rays, ...]) -> Rays:

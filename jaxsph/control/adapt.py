@@ -1,6 +1,6 @@
 """Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
 
-Flow: cells -> [adapt: analysis -> levels -> merge] -> worklist -> cast -> image.
+Flow: cells -> [look -> adapt: analysis -> levels -> merge] -> worklist -> cast -> image.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels, uncoarsened
-from jaxsph.control.probe import promising
+from jaxsph.control.probe import Probe, probe
 from jaxsph.control.ranges import range_tables
 from jaxsph.control.worklist import CELL, Worklist
 from jaxsph.model.camera import Camera
@@ -42,17 +42,31 @@ class ControlPlan:
     parts: int = 2
 
 
+def look(
+    grid: Grid,
+    transfer: TransferFunction,
+    tolerance: Float[Array, ""],
+    relax: Float[Array, ""],
+    slab_samples: int,
+    plan: ControlPlan,
+) -> Probe:
+    """Which cells are worth an analysis, of a band or of a part of it."""
+    lateral = 1 - relax if plan.allocation == "paper" else 0.0
+    return probe(grid, range_tables(transfer), tolerance, lateral, slab_samples)
+
+
 def adapt(
     grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
     origin: Float[Array, "slabs bundles"],
+    wanted: Bool[Array, "cells bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
     plan: ControlPlan,
 ) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
-    r"""Decide how every cell is sampled. Where nothing is promising, that takes no more than a look.
+    r"""Decide how every cell is sampled, at full rate all but the `wanted`; where none is, nothing is analysed.
 
     Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
     thicknesses, of which the exponential keeps less than that) and once a slab;
@@ -68,8 +82,6 @@ def adapt(
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL)
     tables = range_tables(transfer)
-    lateral = 1 - relax if plan.allocation == "paper" else 0.0
-    wanted = promising(grid, tables, tolerance, lateral, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 

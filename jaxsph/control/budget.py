@@ -29,18 +29,26 @@ def cheapest(
     """
     allowed &= variance <= budget
     price = jnp.where(allowed, jnp.log2(variance) - jnp.log2(gain), jnp.inf)
-    low = jnp.full(variance.shape[1], price.min(initial=jnp.inf))
-    high = jnp.full(variance.shape[1], jnp.where(allowed, price, -jnp.inf).max(initial=-jnp.inf))
+    least, most = price.min(0), jnp.where(allowed, price, -jnp.inf).max(0)
+    low, high = (jnp.where(allowed.any(0), end, 0) for end in (least, most))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        keeps = jnp.where(price <= middle, variance, 0).sum(0) <= budget
+        keeps = added(jnp.where(price <= middle, variance, 0)) <= budget
         return jnp.where(keeps, middle, low), jnp.where(keeps, high, middle)
 
-    all_fit = jnp.where(allowed, variance, 0).sum(0) <= budget
+    all_fit = added(jnp.where(allowed, variance, 0)) <= budget
     highest = jnp.where(all_fit, high, lax.fori_loop(0, HALVINGS, halve, (low, high))[0])
     taken = allowed & (price <= highest)
-    total = jnp.where(taken, variance, 0).sum(0)
+    total = added(jnp.where(taken, variance, 0))
     fits = total <= budget  # the least price alone may be too much
     return taken & fits, jnp.where(fits, total, 0)
+
+
+def added(values: Float[Array, "choices bundles"]) -> Float[Array, " bundles"]:
+    """Sum over choices, in an order that does not depend on how many bundles there are, as that of XLA's sum may."""
+    while values.shape[0] > 1:
+        half = values.shape[0] // 2
+        values = jnp.concatenate([values[:half] + values[half : 2 * half], values[2 * half :]])
+    return values[0]

@@ -61,7 +61,7 @@ def pilot(
     return dataclasses.replace(work, **empty, filled=work.filled & begins, level=level, interpolated=taken), estimate
 
 
-def worthwhile(grid: Grid, camera: Camera, slab_samples: int) -> Bool[Array, ""]:
+def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int) -> Bool[Array, ""]:
     """Whether the lattice resolves enough of a band's work to be sampled at all."""
     count = grid.cells.count.astype(jnp.float32)
     return jnp.where(_resolved(grid, camera, slab_samples), count, 0).sum() > WORTHWHILE * count.sum()

@@ -10,6 +10,11 @@ it says, what is analysed is bounded with care.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -26,13 +31,34 @@ PROBES = 8  # particles of each slab, from the middle half of its window
 WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
 
-def promising(
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """What a look at the bundles of a band, or of a part of it, has found.
+
+    Attributes:
+        promising: cells that are to be analysed, if that is `worthwhile`.
+        held: how much of the work they hold.
+        all_held: the work of all cells.
+    """
+
+    promising: Bool[Array, "cells bundles"]
+    held: Float[Array, ""]
+    all_held: Float[Array, ""]
+
+
+def worthwhile(shares: Sequence[tuple[Array, Array]]) -> Bool[Array, ""]:
+    """Whether promising cells hold enough of a band's work to be analysed, by `held` and `all_held` of all of its parts."""
+    held, all_held = (functools.reduce(jnp.add, works) for works in zip(*shares, strict=True))
+    return held >= WORTHWHILE * all_held
+
+
+def probe(
     grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], lateral: Float[Array, ""] | float, slab_samples: int
-) -> Bool[Array, "cells bundles"]:
+) -> Probe:
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
-    Where all of them together hold little of the work, none is worth the analysis. What is promising grows with `tolerance`.
+    What is promising grows with `tolerance`.
 
     Args:
         tables: of the transfer function.
@@ -69,7 +95,7 @@ def promising(
     found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
     found &= 2 * lateral * (front * change).sum(0) <= tolerance
     held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
-    return found & (held >= WORTHWHILE * all_held)
+    return Probe(found, held, all_held)
 
 
 def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -92,3 +118,6 @@ def _varies(lo: Array, hi: Array, steps: Array, tables: RangeTables) -> Array:
     middle = 0.5 * (thin + thick)
     change = jnp.exp(-middle) * -jnp.expm1(-0.5 * (thick - thin)) - 0.5 * off * jnp.expm1(-middle)
     return jnp.stack([jnp.where(filled, change, 0).sum(0), jnp.where(filled, thin, 0).sum(0)])
+
+
+jax.tree_util.register_dataclass(Probe, data_fields=["promising", "held", "all_held"], meta_fields=[])

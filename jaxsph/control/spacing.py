@@ -74,8 +74,9 @@ def spaced(
         whole = taken.shape[0] // share * share
         if not whole:
             continue
-        groups, curved = (value[:whole].reshape(-1, share, value.shape[1]) for value in (taken & (level == 0), bend))
-        deviation = UNSEEN * (share**2 - 1) / (24 * NODE_SAMPLES**2) * curved.sum(1) + least
+        groups = (taken & (level == 0))[:whole].reshape(-1, share, taken.shape[1])
+        curved = functools.reduce(jnp.add, (bend[k:whole:share] for k in range(share)))
+        deviation = UNSEEN * (share**2 - 1) / (24 * NODE_SAMPLES**2) * curved + least
         chosen, more = cheapest(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
         level = level.at[:whole].max(coarse * jnp.repeat(chosen, share, 0))
         spent += more

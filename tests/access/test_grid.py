@@ -154,7 +154,7 @@ def test_lists_are_tight_for_particles_smaller_than_a_bundle(frames):
     for place, expected in ((inside, 1), (between, 0)):
         particles = js.Particles.from_arrays([place], 0.2 * pixel, 0.0, capacity=frames.capacity)
         _, lists, *_ = grid(particles, camera, frames.plan())
-        assert int(lists.start[-1]) == expected
+        assert int(lists.end[-1]) == expected
 
 
 @pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
@@ -175,6 +175,6 @@ def test_dead_and_padded_particles_are_listed_nowhere(frames):
     particles = js.Particles.from_arrays([[0, 0, 0], [0, 1e3, 0], [50, 0, 0]], 0.5, 0.0, capacity=frames.capacity)
     ordered, lists, *_ = grid(particles, camera, frames.plan())
     assert int(ordered.live.sum()) >= 1
-    ranks = set(np.asarray(lists.rank)[: int(lists.start[-1])].tolist())
+    ranks = set(np.asarray(lists.rank)[: int(lists.end[-1])].tolist())
     assert {float(ordered.quantity[r]) for r in ranks} == {0.0}
     assert len(ranks) == 1

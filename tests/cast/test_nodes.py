@@ -28,6 +28,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
         scene.particles.kernel,
         plan.cast.slab_samples,
         (plan.lists.tile_rows, plan.lists.tile_columns),
+        0,
         jnp.float64(0.4),
     )
 
