@@ -35,11 +35,11 @@ from jaxsph.plan import plan as make_plan
 from jaxsph.stages import (
     add_lattices,
     cast_part,
+    deal_part,
     decide_part,
     grid_parts,
     in_own_units,
     input_faults,
-    judge_part,
     limits_of,
     look_part,
     order,
@@ -178,20 +178,22 @@ def _parts(
     """What is decided for the parts of a band, as far as the image shows it; and what their rays meet."""
     each, shapes = [jnp.int32(nth) for nth in range(parts)], dataclasses.replace(plan, control=None)
     adapt, lattice = functools.partial(run_all, "adapt"), None
-    seen: list[Any] = [None] * parts
     if isinstance(plan.control, PilotPlan):
-        grid, camera, transfer = view
         lattices = adapt(sum_part, [(*view, nth) for nth in each], parts=parts, plan=shapes, kernel=kernel)
         (lattice,) = adapt(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
-        judged = adapt(judge_part, [(grid, lattice, camera, transfer, nth) for nth in each], parts=parts, plan=shapes)
-        seen = [(lattice, tuple(judged))] * parts
-    elif plan.control is not None:
-        grid, _, transfer = view
-        probes = adapt(look_part, [(grid, transfer, limits, nth) for nth in each], parts=parts, plan=plan)
-        shares = tuple((probe.held, probe.all_held) for probe in probes)
-        seen = [(probe.promising, shares) for probe in probes]
-    inputs = [(*view, limits, of_part, nth) for of_part, nth in zip(seen, each, strict=True)]
-    decided = adapt(decide_part, inputs, parts=parts, plan=plan)
+        # slab by slab what is at hand stays in the cache: one program is faster than parts side by side
+        decided = adapt(decide_part, [(*view, limits, lattice, each[0])], parts=1, plan=plan)
+        if parts > 1:
+            decided = adapt(deal_part, [(decided[0], nth) for nth in each], parts=parts)
+    else:
+        seen: list[Any] = [None] * parts
+        if plan.control is not None:
+            grid, _, transfer = view
+            probes = adapt(look_part, [(grid, transfer, limits, nth) for nth in each], parts=parts, plan=plan)
+            shares = tuple((probe.held, probe.all_held) for probe in probes)
+            seen = [(probe.promising, shares) for probe in probes]
+        inputs = [(*view, limits, of_part, nth) for of_part, nth in zip(seen, each, strict=True)]
+        decided = adapt(decide_part, inputs, parts=parts, plan=plan)
     work = [(*view, choice.work, lattice, nth) for choice, nth in zip(decided, each, strict=True)]
     rays = run_all("cast", cast_part, work, parts=parts, plan=shapes, kernel=kernel)
     return tuple(choice.layers for choice in decided), tuple(rays)

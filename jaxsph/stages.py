@@ -1,6 +1,6 @@
 """The stages of a frame, each a program of its own: what `render` calls, eagerly one by one or under one trace.
 
-Flow: rescale -> order -> grid_parts -> (sum_part -> judge_part, or look_part) -> decide_part -> cast_part -> layers.
+Flow: rescale -> order -> grid_parts -> (sum_part or look_part) -> decide_part -> cast_part -> layers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jaxsph.cast.points import Rays, evaluations
 from jaxsph.control.adapt import ControlPlan, adapt, look
 from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.control.probe import Probe, worthwhile
-from jaxsph.control.residuals import Residuals, all_rows, residuals
+from jaxsph.control.residuals import residuals
 from jaxsph.control.worklist import Worklist, full_rate, origins
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
@@ -117,16 +117,6 @@ def sum_part(
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan"))
-def judge_part(
-    grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan
-) -> Residuals:
-    """What interpolating from the lattice would err by, in the `nth` of `parts` of a band."""
-    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    return residuals(grid, lattice, camera, transfer, plan.cast.slab_samples, nth, parts)
-
-
-@functools.partial(jax.jit, static_argnames=("parts", "plan"))
 def look_part(
     grid: Grid, transfer: TransferFunction, limits: tuple[Array, Array], nth: Int[Array, ""], *, parts: int, plan: Plan
 ) -> Probe:
@@ -156,12 +146,11 @@ def decide_part(
     """How each cell is sampled, in the `nth` of `parts` of a band. Decisions carry no gradient.
 
     Args:
-        seen: what the decision rests on. Nothing at full rate; of the pilot, the lattice and the residuals of all parts; else
-            the cells of this part that are promising, and the shares of work that they hold in all parts.
+        seen: what the decision rests on. Nothing at full rate; of the pilot, the lattice, and there is only one part; else the
+            cells of this part that are promising, and the shares of work that they hold in all parts.
     """
     grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
-    dtype, bundles = grid.half_steps.dtype, grid.row.shape[0]
-    grid = part_of(grid, nth, parts)
+    dtype, grid = grid.half_steps.dtype, part_of(grid, nth, parts)
     origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
     # an origin far beyond what is shown would cost the digits of what is
     origin = jnp.clip(origin, transfer.values[0], transfer.values[-1])
@@ -172,14 +161,19 @@ def decide_part(
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     tolerance, relax = limits
     if isinstance(plan.control, PilotPlan):
-        lattice, judged = seen
-        found = dealt(all_rows(judged, bundles), nth, parts)
+        lattice, found = seen, residuals(grid, seen, camera, transfer, plan.cast.slab_samples)
         work, bound = pilot(grid, lattice, found, camera, origin, tolerance, plan.cast.slab_samples)
         return Decided(work, full, bound, None)
     promising, shares = seen
     wanted = promising & worthwhile(shares)
     work, bound, levels = adapt(grid, camera, transfer, origin, wanted, tolerance, relax, plan.cast.slab_samples, plan.control)
     return Decided(work, full, bound, levels)
+
+
+@functools.partial(jax.jit, static_argnames="parts")
+def deal_part(decided: Decided, nth: Int[Array, ""], *, parts: int) -> Decided:
+    """What was decided for the whole band, for the `nth` of `parts` of it."""
+    return dealt(decided, nth, parts)
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))

@@ -12,7 +12,6 @@ import dataclasses
 
 import jax
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.access.lists import BUNDLE
@@ -51,16 +50,6 @@ def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> 
     """Where in memory nodes are, of a lattice of (layers, rows, columns) in all."""
     _, rows, columns = shape
     return ((REACH + layer) * rows + row) * columns + column
-
-
-def of_rows(lattice: Lattice, first: Int[Array, ""], number: int) -> Lattice:
-    """The lattice of some rows of bundles, with what lies `GAP` nodes below them; `evaluations` stay those of all.
-
-    Before the first row is what is below the last: fourth differences there mean nothing.
-    """
-    begin, number = first * ACROSS, number * ACROSS + GAP
-    weight, weighted = (lax.dynamic_slice_in_dim(sums, begin, number, 1) for sums in (lattice.weight, lattice.weighted))
-    return Lattice(weight, weighted, lattice.origin, lattice.row + first * BUNDLE, lattice.evaluations)
 
 
 def added(parts: tuple[Lattice, ...]) -> Lattice:

@@ -35,20 +35,12 @@ def cheapest(
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        keeps = added(jnp.where(price <= middle, variance, 0)) <= budget
+        keeps = jnp.where(price <= middle, variance, 0).sum(0) <= budget
         return jnp.where(keeps, middle, low), jnp.where(keeps, high, middle)
 
-    all_fit = added(jnp.where(allowed, variance, 0)) <= budget
+    all_fit = jnp.where(allowed, variance, 0).sum(0) <= budget
     highest = jnp.where(all_fit, high, lax.fori_loop(0, HALVINGS, halve, (low, high))[0])
     taken = allowed & (price <= highest)
-    total = added(jnp.where(taken, variance, 0))
+    total = jnp.where(taken, variance, 0).sum(0)
     fits = total <= budget  # the least price alone may be too much
     return taken & fits, jnp.where(fits, total, 0)
-
-
-def added(values: Float[Array, "choices bundles"]) -> Float[Array, " bundles"]:
-    """Sum over choices, in an order that does not depend on how many bundles there are, as that of XLA's sum may."""
-    while values.shape[0] > 1:
-        half = values.shape[0] // 2
-        values = jnp.concatenate([values[:half] + values[half : 2 * half], values[2 * half :]])
-    return values[0]

@@ -23,10 +23,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, of_rows
+from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
 from jaxsph.control.spacing import bends
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
@@ -41,62 +41,30 @@ Combine = Callable[[Array, Array], Array]
 
 @dataclasses.dataclass(frozen=True)
 class Residuals:
-    """Of slabs, bundle by bundle or (slabs, rows, columns) of bundles.
+    """Of the slabs of a band.
 
     Attributes:
         variance: of the light of a slab, if it is interpolated, as it reaches the eye; infinite where it cannot be.
         bend: root mean square over the nodes of how much light bends along a slab, see `spacing.bends`.
     """
 
-    variance: Float[Array, "slabs *bundles"]
-    bend: Float[Array, "slabs *bundles"]
+    variance: Float[Array, "slabs bundles"]
+    bend: Float[Array, "slabs bundles"]
 
 
 jax.tree_util.register_dataclass(Residuals, data_fields=["variance", "bend"], meta_fields=[])
 
 
-def residuals(
-    grid: Grid,
-    lattice: Lattice,
-    camera: Camera,
-    transfer: TransferFunction,
-    slab_samples: int,
-    nth: Int[Array, ""] | int = 0,
-    parts: int = 1,
-) -> Residuals:
-    """Residuals of the `nth` of `parts` of a band's rows of bundles, with a row more on either side: see `all_rows`."""
-    rows = (lattice.weight.shape[1] - GAP) // ACROSS
-    share, number = _share(rows, parts)
-    first = jnp.clip(nth * share - 1, 0, rows - number)
-
-    def found() -> Residuals:
-        return _residuals(grid, of_rows(lattice, first, number), camera, transfer, slab_samples)
+def residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> Residuals:
+    """Residuals of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
 
     def nothing() -> Residuals:
-        shape = jax.eval_shape(found)
-        return Residuals(jnp.full(shape.variance.shape, jnp.inf, shape.variance.dtype), jnp.zeros_like(shape.bend))
+        shape = grid.cells.count.shape
+        dtype = lattice.weight.dtype
+        return Residuals(jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, dtype))
 
+    found = functools.partial(_residuals, grid, lattice, camera, transfer, slab_samples)
     return lax.cond((lattice.evaluations > 0).any(), found, nothing)
-
-
-def all_rows(parts: tuple[Residuals, ...], bundles: int) -> Residuals:
-    """Residuals of all `bundles` of a band, of those of its parts."""
-    _, number, columns = parts[0].variance.shape
-    rows = bundles // columns
-    share, _ = _share(rows, len(parts))
-    owned = []
-    for nth in range(len(parts)):
-        first = max(0, min(nth * share - 1, rows - number))
-        owned.append(slice(nth * share - first, min(rows, (nth + 1) * share) - first))
-    return jax.tree.map(
-        lambda *values: _by_bundle(jnp.concatenate([v[:, own] for v, own in zip(values, owned, strict=True)], 1)), *parts
-    )
-
-
-def _share(rows: int, parts: int) -> tuple[int, int]:
-    """Rows of bundles that a part answers for, and that it looks at."""
-    share = -(-rows // parts)
-    return share, min(rows, share + 2)
 
 
 def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> Residuals:
@@ -165,7 +133,7 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
     spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // NODE_SAMPLES)
     spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
-    return Residuals(jnp.where(spared, variance, jnp.inf), bend)
+    return Residuals(_by_bundle(jnp.where(spared, variance, jnp.inf)), _by_bundle(bend))
 
 
 def _at_nodes(

@@ -1,7 +1,8 @@
-"""Parts of the rows see what the whole band does."""
+"""Where nothing is known, nothing is interpolated; and what is judged, is judged by what lies around it."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.control.residuals import all_rows, residuals
+from jaxsph.control.residuals import residuals
 from jaxsph.stages import sum_part
 
 
@@ -20,23 +21,27 @@ def band(stages):
     plan = js.plan(scene, camera, js.Settings(samples=96, tolerance=0.05, estimator="pilot"))
     grid, _ = stages(scene.particles, camera, plan=plan)
     lattice = sum_part(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
-    judge = jax.jit(functools.partial(residuals, slab_samples=plan.cast.slab_samples), static_argnames="parts")
-    return grid, lattice, judge, (camera, scene.transfer)
+    judge = jax.jit(functools.partial(residuals, slab_samples=plan.cast.slab_samples))
+    return grid, lattice, lambda lattice: judge(grid, lattice, camera, scene.transfer)
 
 
-@pytest.mark.parametrize("parts", [2, 3, 4])
-def test_parts_are_joined_to_the_whole(band, parts):
-    grid, lattice, judge, view = band
-    bundles = grid.cells.count.shape[1]
-    whole = all_rows((judge(grid, lattice, *view),), bundles)
-    assert np.isfinite(whole.variance).any()
-    found = all_rows(tuple(judge(grid, lattice, *view, nth=jnp.int32(k), parts=parts) for k in range(parts)), bundles)
-    np.testing.assert_array_equal(np.isfinite(found.variance), np.isfinite(whole.variance))
-    for name in ("variance", "bend"):
-        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-4, atol=1e-12)
+def test_some_slabs_with_particles_can_be_interpolated(band):
+    grid, lattice, judge = band
+    found = judge(lattice)
+    filled = np.asarray(grid.cells.count) > 0
+    usable = np.isfinite(found.variance)
+    assert (usable & filled).sum() > 0.1 * filled.sum()
+    assert (np.asarray(found.variance)[usable] > 0).all() and (np.asarray(found.bend) >= 0).all()
+
+
+def test_rougher_sums_are_judged_worse(band):
+    _, lattice, judge = band
+    rough = lattice.weighted * (1 + 0.01 * np.random.default_rng(0).normal(size=lattice.weighted.shape).astype(np.float32))
+    smooth, found = judge(lattice).variance, judge(dataclasses.replace(lattice, weighted=rough)).variance
+    both = np.isfinite(smooth) & np.isfinite(found) & (np.asarray(smooth) > 1e-9)
+    assert both.any() and (np.asarray(found)[both] > np.asarray(smooth)[both]).mean() > 0.95
 
 
 def test_nothing_is_interpolated_without_a_lattice(band):
-    grid, lattice, judge, view = band
-    empty = jax.tree.map(jnp.zeros_like, lattice)
-    assert np.isinf(judge(grid, empty, *view).variance).all()
+    _, lattice, judge = band
+    assert np.isinf(judge(jax.tree.map(jnp.zeros_like, lattice)).variance).all()
