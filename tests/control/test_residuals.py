@@ -36,7 +36,7 @@ def test_some_slabs_with_particles_can_be_interpolated(band):
 
 def test_rougher_sums_are_judged_worse(band):
     _, lattice, judge = band
-    rough = lattice.weighted * (1 + 0.01 * np.random.default_rng(0).normal(size=lattice.weighted.shape).astype(np.float32))
+    rough = lattice.weighted * (1 + 0.1 * np.random.default_rng(0).normal(size=lattice.weighted.shape).astype(np.float32))
     smooth, found = judge(lattice).variance, judge(dataclasses.replace(lattice, weighted=rough)).variance
     both = np.isfinite(smooth) & np.isfinite(found) & (np.asarray(smooth) > 1e-9)
     assert both.any() and (np.asarray(found)[both] > np.asarray(smooth)[both]).mean() > 0.95
