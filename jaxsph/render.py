@@ -121,7 +121,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         first_row = jnp.int32(band * plan.band_height)
         grid = Grid(ordered, *clock.run("grid", grid_parts, (ordered, camera, first_row), plan=shapes))
         view = (grid, camera, transfer)
-        decided, rays = _parts(view, limits_of(settings, ordered), plan, scene.particles.kernel, parts, clock.run_all)
+        decided, rays = _decide_and_cast(view, limits_of(settings, ordered), plan, scene.particles.kernel, parts, clock.run_all)
         words.append(grid.lists.faults)
         counts += [float(count) for count in _counts(grid)]
         bands.append(clock.run("image", unbundle, (rays, decided), plan=shapes))
@@ -151,7 +151,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         first_row = band * plan.band_height
         grid = Grid(ordered, *grid_parts(ordered, camera, first_row, plan=plan))
         view = (grid, camera, transfer)
-        decided, rays = _parts(view, limits_of(settings, ordered), plan, scene.particles.kernel, 1, _run_traced)
+        decided, rays = _decide_and_cast(view, limits_of(settings, ordered), plan, scene.particles.kernel, 1, _run_traced)
         return unbundle(rays, decided, plan=plan), grid.lists.faults, _counts(grid)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
@@ -172,7 +172,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
-def _parts(
+def _decide_and_cast(
     view: View, limits: Any, plan: Plan, kernel: str, parts: int, run_all: RunAll
 ) -> tuple[tuple[Any, ...], tuple[Rays, ...]]:
     """What is decided for the parts of a band, as far as the image shows it; and what their rays meet."""
@@ -210,7 +210,7 @@ def _certifies(plan: Plan) -> bool:
 
 def _counts(grid: Grid) -> tuple[Array, Array]:
     """Filled slabs, and (particle, bundle) pairs, of one band."""
-    return (grid.cells.count > 0).sum(), grid.lists.start[-1]
+    return (grid.cells.count > 0).sum(), grid.lists.end[-1]
 
 
 def _raise(word: int, planned: bool) -> None:

@@ -230,6 +230,15 @@ def test_padding_changes_nothing(frames):
     assert np.array_equal(padded.color, exact.color)
 
 
+def test_pairs_count_the_particles_of_all_bundles():
+    """One particle that all four bundles of the image can meet."""
+    camera = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=16, height=16, near=1.0, far=5.0)
+    particles = js.Particles.from_arrays([[0, 0, 0]], 2.0, 0.5)
+    transfer = js.TransferFunction.from_points([0, 1], [[1, 1, 1], [1, 1, 1]], [1, 1])
+    image = js.render(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=16))
+    assert image.stats["pairs"] == 4
+
+
 def test_stats_count_what_was_done(frames):
     rng = np.random.default_rng(0)
     image = js.render(frames.scene(rng), frames.camera(rng), frames.settings, plan=frames.plan())
