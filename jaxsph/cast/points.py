@@ -115,11 +115,10 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
 def _with_lattice(
     lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], marched: Callable[[], Array], plan: CastPlan
 ) -> Array:
-    """Sums of items, `marched` or from the lattice. A chunk has those with particles, those without, or both."""
+    """Sums of items, `marched` or from the lattice at their level: of a chunk either one of these, or all where it is mixed."""
     slab, bundle = at
     inside = item.interpolated
     assert inside is not None
-
     # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
     corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, grid.column[bundle] // NODE_PIXELS
     levels = jnp.where(inside, item.level, -1)

@@ -3,12 +3,12 @@ r"""How wrong light would be if slabs were interpolated from the lattice: by the
 Flow: lattice -> [residuals] -> pilot -> worklist.
 
 A cubic through four nodes errs by at most 3/128 of a fourth difference, about the middle between two nodes. So the lattice
-tells how well it can be interpolated: fourth differences of $\\sum q V W - Q \\sum V W$ over $\\sum V W$ are the error of Q, to
+tells how well it can be interpolated: fourth differences of $\sum q V W - Q \sum V W$ over $\sum V W$ are the error of Q, to
 first order. It is a residual of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab,
 its effect on light that times the mean square slope of the transfer function over the quantities met, and slabs' variances
 add up along a bundle. Errors stay alike for about as far as nodes are apart, across or in depth, whatever lies nearer: samples
-within count as one. Narrow bands need no rule of their own: every sample is shaded, and where Q meets a steep part, its mean
-square slope is large; a jump is never interpolated over.
+within count as one. Narrow bands need no rule of their own: it is sums that are interpolated, not light, and where Q meets a
+steep part, its mean square slope is large; a jump is never interpolated over.
 
 The second paper's a-posteriori error (its section 4) takes the same view of a finite element: the residual of the next order,
 weighted.
@@ -59,8 +59,7 @@ def residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFu
     """Residuals of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
 
     def nothing() -> Residuals:
-        shape = grid.cells.count.shape
-        dtype = lattice.weight.dtype
+        shape, dtype = grid.cells.count.shape, lattice.weight.dtype
         return Residuals(jnp.full(shape, jnp.inf, dtype), jnp.zeros(shape, dtype))
 
     found = functools.partial(_residuals, grid, lattice, camera, transfer, slab_samples)
@@ -110,10 +109,8 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
         step = (border[1:] - border[:-1])[:, None] * path
         bend, previous = computed_once(slab >= 0, bends, colors, extinction, step, before, previous)
         bend = jnp.sqrt(_pooled(bend**2, jnp.add, down, across)) / (ACROSS + 1)
-        return (before + absorbed, previous, *(layers[-1] for layers in new)), (
-            front**2 * deviation**2 * light / slab_samples,
-            bend,
-        )
+        variance = front**2 * deviation**2 * light / slab_samples
+        return (before + absorbed, previous, *(layers[-1] for layers in new)), (variance, bend)
 
     # one more border than there are samples, and layers past the last
     last = grid.half_steps.shape[0] - 1
@@ -126,8 +123,8 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
         return (state[0], *(jnp.zeros_like(value) for value in state[1:])), (nothing, nothing)
 
     filled = jnp.append((grid.cells.count > 0).any(1), False)
-    near_filled = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
-    each = jnp.arange(slabs, dtype=jnp.int32), near_filled
+    judged = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
+    each = jnp.arange(slabs, dtype=jnp.int32), judged
     _, (variance, bend) = lax.scan(lambda state, x: lax.cond(x[1], one_slab, skip, state, x[0]), start, each)
     variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
