@@ -131,28 +131,34 @@ def interpolate(
         V W as real, (q - origin) V W as imaginary part.
     """
     within, step = slab_samples // NODE_SAMPLES, 1 << level
-    layer, row, column = (jnp.arange(-1, n + 2, dtype=jnp.int32) for n in (within * step, ACROSS, ACROSS))
-    place = layer[:, None, None] + slab[:, None, None, None] * within, row[:, None] + corner[0][:, None, None, None]
-    at = node_at(lattice.weight.shape, *place, column + corner[1][:, None, None, None])
-    at = jnp.clip(at.reshape(slab.shape[0], layer.shape[0], -1), 0, lattice.weight.size - 1)
-    dtype = lattice.weight.dtype
+    first = jnp.stack([REACH + slab * within - 1, corner[0] - 1, corner[1] - 1], -1)
+    near = functools.partial(_near, layers=within * step + 3)
+    # at hand before anything is made of it: each of the nodes would be fetched for every sample that it is a part of
+    nodes = computed_once(slab[0] >= 0, near, lattice, first)
     across_cell = between(ACROSS, NODE_PIXELS)
-    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, dtype)
-    taps = jnp.asarray(between(1, NODE_SAMPLES), dtype)[..., None]  # of the samples past a node
+    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, nodes.real.dtype)
 
-    def across(nodes: Array) -> Array:
-        return jnp.matmul(nodes, lateral, precision=lax.Precision.HIGHEST)
+    def spread(nodes: Array) -> Array:
+        samples = _every(step, nodes, slab_samples) if level else _all(nodes, within)
+        return jnp.matmul(samples, lateral, precision=lax.Precision.HIGHEST)
 
-    def spread(sums: Array) -> Array:
-        nodes = sums.ravel().at[at].get(mode="promise_in_bounds")
-        if level:
-            return across(_every(step, nodes, slab_samples))
-        layers = across(nodes)[:, :, None]
-        # broadcast over the samples past a node rather than stacked: of a stack XLA evaluates every row apart
-        samples = functools.reduce(jnp.add, (taps[:, k] * layers[:, k : k + within] for k in range(4)))
-        return samples.reshape(-1, slab_samples, BUNDLE * BUNDLE)
+    return lax.complex(spread(nodes.real), spread(nodes.imag))
 
-    return lax.complex(spread(lattice.weight), spread(lattice.weighted))
+
+def _near(lattice: Lattice, first: Int[Array, "chunk 3"], *, layers: int) -> Complex[Array, "chunk layers nodes"]:
+    """Both sums at the nodes around items, those of a layer in a row, from the `first` on."""
+    around = lax.GatherDimensionNumbers(offset_dims=(1, 2, 3), collapsed_slice_dims=(), start_index_map=(0, 1, 2))
+    size = layers, ACROSS + 3, ACROSS + 3
+    found = (lax.gather(sums, first, around, size, mode="clip") for sums in (lattice.weight, lattice.weighted))
+    return lax.complex(*found).reshape(first.shape[0], layers, -1)
+
+
+def _all(nodes: Float[Array, "chunk layers nodes"], within: int) -> Float[Array, "chunk samples nodes"]:
+    """Layers at every fine sample."""
+    taps, layers = jnp.asarray(between(1, NODE_SAMPLES), nodes.dtype)[..., None], nodes[:, :, None]
+    # broadcast over the samples past a node rather than stacked: of a stack XLA evaluates every row apart
+    samples = functools.reduce(jnp.add, (taps[:, k] * layers[:, k : k + within] for k in range(4)))
+    return samples.reshape(nodes.shape[0], -1, nodes.shape[2])
 
 
 def _every(step: int, nodes: Float[Array, "chunk layers nodes"], samples: int) -> Float[Array, "chunk samples nodes"]:
