@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsph.access.footprint import pixel_ranges
-from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES
+from jaxsph.access.lattice import FINEST, Spacing
 from jaxsph.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.access.ordering import order_particles
 from jaxsph.cast.stretches import CastPlan
@@ -38,6 +38,8 @@ SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
 ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
+NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
+NODES_REACHED = 2.5  # by a support to every side: with fewer, wider nodes save less than they cost less
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -84,7 +86,9 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
-        wanted = control_plan(settings, self.control.parts if isinstance(self.control, ControlPlan) else 1)
+        parts = self.control.parts if isinstance(self.control, ControlPlan) else 1
+        nodes = self.control.nodes if isinstance(self.control, PilotPlan) else FINEST
+        wanted = control_plan(settings, parts, nodes)
         if wanted != self.control:
             raise ValueError(
                 f"`plan` was made for error control {self.control}, but settings ask for {wanted}; make a new one with "
@@ -92,18 +96,25 @@ class Plan:
             )
 
 
-def control_plan(settings: Settings, parts: int) -> ControlPlan | PilotPlan | None:
-    """What of `settings` is fixed when a program is compiled; None without a tolerance."""
+def control_plan(settings: Settings, parts: int = 1, nodes: Spacing = FINEST) -> ControlPlan | PilotPlan | None:
+    """What of `settings` and of the frame's measures is fixed when a program is compiled; None without a tolerance."""
     if settings.tolerance is None:
         return None
     if settings.estimator == "pilot":
-        return PilotPlan()
+        return PilotPlan(nodes)
     return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, parts)
 
 
 def _choose_parts(diameter: float) -> int:
     """A sub-rectangle is covered only by a support a few times as wide as itself."""
     return 2 if diameter >= FINE_DIAMETER else 4
+
+
+def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:
+    """As far apart as supports of the median size, in samples and in pixels, reach enough of them."""
+    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * NODES_REACHED * n), default=FINEST.pixels)
+    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * NODES_REACHED * n), default=FINEST.samples)
+    return Spacing(pixels, min(samples, slab_samples))
 
 
 def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab_samples: int | None = None) -> Plan:
@@ -125,8 +136,9 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab
     counts = (np.asarray(count) for count in _count(particles, camera, settings.samples, tile_rows))
     tiles, bundles, depth_extent, diameter = counts
     num_classes = _num_classes(particles)
-    control = control_plan(settings, _choose_parts(float(diameter)))
     slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
+    nodes = _choose_nodes(float(depth_extent), float(diameter), slab_samples)
+    control = control_plan(settings, _choose_parts(float(diameter)), nodes)
     bands = 1
     while True:
         rows = _ceil(tile_rows, bands)
@@ -183,7 +195,7 @@ def _bytes_of_control(
     if control is None:
         return 0
     if isinstance(control, PilotPlan):
-        return slabs * _ceil(slab_samples, NODE_SAMPLES) * (BUNDLE // NODE_PIXELS) ** 2 * ARRAYS_OF_NODES * number
+        return slabs * _ceil(slab_samples, control.nodes.samples) * control.nodes.across**2 * ARRAYS_OF_NODES * number
     return slabs * (64 * number // 4 + num_classes * 32)
 
 

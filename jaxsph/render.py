@@ -179,7 +179,7 @@ def _decide_and_cast(
     each, shapes = [jnp.int32(nth) for nth in range(parts)], dataclasses.replace(plan, control=None)
     adapt, lattice = functools.partial(run_all, "adapt"), None
     if isinstance(plan.control, PilotPlan):
-        lattices = adapt(sum_part, [(*view, nth) for nth in each], parts=parts, plan=shapes, kernel=kernel)
+        lattices = adapt(sum_part, [(*view, nth) for nth in each], parts=parts, plan=plan, kernel=kernel)
         (lattice,) = adapt(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
         # slab by slab what is at hand stays in the cache: one program is faster than parts side by side
         decided = adapt(decide_part, [(*view, limits, lattice, each[0])], parts=1, plan=plan)

@@ -108,12 +108,15 @@ def sum_part(
     grid: Grid, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan, kernel: str
 ) -> Lattice:
     """The lattice of the `nth` of `parts` of a band, for the pilot estimator."""
+    assert isinstance(plan.control, PilotPlan)
+    nodes = plan.control.nodes
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
     slab_samples, tiles = plan.cast.slab_samples, (plan.lists.tile_rows, plan.lists.tile_columns)
-    wanted = worth_a_lattice(grid, camera, slab_samples)
+    wanted = worth_a_lattice(grid, camera, slab_samples, nodes)
     amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
     amid = amid.astype(grid.half_steps.dtype)
-    return sum_at_nodes(part_of(grid, nth, parts), camera, kernel, slab_samples, tiles, grid.row[0], amid, wanted)
+    part = part_of(grid, nth, parts)
+    return sum_at_nodes(part, camera, kernel, slab_samples, tiles, grid.row[0], amid, wanted, nodes)
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan"))

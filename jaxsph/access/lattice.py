@@ -2,8 +2,8 @@
 
 Flow: grid -> [lattice] -> control, cast.
 
-Sums over particles are as smooth as the kernel, whatever the transfer function makes of their ratio. So nodes are every
-`NODE_PIXELS`-th ray and every `NODE_SAMPLES`-th fine sample, a small part of all samples.
+Sums over particles are as smooth as the kernel, whatever the transfer function makes of their ratio. So nodes are every few
+rays and every few fine samples, as far apart as supports allow: a small part of all samples.
 """
 
 from __future__ import annotations
@@ -17,11 +17,29 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.parts import gathered
 
-NODE_PIXELS = 4
-NODE_SAMPLES = 2
-ACROSS = BUNDLE // NODE_PIXELS  # nodes of a bundle, down and across
 REACH = 2  # nodes to either side that a fourth difference takes
 GAP = REACH + 1  # nodes without anything past the last along each axis: a fourth difference, and the far border of a slab
+
+
+@dataclasses.dataclass(frozen=True)
+class Spacing:
+    """How far apart nodes are, static.
+
+    Attributes:
+        pixels: across, a divisor of `BUNDLE`.
+        samples: fine samples in depth, a divisor of the samples of a slab.
+    """
+
+    pixels: int
+    samples: int
+
+    @property
+    def across(self) -> int:
+        """Nodes of a bundle, down and across."""
+        return BUNDLE // self.pixels
+
+
+FINEST = Spacing(4, 2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +55,7 @@ class Lattice:
         origin: a quantity amid the particles'.
         row: pixel row of the first nodes.
         evaluations: kernel evaluations that the nodes took, for each ray of a bundle.
+        spacing: of the nodes.
     """
 
     weight: Float[Array, "layers rows columns"]
@@ -44,6 +63,7 @@ class Lattice:
     origin: Float[Array, ""]
     row: Int[Array, ""]
     evaluations: Float[Array, " bundles"]
+    spacing: Spacing = FINEST
 
 
 def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> Int[Array, "*any"]:
@@ -57,7 +77,8 @@ def added(parts: tuple[Lattice, ...]) -> Lattice:
     weight, weighted = (
         sum(values[1:], values[0]) for values in zip(*((part.weight, part.weighted) for part in parts), strict=True)
     )
-    return Lattice(weight, weighted, parts[0].origin, parts[0].row, gathered(tuple(part.evaluations for part in parts)))
+    evaluations = gathered(tuple(part.evaluations for part in parts))
+    return dataclasses.replace(parts[0], weight=weight, weighted=weighted, evaluations=evaluations)
 
 
 def between(cells: int, every: int) -> Float[np.ndarray, "points nodes"]:
@@ -77,4 +98,6 @@ def cubic(t: float) -> tuple[float, float, float, float]:
     return -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
 
 
-jax.tree_util.register_dataclass(Lattice, data_fields=[field.name for field in dataclasses.fields(Lattice)], meta_fields=[])
+jax.tree_util.register_dataclass(
+    Lattice, data_fields=["weight", "weighted", "origin", "row", "evaluations"], meta_fields=["spacing"]
+)

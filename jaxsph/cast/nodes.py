@@ -2,7 +2,7 @@
 
 Flow: grid -> [nodes] -> control.pilot -> worklist -> points -> image.
 
-A bundle owns 2 x 2 rays of nodes. They are so few that cells, not rays, lie side by side in memory.
+A bundle owns so few nodes that cells, not rays, lie side by side in memory.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice, between, cubic, node_at
+from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Spacing, between, cubic, node_at
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
@@ -28,7 +28,6 @@ from jaxsph.numerics.staging import computed_once
 
 CHUNK = 256  # cells at once
 BLOCK = 8  # particles unrolled in the inner loop
-DEEP = CELL // NODE_SAMPLES  # layers of nodes of a cell
 
 
 def sum_at_nodes(
@@ -40,6 +39,7 @@ def sum_at_nodes(
     first_row: Int[Array, ""] | int,
     origin: Float[Array, ""],
     wanted: Bool[Array, ""] | bool = True,
+    spacing: Spacing = FINEST,
 ) -> Lattice:
     """Sums at the nodes of all bundles, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
 
@@ -48,6 +48,7 @@ def sum_at_nodes(
         tiles: rows and columns of tiles of the band.
         first_row: first pixel row of the band.
         origin: quantity that sums are taken relative to.
+        spacing: of the nodes.
     """
     cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
     windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
@@ -57,27 +58,28 @@ def sum_at_nodes(
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
-    shape = REACH + cells * DEEP + GAP, *(2 * ACROSS * number + GAP for number in tiles)
-    deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (DEEP, ACROSS, ACROSS))
+    layers, across = CELL // spacing.samples, spacing.across
+    shape = REACH + cells * layers + GAP, *(2 * across * number + GAP for number in tiles)
+    deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (layers, across, across))
 
     def march(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
         real = step * chunk + jnp.arange(chunk, dtype=jnp.int32) < number
         cell, bundle = at // bundles, at % bundles
-        u, v = (rays[::NODE_PIXELS] for rays in grid.rays(camera, bundle))
-        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * NODE_SAMPLES) + 1, last)]
+        u, v = (rays[:: spacing.pixels] for rays in grid.rays(camera, bundle))
+        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        row, column = (side[bundle] // NODE_PIXELS for side in (grid.row - first_row, grid.column))
-        place = cell * DEEP + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
+        row, column = (side[bundle] // spacing.pixels for side in (grid.row - first_row, grid.column))
+        place = cell * layers + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
         weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
         return weight, weighted
 
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
-    spent = count.astype(jnp.float32).sum(0) * (DEEP * ACROSS * ACROSS / BUNDLE**2)
-    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, jnp.asarray(first_row), spent)
+    spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, jnp.asarray(first_row), spent, spacing)
 
 
 def _summed(
@@ -130,17 +132,17 @@ def interpolate(
     Returns:
         V W as real, (q - origin) V W as imaginary part.
     """
-    within, step = slab_samples // NODE_SAMPLES, 1 << level
+    spacing, step = lattice.spacing, 1 << level
+    within = slab_samples // spacing.samples
     first = jnp.stack([REACH + slab * within - 1, corner[0] - 1, corner[1] - 1], -1)
     near = functools.partial(_near, layers=within * step + 3)
     # at hand before anything is made of it: each of the nodes would be fetched for every sample that it is a part of
     nodes = computed_once(slab[0] >= 0, near, lattice, first)
-    across_cell = between(ACROSS, NODE_PIXELS)
-    lateral = jnp.asarray(np.kron(across_cell, across_cell).T, nodes.real.dtype)
+    across = between(spacing.across, spacing.pixels)
+    lateral = jnp.asarray(np.kron(across, across).T, nodes.real.dtype)
 
     def spread(nodes: Array) -> Array:
-        samples = _every(step, nodes, slab_samples) if level else _all(nodes, within)
-        return jnp.matmul(samples, lateral, precision=lax.Precision.HIGHEST)
+        return jnp.matmul(_in_depth(nodes, step, spacing, slab_samples), lateral, precision=lax.Precision.HIGHEST)
 
     return lax.complex(spread(nodes.real), spread(nodes.imag))
 
@@ -148,22 +150,20 @@ def interpolate(
 def _near(lattice: Lattice, first: Int[Array, "chunk 3"], *, layers: int) -> Complex[Array, "chunk layers nodes"]:
     """Both sums at the nodes around items, those of a layer in a row, from the `first` on."""
     around = lax.GatherDimensionNumbers(offset_dims=(1, 2, 3), collapsed_slice_dims=(), start_index_map=(0, 1, 2))
-    size = layers, ACROSS + 3, ACROSS + 3
+    size = layers, lattice.spacing.across + 3, lattice.spacing.across + 3
     found = (lax.gather(sums, first, around, size, mode="clip") for sums in (lattice.weight, lattice.weighted))
     return lax.complex(*found).reshape(first.shape[0], layers, -1)
 
 
-def _all(nodes: Float[Array, "chunk layers nodes"], within: int) -> Float[Array, "chunk samples nodes"]:
-    """Layers at every fine sample."""
-    taps, layers = jnp.asarray(between(1, NODE_SAMPLES), nodes.dtype)[..., None], nodes[:, :, None]
+def _in_depth(
+    nodes: Float[Array, "chunk layers nodes"], step: int, spacing: Spacing, samples: int
+) -> Float[Array, "chunk samples nodes"]:
+    """Layers in the middle of every `step` fine samples."""
+    each = max(spacing.samples // step, 1)  # samples past a layer of nodes, before the next
+    stride = max(step // spacing.samples, 1)
+    past = [((k + 0.5) * step - 0.5) / spacing.samples for k in range(each)]
+    begin = int(past[0])
+    taps, layers = jnp.asarray([cubic(t - begin) for t in past], nodes.dtype)[..., None], nodes[:, :, None]
     # broadcast over the samples past a node rather than stacked: of a stack XLA evaluates every row apart
-    samples = functools.reduce(jnp.add, (taps[:, k] * layers[:, k : k + within] for k in range(4)))
-    return samples.reshape(nodes.shape[0], -1, nodes.shape[2])
-
-
-def _every(step: int, nodes: Float[Array, "chunk layers nodes"], samples: int) -> Float[Array, "chunk samples nodes"]:
-    """Layers in the middle of every `step` fine samples: all are equally far past a layer of nodes."""
-    first, past = divmod((step - 1) / 2 / NODE_SAMPLES, 1)
-    begin, stride = int(first), step // NODE_SAMPLES
-    near = (nodes[:, begin + k :: stride][:, :samples] for k in range(4))
-    return functools.reduce(jnp.add, (weight * layers for weight, layers in zip(cubic(past), near, strict=True)))
+    near = (layers[:, begin + k :: stride][:, : samples // each] for k in range(4))
+    return functools.reduce(jnp.add, (taps[:, k] * at for k, at in enumerate(near))).reshape(nodes.shape[0], samples, -1)

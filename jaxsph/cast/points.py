@@ -26,7 +26,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import NODE_PIXELS, Lattice
+from jaxsph.access.lattice import Lattice
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.cast.composite import Light, State, composite, fresh, unlit
@@ -120,7 +120,8 @@ def _with_lattice(
     inside = item.interpolated
     assert inside is not None
     # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
-    corner = (grid.row[bundle] - lattice.row) // NODE_PIXELS, grid.column[bundle] // NODE_PIXELS
+    pixels = lattice.spacing.pixels
+    corner = (grid.row[bundle] - lattice.row) // pixels, grid.column[bundle] // pixels
     levels = jnp.where(inside, item.level, -1)
 
     def found(level: int) -> Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import NODE_PIXELS, NODE_SAMPLES, Lattice
+from jaxsph.access.lattice import FINEST, Lattice, Spacing
 from jaxsph.control.budget import cheapest
 from jaxsph.control.residuals import Residuals
 from jaxsph.control.spacing import spaced
@@ -28,7 +28,9 @@ WORTHWHILE = 0.25  # least share of a band's work that the lattice must resolve:
 
 @dataclasses.dataclass(frozen=True)
 class PilotPlan:
-    """Static choices of the pilot estimator: none so far, but that it is wanted."""
+    """Static choices of the pilot estimator: how far apart nodes are."""
+
+    nodes: Spacing = FINEST
 
 
 def pilot(
@@ -50,10 +52,10 @@ def pilot(
         marched.
     """
     count = grid.cells.count
-    allowed = (count > 0) & _resolved(grid, camera, slab_samples)
+    allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.spacing)
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
     taken, total = cheapest(found.variance, jnp.maximum(count, 1).astype(budget.dtype), allowed, budget)
-    level, more = spaced(taken, found.bend, budget - total)
+    level, more = spaced(taken, found.bend, budget - total, lattice.spacing.samples)
     estimate = jnp.where(taken.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
     work = full_rate(grid.cells, jnp.where(taken, lattice.origin, origin))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0
@@ -61,20 +63,20 @@ def pilot(
     return dataclasses.replace(work, **empty, filled=work.filled & begins, level=level, interpolated=taken), estimate
 
 
-def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int) -> Bool[Array, ""]:
+def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
     """Whether the lattice resolves enough of a band's work to be sampled at all."""
     count = grid.cells.count.astype(jnp.float32)
-    return jnp.where(_resolved(grid, camera, slab_samples), count, 0).sum() > WORTHWHILE * count.sum()
+    return jnp.where(_resolved(grid, camera, slab_samples, nodes), count, 0).sum() > WORTHWHILE * count.sum()
 
 
-def _resolved(grid: Grid, camera: Camera, slab_samples: int) -> Bool[Array, "slabs bundles"]:
+def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, "slabs bundles"]:
     """Slabs where all classes of supports reach several nodes."""
     slabs = grid.cells.count.shape[0]
     borders = grid.borders(slabs * slab_samples)
     back = borders[slab_samples::slab_samples]
     pixel = 2 * camera.half_height / camera.height * (back if camera.is_perspective else jnp.ones_like(back))
-    deep = back - borders[slab_samples - NODE_SAMPLES :: slab_samples][: back.shape[0]]
-    spacing = jnp.maximum(NODE_PIXELS * pixel, deep)
+    deep = back - borders[slab_samples - nodes.samples :: slab_samples][: back.shape[0]]
+    spacing = jnp.maximum(nodes.pixels * pixel, deep)
     reach, live = grid.ordered.reach, grid.ordered.live
     classes = grid.cells.length.shape[0]
     octaves = jnp.exp2(-1.0 - jnp.arange(classes, dtype=reach.dtype))

@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import ACROSS, GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
+from jaxsph.access.lattice import GAP, REACH, Lattice
 from jaxsph.control.spacing import bends
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import Segments, TransferFunction, look_up
@@ -72,16 +72,18 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     Infinite variance where a stencil may leave the lattice: at its first and last slabs, rows and columns.
     """
     slabs = grid.cells.count.shape[0]
-    within = slab_samples // NODE_SAMPLES
+    nodes = lattice.spacing
+    within = slab_samples // nodes.samples
     down, across = (side - GAP for side in lattice.weight.shape[1:])
-    rows, columns = down // ACROSS, across // ACROSS
+    rows, columns = down // nodes.across, across // nodes.across
     layer = (down + GAP) * (across + GAP)
     weight, weighted = (value.ravel() for value in (lattice.weight, lattice.weighted))
     segments, squares = transfer.segments(), _squared_slopes(transfer)
     path = _slant(lattice, camera, down + GAP, across + GAP).ravel()
-    longest = _pooled(path, jnp.maximum, down, across)
+    pooled = functools.partial(_pooled, down=down, across=across, of_bundle=nodes.across)
+    longest = pooled(path, jnp.maximum)
 
-    at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer)
+    at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer, node_samples=nodes.samples)
     pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
 
     def one_slab(state: tuple[Array, ...], slab: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
@@ -89,16 +91,16 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
         begin, number = (slab * within + 1) * layer, (within + 2 * REACH) * layer
         near = [lax.dynamic_slice_in_dim(value, begin, number) for value in (weight, weighted)]
         border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
-        spacing = NODE_PIXELS * pixel * (border[-1] if camera.is_perspective else 1)
+        spacing = nodes.pixels * pixel * (border[-1] if camera.is_perspective else 1)
         alike = jnp.maximum(slab_samples * spacing / (border[-1] - border[0]), 1)  # samples in a row that err alike across
         new = computed_once(slab >= 0, at_nodes, *near, lattice.origin, segments, alike)
         spread, quantity, *colors, extinction = ([a, *b] for a, b in zip(first, new, strict=True))
         absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
 
         def pool(layers: list[Array], combine: Combine) -> Array:
-            return _pooled(functools.reduce(combine, layers), combine, down, across)
+            return pooled(functools.reduce(combine, layers), combine)
 
-        deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (ACROSS + 1) ** 2))
+        deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (nodes.across + 1) ** 2))
         low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
         front, taken = jnp.exp(-pool([before], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
         around = 2 * deviation / jnp.sqrt(alike)
@@ -108,13 +110,13 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
         step = (border[1:] - border[:-1])[:, None] * path
         bend, previous = computed_once(slab >= 0, bends, colors, extinction, step, before, previous)
-        bend = jnp.sqrt(_pooled(bend**2, jnp.add, down, across)) / (ACROSS + 1)
+        bend = jnp.sqrt(pooled(bend**2, jnp.add)) / (nodes.across + 1)
         variance = front**2 * deviation**2 * light / slab_samples
         return (before + absorbed, previous, *(layers[-1] for layers in new)), (variance, bend)
 
     # one more border than there are samples, and layers past the last
     last = grid.half_steps.shape[0] - 1
-    edges = grid.half_steps[jnp.minimum(2 * NODE_SAMPLES * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
+    edges = grid.half_steps[jnp.minimum(2 * nodes.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
     # the first layer counts as empty: its slab is not interpolated anyway
     start = jnp.zeros_like(path), jnp.zeros((4, *path.shape), path.dtype), *([jnp.zeros_like(path)] * 6)
 
@@ -128,13 +130,13 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     _, (variance, bend) = lax.scan(lambda state, x: lax.cond(x[1], one_slab, skip, state, x[0]), start, each)
     variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
-    spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // NODE_SAMPLES)
+    spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // nodes.samples)
     spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
     return Residuals(_by_bundle(jnp.where(spared, variance, jnp.inf)), _by_bundle(bend))
 
 
 def _at_nodes(
-    weight: Array, weighted: Array, origin: Array, segments: Segments, alike: Array, *, across: int, layer: int
+    weight: Array, weighted: Array, origin: Array, segments: Segments, alike: Array, *, across: int, layer: int, node_samples: int
 ) -> tuple[Array, ...]:
     """Variance of Q between nodes, Q, red, green, blue and extinction, (layers, nodes of a layer), but `REACH` on either side.
 
@@ -143,7 +145,8 @@ def _at_nodes(
     Args:
         alike: how many samples in a row err alike across.
         weight, weighted: sums at nodes in a row.
-        across, layer: how far apart neighbours are down and in depth.
+        across, layer: how far apart in memory neighbours are down and in depth.
+        node_samples: fine samples from one layer to the next.
     """
     number = weight.shape[0] - 2 * REACH * layer
 
@@ -163,7 +166,7 @@ def _at_nodes(
         of_weight = fourth(weight, stride)
         unsure += CUBIC * jnp.abs(of_weight)
         error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
-        spread += (NODE_SAMPLES if stride == layer else alike) * error
+        spread += (node_samples if stride == layer else alike) * error
     spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
     quantity = origin + ratio
     *colors, extinction = look_up(segments, quantity)
@@ -176,17 +179,20 @@ def _slant(lattice: Lattice, camera: Camera, down: int, across: int) -> Array:
     dtype = lattice.weight.dtype
     if not camera.is_perspective:
         return jnp.ones((down, across), dtype)
-    u = camera.column(NODE_PIXELS * jnp.arange(across, dtype=dtype) + 0.5)
-    v = camera.row((lattice.row + NODE_PIXELS * jnp.arange(down, dtype=jnp.int32)).astype(dtype) + 0.5)
+    pixels = lattice.spacing.pixels
+    u = camera.column(pixels * jnp.arange(across, dtype=dtype) + 0.5)
+    v = camera.row((lattice.row + pixels * jnp.arange(down, dtype=jnp.int32)).astype(dtype) + 0.5)
     return jnp.sqrt(1 + u**2 + v[:, None] ** 2)
 
 
-def _pooled(value: Float[Array, " nodes"], combine: Combine, down: int, across: int) -> Float[Array, "rows columns"]:
+def _pooled(
+    value: Float[Array, " nodes"], combine: Combine, *, down: int, across: int, of_bundle: int
+) -> Float[Array, "rows columns"]:
     """Nodes of a layer combined over each bundle, those on the far borders as well."""
     for stride in (1, across + GAP):
-        number = value.shape[0] - ACROSS * stride
-        value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(ACROSS + 1)))
-    return value[: down * (across + GAP)].reshape(down, -1)[::ACROSS, :across:ACROSS]
+        number = value.shape[0] - of_bundle * stride
+        value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(of_bundle + 1)))
+    return value[: down * (across + GAP)].reshape(down, -1)[::of_bundle, :across:of_bundle]
 
 
 def _by_bundle(value: Array) -> Array:

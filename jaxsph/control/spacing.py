@@ -15,7 +15,6 @@ import functools
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.lattice import NODE_SAMPLES
 from jaxsph.control.budget import cheapest
 
 WIDEST = 2  # level of the most widely spaced samples
@@ -55,7 +54,7 @@ def bends(
 
 
 def spaced(
-    taken: Bool[Array, "slabs bundles"], bend: Float[Array, "slabs bundles"], budget: Float[Array, " bundles"]
+    taken: Bool[Array, "slabs bundles"], bend: Float[Array, "slabs bundles"], budget: Float[Array, " bundles"], node_samples: int
 ) -> tuple[Int[Array, "slabs bundles"], Float[Array, " bundles"]]:
     """Levels of interpolated slabs, from the widest spaced down: aligned groups of slabs, all interpolated, share samples.
 
@@ -63,6 +62,7 @@ def spaced(
         taken: slabs that are interpolated.
         bend: root mean square over the nodes of a bundle.
         budget: variance that wider spacing may add.
+        node_samples: fine samples between nodes.
 
     Returns:
         Level of each slab; and the variance.
@@ -76,7 +76,7 @@ def spaced(
             continue
         groups = (taken & (level == 0))[:whole].reshape(-1, share, taken.shape[1])
         curved = functools.reduce(jnp.add, (bend[k:whole:share] for k in range(share)))
-        deviation = UNSEEN * (share**2 - 1) / (24 * NODE_SAMPLES**2) * curved + least
+        deviation = UNSEEN * (share**2 - 1) / (24 * node_samples**2) * curved + least
         chosen, more = cheapest(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
         level = level.at[:whole].max(coarse * jnp.repeat(chosen, share, 0))
         spent += more

@@ -9,14 +9,17 @@ import pytest
 
 import jaxsph as js
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import GAP, NODE_PIXELS, NODE_SAMPLES, REACH, Lattice
+from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Spacing
 from jaxsph.cast.nodes import interpolate, sum_at_nodes
 from jaxsph.control.spacing import WIDEST
 from jaxsph.model import kernels
 from jaxsph.stages import grid_parts, order
 
+WIDER = Spacing(8, 4)
 
-def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
+
+@pytest.mark.parametrize("spacing", [FINEST, WIDER])
+def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64, spacing):
     rng = np.random.default_rng(5)
     scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
     plan = js.plan(scene, camera, frames.settings)
@@ -30,14 +33,15 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
         (plan.lists.tile_rows, plan.lists.tile_columns),
         0,
         jnp.float64(0.4),
+        spacing=spacing,
     )
 
     kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)
     deep, down, across = lattice.weight[kept].shape
-    deep = min(deep, -(-plan.samples // NODE_SAMPLES))
-    depth = np.asarray(grid.half_steps)[1::2][::NODE_SAMPLES][:, None, None]
-    u = np.asarray(camera.column(NODE_PIXELS * np.arange(across) + 0.5))
-    v = np.asarray(camera.row(NODE_PIXELS * np.arange(down) + 0.5))[:, None]
+    deep = min(deep, -(-plan.samples // spacing.samples))
+    depth = np.asarray(grid.half_steps)[1::2][:: spacing.samples][:, None, None]
+    u = np.asarray(camera.column(spacing.pixels * np.arange(across) + 0.5))
+    v = np.asarray(camera.row(spacing.pixels * np.arange(down) + 0.5))[:, None]
     spread = depth if camera.is_perspective else np.ones_like(depth)
     smooth, weight, weighted = kernels.by_name(scene.particles.kernel), 0.0, 0.0
     x, y, z, scale, size, quantity = (
@@ -49,32 +53,34 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64):
         w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
         weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.origin))
     # nodes beyond the image lie in bundles that it has no list for
-    rows, columns = -(-camera.height // NODE_PIXELS), -(-camera.width // NODE_PIXELS)
+    rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
     for found, wanted in ((lattice.weight, weight), (lattice.weighted, weighted)):
         assert np.asarray(found != 0).sum() == np.asarray(found[kept] != 0).sum(), "margins are zero"
         np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
     assert weight.max() > 0
 
 
+@pytest.mark.parametrize("spacing", [FINEST, WIDER])
 @pytest.mark.parametrize("level", range(WIDEST + 1))
-def test_a_cubic_field_is_interpolated_exactly(level, x64):
-    rng = np.random.default_rng(0)
+def test_a_cubic_field_is_interpolated_exactly(level, spacing, x64):
+    rng, slab_samples = np.random.default_rng(0), 2 * spacing.samples
     z, y, x = np.meshgrid(np.arange(16.0), np.arange(9.0), np.arange(8.0), indexing="ij")
     cubic = rng.normal(size=(4, 4, 4))
     field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
     field = jnp.pad(field, ((REACH, GAP), (0, GAP), (0, GAP)))
-    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.int32(0), jnp.zeros(1))
+    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.int32(0), jnp.zeros(1), spacing)
     slab, row, column = jnp.asarray([1, 2]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
     found = jax.jit(interpolate, static_argnames=("slab_samples", "level"))(
-        lattice, slab, (row, column), slab_samples=4, level=level
+        lattice, slab, (row, column), slab_samples=slab_samples, level=level
     )
+    middles = (np.arange(slab_samples) + 0.5) * 2**level - 0.5
     for k in range(2):
         at = [
-            (((np.arange(4) + 0.5) * 2**level) - 0.5) / NODE_SAMPLES + 2 * float(slab[k]),  # middles of 2**level samples
-            np.arange(8) / NODE_PIXELS + float(row[k]),
-            np.arange(8) / NODE_PIXELS + float(column[k]),
+            middles / spacing.samples + 2 * float(slab[k]),
+            np.arange(8) / spacing.pixels + float(row[k]),
+            np.arange(8) / spacing.pixels + float(column[k]),
         ]
         zs, ys, xs = np.meshgrid(*at, indexing="ij")
-        wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(4, 64)
+        wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(slab_samples, 64)
         np.testing.assert_allclose(found[k].real, wanted, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(found[k].imag, 2 * wanted, rtol=1e-10, atol=1e-10)
