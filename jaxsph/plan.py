@@ -39,7 +39,7 @@ SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands 
 SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
 ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
-NODES_REACHED = 2.5  # by a support to every side: with fewer, wider nodes save less than they cost less
+NODES_REACHED = 2.5, 3  # by a support to every side, across and in depth: with fewer, wider nodes save less than they cost less
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -87,8 +87,8 @@ class Plan:
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
         parts = self.control.parts if isinstance(self.control, ControlPlan) else 1
-        nodes = self.control.nodes if isinstance(self.control, PilotPlan) else FINEST
-        wanted = control_plan(settings, parts, nodes)
+        pilot = self.control if isinstance(self.control, PilotPlan) else PilotPlan()
+        wanted = control_plan(settings, parts, pilot)
         if wanted != self.control:
             raise ValueError(
                 f"`plan` was made for error control {self.control}, but settings ask for {wanted}; make a new one with "
@@ -96,12 +96,12 @@ class Plan:
             )
 
 
-def control_plan(settings: Settings, parts: int = 1, nodes: Spacing = FINEST) -> ControlPlan | PilotPlan | None:
+def control_plan(settings: Settings, parts: int, pilot: PilotPlan) -> ControlPlan | PilotPlan | None:
     """What of `settings` and of the frame's measures is fixed when a program is compiled; None without a tolerance."""
     if settings.tolerance is None:
         return None
     if settings.estimator == "pilot":
-        return PilotPlan(nodes)
+        return pilot
     return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, parts)
 
 
@@ -112,8 +112,8 @@ def _choose_parts(diameter: float) -> int:
 
 def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:
     """As far apart as supports of the median size, in samples and in pixels, reach enough of them."""
-    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * NODES_REACHED * n), default=FINEST.pixels)
-    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * NODES_REACHED * n), default=FINEST.samples)
+    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * NODES_REACHED[0] * n), default=FINEST.pixels)
+    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * NODES_REACHED[1] * n), default=FINEST.samples)
     return Spacing(pixels, min(samples, slab_samples))
 
 
@@ -134,15 +134,16 @@ def plan(scene: Scene, camera: Camera, settings: Settings | None = None, *, slab
     particles = scene.particles
     tile_rows, columns = _ceil(camera.height, TILE), _ceil(camera.width, TILE)
     counts = (np.asarray(count) for count in _count(particles, camera, settings.samples, tile_rows))
-    tiles, bundles, depth_extent, diameter = counts
+    tiles, bundles, depth_extent, diameter, extent = counts
     num_classes = _num_classes(particles)
     slab_samples = slab_samples or _choose_slab_samples(float(depth_extent))
     nodes = _choose_nodes(float(depth_extent), float(diameter), slab_samples)
-    control = control_plan(settings, _choose_parts(float(diameter)), nodes)
-    bands = 1
+    parts, bands = _choose_parts(float(diameter)), 1
     while True:
         rows = _ceil(tile_rows, bands)
         cast = _cast_plan(4 * rows * columns, settings.samples, slab_samples)
+        room = min(round_up(int(extent[0])), 2 * rows), min(round_up(int(extent[1])), 2 * columns)
+        control = control_plan(settings, parts, PilotPlan(nodes, room))
         made = _for_bands(camera, settings, particles, (rows, columns), (tiles, bundles), num_classes, cast, control)
         slabs = made.lists.num_bundles * _ceil(settings.samples, slab_samples)
         fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY and slabs < MOST_SLABS
@@ -182,21 +183,22 @@ def _for_bands(
         + (16 * cast.chunk + 3 * cast.held) * cast.slab_samples * BUNDLE * BUNDLE * number
         + slabs * lists.num_bundles * 8
         + camera.width * camera.height * 8 * number
-        + _bytes_of_control(control, lists.num_bundles * slabs, cast.slab_samples, num_classes, number)
+        + _bytes_of_control(control, lists, slabs, cast.slab_samples, num_classes, number)
     )
     size = (camera.width, camera.height, settings.samples, particles.capacity)
     return Plan(*size, num_classes, bands, lists, cast, int(memory), control)
 
 
 def _bytes_of_control(
-    control: ControlPlan | PilotPlan | None, slabs: int, slab_samples: int, num_classes: int, number: int
+    control: ControlPlan | PilotPlan | None, lists: ListPlan, slabs: int, slab_samples: int, num_classes: int, number: int
 ) -> int:
     """Of the tables of all candidates of all cells, and of the windows of coarser slabs; or of lattices of nodes."""
     if control is None:
         return 0
     if isinstance(control, PilotPlan):
-        return slabs * _ceil(slab_samples, control.nodes.samples) * control.nodes.across**2 * ARRAYS_OF_NODES * number
-    return slabs * (64 * number // 4 + num_classes * 32)
+        of_nodes = math.prod(control.room or lists.bundles) * control.nodes.across**2
+        return slabs * _ceil(slab_samples, control.nodes.samples) * of_nodes * ARRAYS_OF_NODES * number
+    return slabs * lists.num_bundles * (64 * number // 4 + num_classes * 32)
 
 
 def _by_band(counts: np.ndarray, rows: int, bands: int) -> np.ndarray:
@@ -242,7 +244,7 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
     """What a plan is made from.
 
     Pairs in each row of tiles (with tiles, and at most with bundles); the median diameter of a support in samples, and in
-    pixels.
+    pixels; rows and columns of bundles from the first to the last that any particle is seen in.
     """
     depths = camera.depth(jnp.arange(samples, dtype=camera.dtype) + 0.5, samples).astype(particles.dtype)
     ordered = order_particles(particles, camera, depths, samples, 1)
@@ -260,4 +262,6 @@ def _count(particles: Particles, camera: Camera, samples: int, tile_rows: int) -
     extent = jnp.interp(ordered.z + ordered.reach, depths, index) - jnp.interp(ordered.z - ordered.reach, depths, index)
     median = jnp.nanmedian(jnp.where(seen, extent, jnp.nan))
     wide = jnp.nanmedian(jnp.where(seen, right - left + 1, jnp.nan))
-    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, wide
+    sides = (top // BUNDLE, bottom // BUNDLE, 2 * tile_rows), (left // BUNDLE, right // BUNDLE, camera.width)
+    reach = [jnp.where(seen, last, -1).max() - jnp.where(seen, first, most).min() + 1 for first, last, most in sides]
+    return tiles[:-1], bundles[:-1].reshape(-1, 2).sum(1), median, wide, jnp.maximum(jnp.stack(reach), 1)

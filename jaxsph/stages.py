@@ -17,7 +17,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.access.cells import Cells, find_cells
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice, added
+from jaxsph.access.lattice import Lattice, added, region_of
 from jaxsph.access.lists import BundleLists, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, order_particles
 from jaxsph.access.parts import dealt, part_of
@@ -111,12 +111,12 @@ def sum_part(
     assert isinstance(plan.control, PilotPlan)
     nodes = plan.control.nodes
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    slab_samples, tiles = plan.cast.slab_samples, (plan.lists.tile_rows, plan.lists.tile_columns)
+    slab_samples, room = plan.cast.slab_samples, plan.control.room or plan.lists.bundles
     wanted = worth_a_lattice(grid, camera, slab_samples, nodes)
     amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
     amid = amid.astype(grid.half_steps.dtype)
-    part = part_of(grid, nth, parts)
-    return sum_at_nodes(part, camera, kernel, slab_samples, tiles, grid.row[0], amid, wanted, nodes)
+    region = region_of(grid, *room, nodes)
+    return sum_at_nodes(part_of(grid, nth, parts), camera, kernel, slab_samples, region, amid, wanted)
 
 
 @functools.partial(jax.jit, static_argnames=("parts", "plan"))

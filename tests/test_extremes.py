@@ -12,6 +12,7 @@ import pytest
 from extreme import FORWARD, Extreme, error_and_allowance, layers
 
 import jaxsph as js
+from jaxsph.control.pilot import PilotPlan
 from jaxsph.plan import control_plan
 
 
@@ -158,7 +159,7 @@ def test_any_tolerance_is_kept(frames):
     reference = layers(js.render(scene, camera, full, plan=frames.plan()))
     for tolerance in (0.0, 1e-46, 1e-12, 1.0):
         settings = js.Settings(samples=frames.samples, tolerance=tolerance)
-        plan = dataclasses.replace(frames.plan(), control=control_plan(settings, 1))
+        plan = dataclasses.replace(frames.plan(), control=control_plan(settings, 1, PilotPlan()))
         image = js.render(scene, camera, settings, plan=plan)
         assert np.abs(layers(image) - reference).max() <= tolerance
         assert float(image.error_bound.max()) <= tolerance

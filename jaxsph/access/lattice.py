@@ -11,9 +11,11 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.parts import gathered
 
@@ -43,8 +45,37 @@ FINEST = Spacing(4, 2)
 
 
 @dataclasses.dataclass(frozen=True)
+class Region:
+    """The bundles of a band that have nodes: those around all that is seen, as far as there is room.
+
+    Attributes:
+        row, column: of pixels, of the first bundle.
+        rows, columns: of bundles; static, as is the spacing.
+        spacing: of nodes.
+    """
+
+    row: Int[Array, ""]
+    column: Int[Array, ""]
+    rows: int
+    columns: int
+    spacing: Spacing
+
+    def place(self, grid: Grid) -> tuple[Int[Array, " bundles"], Int[Array, " bundles"], Bool[Array, " bundles"]]:
+        """Row and column in the region of a grid's bundles, and whether they are of the region at all."""
+        row, column = (grid.row - self.row) // BUNDLE, (grid.column - self.column) // BUNDLE
+        return row, column, (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+
+
+def region_of(grid: Grid, rows: int, columns: int, spacing: Spacing) -> Region:
+    """From the first row and column of bundles on that any particle can touch."""
+    touched = grid.lists.end > grid.lists.start
+    row, column = (jnp.where(touched, side, side.max()).min() for side in (grid.row, grid.column))
+    return Region(row, column, rows, columns, spacing)
+
+
+@dataclasses.dataclass(frozen=True)
 class Lattice:
-    """Sums at the nodes of a band, up to one common factor.
+    """Sums at the nodes of a region, up to one common factor.
 
     With `REACH` layers of zeros in front and `GAP` zeros past the last node along each axis: one after the other in memory,
     neighbours along any axis are then one shift away.
@@ -53,17 +84,15 @@ class Lattice:
         weight: of V W.
         weighted: of (q - origin) V W.
         origin: a quantity amid the particles'.
-        row: pixel row of the first nodes.
-        evaluations: kernel evaluations that the nodes took, for each ray of a bundle.
-        spacing: of the nodes.
+        region: where the nodes are.
+        evaluations: kernel evaluations that the nodes took, for each ray of a bundle of the band.
     """
 
     weight: Float[Array, "layers rows columns"]
     weighted: Float[Array, "layers rows columns"]
     origin: Float[Array, ""]
-    row: Int[Array, ""]
+    region: Region
     evaluations: Float[Array, " bundles"]
-    spacing: Spacing = FINEST
 
 
 def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> Int[Array, "*any"]:
@@ -98,6 +127,5 @@ def cubic(t: float) -> tuple[float, float, float, float]:
     return -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
 
 
-jax.tree_util.register_dataclass(
-    Lattice, data_fields=["weight", "weighted", "origin", "row", "evaluations"], meta_fields=["spacing"]
-)
+jax.tree_util.register_dataclass(Region, data_fields=["row", "column"], meta_fields=["rows", "columns", "spacing"])
+jax.tree_util.register_dataclass(Lattice, data_fields=[field.name for field in dataclasses.fields(Lattice)], meta_fields=[])

@@ -60,6 +60,11 @@ class ListPlan:
         return self.tile_rows * self.tile_columns
 
     @property
+    def bundles(self) -> tuple[int, int]:
+        """Rows and columns of bundles in a band."""
+        return 2 * self.tile_rows, 2 * self.tile_columns
+
+    @property
     def num_bundles(self) -> int:
         """Bundles in a band, four a tile; bundle ids are `4 * tile + 2 * lower + right`."""
         return 4 * self.num_tiles

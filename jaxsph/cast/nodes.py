@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxsph.access.cells import position
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Spacing, between, cubic, node_at
+from jaxsph.access.lattice import GAP, REACH, Lattice, Region, Spacing, between, cubic, node_at
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
@@ -35,31 +35,28 @@ def sum_at_nodes(
     camera: Camera,
     kernel: str,
     slab_samples: int,
-    tiles: tuple[int, int],
-    first_row: Int[Array, ""] | int,
+    region: Region,
     origin: Float[Array, ""],
     wanted: Bool[Array, ""] | bool = True,
-    spacing: Spacing = FINEST,
 ) -> Lattice:
-    """Sums at the nodes of all bundles, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
+    """Sums at the nodes of a region, zero where no particle can be; all zero, and for nothing, if they are not `wanted`.
 
     Args:
         grid: of a band, or of a part of it.
-        tiles: rows and columns of tiles of the band.
-        first_row: first pixel row of the band.
+        region: of the band.
         origin: quantity that sums are taken relative to.
-        spacing: of the nodes.
     """
+    spacing, (row, column, has_nodes) = region.spacing, region.place(grid)
     cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
     windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
-    count = jnp.where(wanted, length.sum(0, dtype=jnp.int32), 0)
+    count = jnp.where(wanted & has_nodes, length.sum(0, dtype=jnp.int32), 0)
     bundles = count.shape[1]
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
     layers, across = CELL // spacing.samples, spacing.across
-    shape = REACH + cells * layers + GAP, *(2 * across * number + GAP for number in tiles)
+    shape = REACH + cells * layers + GAP, *(across * number + GAP for number in (region.rows, region.columns))
     deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (layers, across, across))
 
     def march(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -70,8 +67,8 @@ def sum_at_nodes(
         s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
-        row, column = (side[bundle] // spacing.pixels for side in (grid.row - first_row, grid.column))
-        place = cell * layers + deep[:, None, None, None], row + down[:, None, None], column + right[:, None]
+        first = row[bundle] * across, column[bundle] * across
+        place = cell * layers + deep[:, None, None, None], first[0] + down[:, None, None], first[1] + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
         weight, weighted = (old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found, strict=True))
         return weight, weighted
@@ -79,7 +76,7 @@ def sum_at_nodes(
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     weight, weighted = lax.fori_loop(0, (number + chunk - 1) // chunk, march, (nothing, nothing))
     spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
-    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, jnp.asarray(first_row), spent, spacing)
+    return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, region, spent)
 
 
 def _summed(
@@ -132,7 +129,7 @@ def interpolate(
     Returns:
         V W as real, (q - origin) V W as imaginary part.
     """
-    spacing, step = lattice.spacing, 1 << level
+    spacing, step = lattice.region.spacing, 1 << level
     within = slab_samples // spacing.samples
     first = jnp.stack([REACH + slab * within - 1, corner[0] - 1, corner[1] - 1], -1)
     near = functools.partial(_near, layers=within * step + 3)
@@ -150,7 +147,8 @@ def interpolate(
 def _near(lattice: Lattice, first: Int[Array, "chunk 3"], *, layers: int) -> Complex[Array, "chunk layers nodes"]:
     """Both sums at the nodes around items, those of a layer in a row, from the `first` on."""
     around = lax.GatherDimensionNumbers(offset_dims=(1, 2, 3), collapsed_slice_dims=(), start_index_map=(0, 1, 2))
-    size = layers, lattice.spacing.across + 3, lattice.spacing.across + 3
+    across = lattice.region.spacing.across + 3
+    size = layers, across, across
     found = (lax.gather(sums, first, around, size, mode="clip") for sums in (lattice.weight, lattice.weighted))
     return lax.complex(*found).reshape(first.shape[0], layers, -1)
 

@@ -120,8 +120,8 @@ def _with_lattice(
     inside = item.interpolated
     assert inside is not None
     # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
-    pixels = lattice.spacing.pixels
-    corner = (grid.row[bundle] - lattice.row) // pixels, grid.column[bundle] // pixels
+    row, column, _ = (side[bundle] * lattice.region.spacing.across for side in lattice.region.place(grid))
+    corner = row, column
     levels = jnp.where(inside, item.level, -1)
 
     def found(level: int) -> Array:

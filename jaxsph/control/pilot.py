@@ -28,9 +28,15 @@ WORTHWHILE = 0.25  # least share of a band's work that the lattice must resolve:
 
 @dataclasses.dataclass(frozen=True)
 class PilotPlan:
-    """Static choices of the pilot estimator: how far apart nodes are."""
+    """Static choices of the pilot estimator.
+
+    Attributes:
+        nodes: how far apart they are.
+        room: rows and columns of bundles that have nodes; all of a band where there is None.
+    """
 
     nodes: Spacing = FINEST
+    room: tuple[int, int] | None = None
 
 
 def pilot(
@@ -52,10 +58,10 @@ def pilot(
         marched.
     """
     count = grid.cells.count
-    allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.spacing)
+    allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
     taken, total = cheapest(found.variance, jnp.maximum(count, 1).astype(budget.dtype), allowed, budget)
-    level, more = spaced(taken, found.bend, budget - total, lattice.spacing.samples)
+    level, more = spaced(taken, found.bend, budget - total, lattice.region.spacing.samples)
     estimate = jnp.where(taken.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
     work = full_rate(grid.cells, jnp.where(taken, lattice.origin, origin))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0

@@ -72,10 +72,10 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     Infinite variance where a stencil may leave the lattice: at its first and last slabs, rows and columns.
     """
     slabs = grid.cells.count.shape[0]
-    nodes = lattice.spacing
+    region, nodes = lattice.region, lattice.region.spacing
     within = slab_samples // nodes.samples
     down, across = (side - GAP for side in lattice.weight.shape[1:])
-    rows, columns = down // nodes.across, across // nodes.across
+    rows, columns = region.rows, region.columns
     layer = (down + GAP) * (across + GAP)
     weight, weighted = (value.ravel() for value in (lattice.weight, lattice.weighted))
     segments, squares = transfer.segments(), _squared_slopes(transfer)
@@ -132,7 +132,10 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
     spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // nodes.samples)
     spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
-    return Residuals(_by_bundle(jnp.where(spared, variance, jnp.inf)), _by_bundle(bend))
+    row, column, inside = region.place(grid)
+    at = jnp.where(inside, row * columns + column, 0)
+    variance, bend = (value.reshape(slabs, -1)[:, at] for value in (jnp.where(spared, variance, jnp.inf), bend))
+    return Residuals(jnp.where(inside, variance, jnp.inf), bend)
 
 
 def _at_nodes(
@@ -179,9 +182,9 @@ def _slant(lattice: Lattice, camera: Camera, down: int, across: int) -> Array:
     dtype = lattice.weight.dtype
     if not camera.is_perspective:
         return jnp.ones((down, across), dtype)
-    pixels = lattice.spacing.pixels
-    u = camera.column(pixels * jnp.arange(across, dtype=dtype) + 0.5)
-    v = camera.row((lattice.row + pixels * jnp.arange(down, dtype=jnp.int32)).astype(dtype) + 0.5)
+    region = lattice.region
+    row, column = (region.spacing.pixels * jnp.arange(number, dtype=jnp.int32) for number in (down, across))
+    u, v = camera.column((region.column + column).astype(dtype) + 0.5), camera.row((region.row + row).astype(dtype) + 0.5)
     return jnp.sqrt(1 + u**2 + v[:, None] ** 2)
 
 
@@ -193,13 +196,6 @@ def _pooled(
         number = value.shape[0] - of_bundle * stride
         value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(of_bundle + 1)))
     return value[: down * (across + GAP)].reshape(down, -1)[::of_bundle, :across:of_bundle]
-
-
-def _by_bundle(value: Array) -> Array:
-    """(slabs, rows, columns) to (slabs, bundles), four bundles a tile."""
-    slabs, rows, columns = value.shape
-    value = value.reshape(slabs, rows // 2, 2, columns // 2, 2)
-    return jnp.transpose(value, (0, 1, 3, 2, 4)).reshape(slabs, -1)
 
 
 def _squared_slopes(transfer: TransferFunction) -> Segments:

@@ -9,7 +9,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Spacing
+from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Region, Spacing, region_of
 from jaxsph.cast.nodes import interpolate, sum_at_nodes
 from jaxsph.control.spacing import WIDEST
 from jaxsph.model import kernels
@@ -30,10 +30,8 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64, spacing):
         camera,
         scene.particles.kernel,
         plan.cast.slab_samples,
-        (plan.lists.tile_rows, plan.lists.tile_columns),
-        0,
+        Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, spacing),
         jnp.float64(0.4),
-        spacing=spacing,
     )
 
     kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)
@@ -60,6 +58,24 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64, spacing):
     assert weight.max() > 0
 
 
+def test_a_region_with_little_room_holds_the_same_nodes(frames):
+    """As far as it reaches: from the first row and column of bundles that are touched."""
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
+    plan = js.plan(scene, camera, frames.settings)
+    ordered = order(scene.particles, camera, plan=plan)
+    grid = Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
+    every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
+    kept = slice(None), slice(-GAP), slice(-GAP)
+    whole, part = (
+        sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, jnp.float32(0.4)).weight[kept]
+        for region in (every, some)
+    )
+    row, column = int(some.row) // FINEST.pixels, int(some.column) // FINEST.pixels
+    np.testing.assert_array_equal(part, whole[:, row : row + part.shape[1], column : column + part.shape[2]])
+    assert part.shape[1:] == (4, 6) and (part > 0).any()
+
+
 @pytest.mark.parametrize("spacing", [FINEST, WIDER])
 @pytest.mark.parametrize("level", range(WIDEST + 1))
 def test_a_cubic_field_is_interpolated_exactly(level, spacing, x64):
@@ -68,7 +84,8 @@ def test_a_cubic_field_is_interpolated_exactly(level, spacing, x64):
     cubic = rng.normal(size=(4, 4, 4))
     field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
     field = jnp.pad(field, ((REACH, GAP), (0, GAP), (0, GAP)))
-    lattice = Lattice(field, 2 * field, jnp.float64(0), jnp.int32(0), jnp.zeros(1), spacing)
+    region = Region(jnp.int32(0), jnp.int32(0), 4, 4, spacing)
+    lattice = Lattice(field, 2 * field, jnp.float64(0), region, jnp.zeros(1))
     slab, row, column = jnp.asarray([1, 2]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
     found = jax.jit(interpolate, static_argnames=("slab_samples", "level"))(
         lattice, slab, (row, column), slab_samples=slab_samples, level=level
