@@ -27,15 +27,15 @@ from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import GAP, REACH, Lattice
+from jaxsph.control.slopes import mean_square_slope, squared_slopes
 from jaxsph.control.spacing import bends
 from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import Segments, TransferFunction, look_up
+from jaxsph.model.transfer import Segments, TransferFunction, find, read
 from jaxsph.numerics.staging import computed_once
 
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 CLEAR = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 LEAST = 8  # eps: what interpolated samples differ by, at least
-NARROWEST = 1e-3  # of the transfer function's domain that a slope is averaged over, at least
 Combine = Callable[[Array, Array], Array]
 
 
@@ -78,7 +78,7 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     rows, columns = region.rows, region.columns
     layer = (down + GAP) * (across + GAP)
     weight, weighted = (value.ravel() for value in (lattice.weight, lattice.weighted))
-    segments, squares = transfer.segments(), _squared_slopes(transfer)
+    segments, squares = transfer.segments(), squared_slopes(transfer)
     path = _slant(lattice, camera, down + GAP, across + GAP).ravel()
     pooled = functools.partial(_pooled, down=down, across=across, of_bundle=nodes.across)
     longest = pooled(path, jnp.maximum)
@@ -97,14 +97,18 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
         spread, quantity, *colors, extinction = ([a, *b] for a, b in zip(first, new, strict=True))
         absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
 
-        def pool(layers: list[Array], combine: Combine) -> Array:
-            return pooled(functools.reduce(combine, layers), combine)
+        def of_bundles(spread: list[Array], quantity: list[Array], before: Array, absorbed: Array) -> tuple[Array, ...]:
+            def pool(layers: list[Array], combine: Combine) -> Array:
+                return pooled(functools.reduce(combine, layers), combine)
 
-        deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (nodes.across + 1) ** 2))
-        low, high = pool(quantity, jnp.minimum), pool(quantity, jnp.maximum)
-        front, taken = jnp.exp(-pool([before], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
+            deviation = jnp.sqrt(pool(spread, jnp.add) / ((within + 1) * (nodes.across + 1) ** 2))
+            front, taken = jnp.exp(-pool([before], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
+            return deviation, pool(quantity, jnp.minimum), pool(quantity, jnp.maximum), front, taken
+
+        pieces = spread, quantity, before, absorbed
+        deviation, low, high, front, taken = computed_once(slab >= 0, of_bundles, *pieces)
         around = 2 * deviation / jnp.sqrt(alike)
-        *of_colors, of_extinction = _mean_square_slope(squares, low - around, high + around)
+        *of_colors, of_extinction = mean_square_slope(squares, low - around, high + around)
         length = (border[-1] - border[0]) * longest
         # what errs alike is in the deviation; the rest is independent: a sum grows by the root of its number, a mean falls so
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
@@ -172,7 +176,8 @@ def _at_nodes(
         spread += (node_samples if stride == layer else alike) * error
     spread = jnp.where(inside & (here > CLEAR * unsure), spread * inverse**2, jnp.inf)
     quantity = origin + ratio
-    *colors, extinction = look_up(segments, quantity)
+    place = computed_once(alike > 0, find, segments, quantity)
+    *colors, extinction = read(segments, place)
     found = spread, quantity, *colors, jnp.where(inside, extinction, 0)
     return tuple(value.reshape(-1, layer) for value in found)
 
@@ -196,27 +201,3 @@ def _pooled(
         number = value.shape[0] - of_bundle * stride
         value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(of_bundle + 1)))
     return value[: down * (across + GAP)].reshape(down, -1)[::of_bundle, :across:of_bundle]
-
-
-def _squared_slopes(transfer: TransferFunction) -> Segments:
-    """Integrals from the first control point on of the squared slopes of red, green, blue and extinction; number of jumps."""
-    segments = transfer.segments()
-    run = jnp.append(transfer.values[1:] - transfer.values[:-1], 0)
-    change = jnp.where(run > 0, segments.change / jnp.where(run > 0, run, 1), 0) ** 2 * run
-    jumps = ((run <= 0) & (segments.change != 0).any(0)).astype(run.dtype)
-    added = jnp.append(change, jumps[None], 0)
-    return dataclasses.replace(segments, base=jnp.cumsum(added, 1) - added, change=added.at[-1].set(0))
-
-
-def _mean_square_slope(squares: Segments, low: Array, high: Array) -> list[Array]:
-    """Mean over `[low, high]` of the squared slope of red, green, blue and extinction; infinite with a jump inside.
-
-    With what the difference of two integrals may have lost to rounding.
-    """
-    least = NARROWEST * (squares.start[-1] - squares.start[0])
-    extent = jnp.maximum(high - low, jnp.where(least > 0, least, 1))
-    *upper, jumps = look_up(squares, low + extent)
-    *lower, before = look_up(squares, low)
-    lost = 4 * jnp.finfo(low.dtype).eps
-    means = [((b - a) + lost * b) / extent for a, b in zip(lower, upper, strict=True)]
-    return [jnp.where(jumps > before, jnp.inf, mean) for mean in means]

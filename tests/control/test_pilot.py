@@ -6,12 +6,10 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.control.residuals import _mean_square_slope, _squared_slopes
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
 FULL = js.Settings(samples=128)
@@ -184,19 +182,3 @@ def test_float64_orthographic_wendland(x64):
     assert image.color.dtype == np.float64
     assert image.stats["evaluations"] < truth.stats["evaluations"]
     assert error_of(image, truth).max() <= PILOT.tolerance
-
-
-def test_the_mean_square_slope_is_that_of_a_quadrature():
-    transfer = js.TransferFunction.from_points(
-        np.float32([0, 0.2, 0.5, 1]), np.float32([[0, 0, 0], [1, 0, 0], [0, 0.5, 0], [0, 1, 1]]), np.float32([0, 3, 3, 1])
-    )
-    low, high = np.float32([-0.5, 0.05, 0.1, 0.3, 0.9, 1.2, 0.3]), np.float32([-0.1, 0.1, 0.4, 2.0, 0.9, 1.4, 0.45])
-    found = _mean_square_slope(_squared_slopes(transfer), jnp.asarray(low), jnp.asarray(high))
-    table = np.concatenate([np.asarray(transfer.colors), np.asarray(transfer.extinction)[:, None]], 1)
-    for i, (a, b) in enumerate(zip(low, high, strict=True)):
-        q = a + (b - a) * (np.arange(4000) + 0.5) / 4000
-        segment = np.searchsorted(np.asarray(transfer.values), q, side="right") - 1
-        slope = np.zeros((5, 4))
-        slope[1:4] = np.diff(table, axis=0) / np.diff(np.asarray(transfer.values))[:, None]
-        wanted = (slope[segment + 1] ** 2).mean(0)
-        np.testing.assert_allclose([float(channel[i]) for channel in found], wanted, rtol=5e-3, atol=5e-3)
