@@ -61,7 +61,7 @@ def mean_square_slope(squares: SquaredSlopes, low: Array, high: Array) -> list[A
     def bucket(quantity: Array) -> Array:
         place = jnp.clip((quantity - squares.start) * squares.rate, 0, BUCKETS).astype(jnp.int32)
         place = jnp.where(squares.rate > 0, place, BUCKETS)  # of no width: all lies beyond
-        return jnp.where(quantity < squares.start, 0, place + 1)
+        return jnp.where(quantity < squares.start, 0, jnp.clip(place, 0, BUCKETS) + 1)  # in range even for NaN
 
     def between(row: Array, first: Array, past: Array) -> tuple[Array, Array]:
         upper, lower = (row.at[at].get(mode="promise_in_bounds") for at in (past, first))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.access.lattice import FINEST, Spacing
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
 FULL = js.Settings(samples=128)
@@ -167,6 +168,27 @@ def test_bands_keep_the_tolerance_too():
     assert banded.bands > 1
     error = error_of(js.render(scene, camera, low, plan=banded), both("mixer")[0])
     assert error.max() <= 2 * PILOT.tolerance
+
+
+def test_a_plan_with_little_room_for_nodes_saves_less_but_keeps_the_tolerance():
+    """As that of another frame may have: what lies beyond is marched."""
+    particles, camera = cloud(lambda x: x[:, 0], 0.5)
+    scene = js.Scene(particles=particles, transfer=SMOOTH)
+    truth, roomy = draw(scene, camera)
+    plan = plan_of(PILOT)
+    little = dataclasses.replace(plan, control=dataclasses.replace(plan.control, room=(5, 6)))
+    image = js.render(scene, camera, PILOT, plan=little)
+    assert roomy.stats["evaluations"] < image.stats["evaluations"] < truth.stats["evaluations"]
+    assert error_of(image, truth).max() <= PILOT.tolerance
+
+
+def test_nodes_are_as_far_apart_as_supports_allow():
+    for size, samples, nodes in ((128, 128, FINEST), (1024, 128, Spacing(8, 2)), (128, 1024, Spacing(4, 8))):
+        scene, camera = js.scenes.load("mixer", 8_000, width=size, height=size)
+        plan = js.plan(scene, camera, dataclasses.replace(PILOT, samples=samples))
+        assert plan.control.nodes == nodes
+        rows, columns = plan.control.room
+        assert 0 < rows < size / 8 and 0 < columns <= size / 8, "around the fluid only"
 
 
 def test_float64_orthographic_wendland(x64):
