@@ -69,7 +69,7 @@ def residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFu
 def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> Residuals:
     """Slab by slab from front to back, such that what is at hand stays in the cache.
 
-    Infinite variance where a stencil may leave the lattice: at its first and last slabs, rows and columns.
+    Infinite variance where a cubic may take nodes beyond the lattice: at its first and last slabs, rows and columns.
     """
     slabs = grid.cells.count.shape[0]
     region, nodes = lattice.region, lattice.region.spacing
@@ -135,7 +135,8 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
     variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
     slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
     spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // nodes.samples)
-    spared = spared[:, None, None] & ((row > 0) & (row < rows - 1))[:, None] & ((column > 0) & (column < columns - 1))
+    past = -(-2 // nodes.across)  # bundles at the far sides from which a cubic takes nodes beyond
+    spared = spared[:, None, None] & ((row > 0) & (row < rows - past))[:, None] & ((column > 0) & (column < columns - past))
     row, column, inside = region.place(grid)
     at = jnp.where(inside, row * columns + column, 0)
     variance, bend = (value.reshape(slabs, -1)[:, at] for value in (jnp.where(spared, variance, jnp.inf), bend))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.access.lattice import FINEST, GAP, Spacing, region_of
 from jaxsph.control.residuals import residuals
 from jaxsph.stages import sum_part
 
@@ -45,3 +46,19 @@ def test_rougher_sums_are_judged_worse(band):
 def test_nothing_is_interpolated_without_a_lattice(band):
     _, lattice, judge = band
     assert np.isinf(judge(jax.tree.map(jnp.zeros_like, lattice)).variance).all()
+
+
+@pytest.mark.parametrize("nodes", [FINEST, Spacing(8, 2)])
+def test_what_would_be_interpolated_from_beyond_the_lattice_is_not(band, nodes):
+    """Even where sums fall off so evenly that nodes which are missing look like zero."""
+    grid, lattice, judge = band
+    region = dataclasses.replace(region_of(grid, 12, 13, nodes), row=jnp.int32(0), column=jnp.int32(0))
+    layers, down, across = lattice.weight.shape[0], 12 * nodes.across, 13 * nodes.across
+    ramp = np.zeros((layers, down + GAP, across + GAP), np.float32)
+    ramp[:, :down, :across] = across - np.arange(across)
+    even = dataclasses.replace(lattice, weight=jnp.asarray(ramp), weighted=jnp.asarray(0.3 * ramp), region=region)
+    row, column, inside = (np.asarray(value) for value in region.place(grid))
+    usable = np.isfinite(judge(even).variance).any(0)
+    last = (column + 1) * nodes.across + 1, (row + 1) * nodes.across + 1  # nodes that a cubic takes
+    assert usable.any() and inside[usable].all() and (row[usable] > 0).all() and (column[usable] > 0).all()
+    assert (last[0][usable] < across).all() and (last[1][usable] < down).all()

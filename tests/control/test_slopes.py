@@ -10,7 +10,7 @@ import jaxsph as js
 from jaxsph.control.slopes import BUCKETS, mean_square_slope, squared_slopes
 
 
-def testmean_square_slopes_lie_between_those_of_the_range_and_of_its_buckets():
+def test_mean_square_slopes_lie_between_those_of_the_range_and_of_its_buckets():
     transfer = js.TransferFunction.from_points(
         np.float32([0, 0.2, 0.5, 1]), np.float32([[0, 0, 0], [1, 0, 0], [0, 0.5, 0], [0, 1, 1]]), np.float32([0, 3, 3, 1])
     )
