@@ -6,6 +6,8 @@ PYTHON ?=
 # Processes that share the suite file by file, as tests of a file share compiled programs; 0 runs all in one.
 JOBS ?= 2
 PYTEST_ARGS ?=
+# With this JAX compiles once what several tests or benchmarks compile, in any process, as long as the folder is there.
+SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.1 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
 .PHONY: setup test test-slow lint format demo results clean
@@ -33,7 +35,8 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@touch $(VENV)/.installed-test $@
 
 test: lint
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	@compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
+	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m '' $(PYTEST_ARGS)
@@ -51,16 +54,18 @@ format: $(VENV)/.installed-test
 demo: $(VENV)/.installed-all
 	@$(VENV)/bin/jaxsph demo -o demo
 
+# The last two tell how long compiling takes, and so share nothing.
+MEASURE = $(SHARE_COMPILED)=$(VENV)/compiled $(VENV)/bin/python
 # A benchmark whose claim does not hold says so at its end; what it measured is written all the same.
 results: $(VENV)/.installed-all
 	@$(PIP) install --editable '.[all,vtk]'
-	rm -rf benchmarks/results/trade benchmarks/results/sequences
-	-$(VENV)/bin/python benchmarks/pilot.py --repeats 1 --sequences
+	rm -rf benchmarks/results/trade benchmarks/results/sequences $(VENV)/compiled
+	-$(MEASURE) benchmarks/pilot.py --repeats 1 --sequences
+	-$(MEASURE) benchmarks/trade.py --repeats 2
+	-$(MEASURE) benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
+	-$(MEASURE) benchmarks/scaling.py --repeats 1
+	-$(MEASURE) benchmarks/vtk_grid.py --repeats 1
 	-$(VENV)/bin/python benchmarks/peers.py --repeats 2
-	-$(VENV)/bin/python benchmarks/trade.py --repeats 2
-	-$(VENV)/bin/python benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
-	-$(VENV)/bin/python benchmarks/scaling.py --repeats 1
-	-$(VENV)/bin/python benchmarks/vtk_grid.py --repeats 1
 	-$(VENV)/bin/python benchmarks/gradients.py --repeats 2
 	$(VENV)/bin/python benchmarks/report.py
 

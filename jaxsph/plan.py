@@ -55,7 +55,7 @@ class Plan:
         bands: horizontal bands that are rendered one after the other.
         lists: sizes of the lists of one band.
         cast: sizes of the march.
-        bytes: estimate of the working memory, in bytes.
+        bytes: estimate of the working memory, in bytes; of no matter to what is compiled, so plans are equal whatever it is.
         control: static choices of error control; None renders at full rate.
     """
 
@@ -67,7 +67,7 @@ class Plan:
     bands: int
     lists: ListPlan
     cast: CastPlan
-    bytes: int
+    bytes: int = dataclasses.field(compare=False)
     control: ControlPlan | PilotPlan | None = None
 
     @property

@@ -35,7 +35,6 @@ from jaxsph.plan import plan as make_plan
 from jaxsph.stages import (
     add_lattices,
     cast_part,
-    deal_part,
     decide_part,
     grid_parts,
     in_own_units,
@@ -183,8 +182,7 @@ def _decide_and_cast(
         (lattice,) = adapt(add_lattices, [(tuple(lattices),)]) if parts > 1 else lattices
         # slab by slab what is at hand stays in the cache: one program is faster than parts side by side
         decided = adapt(decide_part, [(*view, limits, lattice, each[0])], parts=1, plan=plan)
-        if parts > 1:
-            decided = adapt(deal_part, [(decided[0], nth) for nth in each], parts=parts)
+        works = [decided[0].work] * parts
     else:
         seen: list[Any] = [None] * parts
         if plan.control is not None:
@@ -194,8 +192,9 @@ def _decide_and_cast(
             seen = [(probe.promising, shares) for probe in probes]
         inputs = [(*view, limits, of_part, nth) for of_part, nth in zip(seen, each, strict=True)]
         decided = adapt(decide_part, inputs, parts=parts, plan=plan)
-    work = [(*view, choice.work, lattice, nth) for choice, nth in zip(decided, each, strict=True)]
-    rays = run_all("cast", cast_part, work, parts=parts, plan=shapes, kernel=kernel)
+        works = [choice.work for choice in decided]
+    inputs = [(*view, work, lattice, nth) for work, nth in zip(works, each, strict=True)]
+    rays = run_all("cast", cast_part, inputs, parts=parts, plan=shapes, kernel=kernel)
     return tuple(choice.layers for choice in decided), tuple(rays)
 
 

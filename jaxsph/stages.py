@@ -173,12 +173,6 @@ def decide_part(
     return Decided(work, full, bound, levels)
 
 
-@functools.partial(jax.jit, static_argnames="parts")
-def deal_part(decided: Decided, nth: Int[Array, ""], *, parts: int) -> Decided:
-    """What was decided for the whole band, for the `nth` of `parts` of it."""
-    return dealt(decided, nth, parts)
-
-
 @functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
 def cast_part(
     grid: Grid,
@@ -192,10 +186,11 @@ def cast_part(
     plan: Plan,
     kernel: str,
 ) -> Rays:
-    """What the rays of the `nth` of `parts` of a band meet; `work` is of this part, grid and lattice are of the whole."""
+    """What the rays of the `nth` of `parts` of a band meet. The grid is of the whole band, and so is the work with a lattice."""
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     if lattice is not None:
-        lattice = dataclasses.replace(lattice, evaluations=dealt(lattice.evaluations, nth, parts))
+        work, evaluations = dealt((work, lattice.evaluations), nth, parts)
+        lattice = dataclasses.replace(lattice, evaluations=evaluations)
     return cast(part_of(grid, nth, parts), work, camera, transfer, kernel, plan_of_part(plan.cast, parts), lattice)
 
 

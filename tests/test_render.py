@@ -239,6 +239,18 @@ def test_pairs_count_the_particles_of_all_bundles():
     assert image.stats["pairs"] == 4
 
 
+def test_plans_share_grid_and_cast_whatever_controls_the_error():
+    """What is compiled for one setting serves the others: only error control is a difference between their plans."""
+    scene, camera = js.scenes.load("mixer", 2000, width=64, height=64)
+    settings = [
+        js.Settings(samples=32, tolerance=limit, estimator=by)
+        for limit, by in ((None, "interval"), (0.01, "interval"), (0.01, "pilot"))
+    ]
+    plans = [js.plan(scene, camera, one) for one in settings]
+    assert len({plan.bytes for plan in plans}) == 3
+    assert len({dataclasses.replace(plan, control=None) for plan in plans}) == 1
+
+
 def test_stats_count_what_was_done(frames):
     rng = np.random.default_rng(0)
     image = js.render(frames.scene(rng), frames.camera(rng), frames.settings, plan=frames.plan())

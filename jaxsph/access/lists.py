@@ -28,6 +28,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
 from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.sums import running_sum
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
 RUNS = 16  # sorts that run side by side
@@ -194,7 +195,7 @@ def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Ar
     left, top = ranges.left >> 1, ranges.top >> 1
     columns = jnp.where(ranges.right > ranges.left, ((ranges.right + 1) >> 1) - left, 0)
     count = columns * (((ranges.bottom + 1) >> 1) - top)
-    end, nth = lax.associative_scan(jnp.add, count), lax.associative_scan(jnp.add, (count > 0).astype(jnp.int32))
+    end, nth = running_sum(count), running_sum((count > 0).astype(jnp.int32))
     total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], -1)
     flag = jnp.where(count > 0, jnp.uint32(1) << ((end - 1) & (WORD - 1)).astype(jnp.uint32), 0)
     last = jnp.zeros(words, jnp.uint32).at[(end - 1) // WORD].add(flag, mode="drop")
@@ -207,7 +208,7 @@ def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Ar
 def _counted(word: Int[Array, "*some words"]) -> Int[Array, "*some words"]:
     """Flags that are set in the words before each."""
     number = lax.population_count(word).astype(jnp.int32)
-    return lax.associative_scan(jnp.add, number, axis=-1) - number
+    return running_sum(number) - number
 
 
 def _set_before(word: Array, counted: Array, lane: Array) -> Array:
@@ -226,7 +227,7 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
     at_start = _set_before(word[:, start // WORD], counted[:, start // WORD], start % WORD)
     count = at_start[:, :, 1:] - at_start[:, :, :-1]
     overflow = pairs.faults | faults.raised(faults.LIST_OVERFLOW, count.astype(jnp.float32).sum() > plan.list_capacity)
-    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(jnp.moveaxis(count, 2, 0).ravel())])
+    begins = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(jnp.moveaxis(count, 2, 0).ravel())])
     shift = jnp.moveaxis(begins[:-1].reshape(plan.num_tiles, 4, runs), 0, 2) - at_start[:, :, :-1]
     word, counted = (value[:, :-1].reshape(4, runs, -1, 1) for value in (word, counted))
 

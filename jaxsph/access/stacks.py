@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from jaxsph.numerics.sums import running_sum
+
 SIZE_BITS = 5  # of a sort key: how full an item is, in quarters of octaves
 
 
@@ -37,14 +39,14 @@ class Stacks:
 def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
     """Stack the `filled` items of each bundle."""
     slabs, bundles = filled.shape
-    nth = jnp.cumsum(filled.astype(jnp.int32), 0)
+    nth = running_sum(filled.astype(jnp.int32), 0)
     height = nth[-1]
     bits = (bundles - 1).bit_length()
     key = lax.sort(((slabs - height).astype(jnp.uint32) << bits) | lax.iota(jnp.uint32, bundles))
     bundle = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
     place = jnp.zeros(bundles, jnp.int32).at[bundle].set(jnp.arange(bundles, dtype=jnp.int32))
     active = bundles - jnp.searchsorted(height[bundle[::-1]], jnp.arange(slabs, dtype=jnp.int32), side="right")
-    start = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(active.astype(jnp.int32))])
+    start = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(active.astype(jnp.int32))])
     # always in bounds, as a dropped entry is a branch mispredicted
     target = jnp.where(filled, start[jnp.maximum(nth - 1, 0)] + place, slabs * bundles)
     item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)

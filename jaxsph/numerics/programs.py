@@ -46,7 +46,7 @@ MOST_PROGRAMS = 24  # compiled stages that are kept, the oldest goes first: each
 
 def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    shapes = tuple((leaf.shape, str(leaf.dtype), leaf.weak_type, str(leaf.sharding)) for leaf in leaves)
+    shapes = tuple((leaf.shape, leaf.dtype, leaf.weak_type, leaf.sharding) for leaf in leaves)
     key = (function, tuple(static.items()), structure, shapes, jax.config.read("jax_enable_x64"))
     if key not in _PROGRAMS:
         while len(_PROGRAMS) >= MOST_PROGRAMS:
