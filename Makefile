@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 VENV := .venv
 PYTHON ?=
-# Processes that share the suite file by file, as tests of a file share compiled programs; 0 runs all in one.
+# Processes that share the suite, what is left going to whichever is idle; 0 runs all in one.
 JOBS ?= 2
 PYTEST_ARGS ?=
 # With this JAX compiles once what several tests or benchmarks compile, in any process, as long as the folder is there.
@@ -36,7 +36,7 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 
 test: lint
 	@compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
-	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m '' $(PYTEST_ARGS)

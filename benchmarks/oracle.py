@@ -5,7 +5,7 @@ rays ('light'); the quantity interpolated from such a lattice, and shaded at eve
 interpolated. Every candidate of every cell is compared with full rate, a price on error shares out the bundles' tolerance, and
 the image made of the choices is compared with the reference. Work counts kernel evaluations only: shading is not in it.
 
-    python benchmarks/oracle.py [--scenes mixer radial] [--size 512] [--tolerance 0.004]
+    python benchmarks/oracle.py [--scenes mixer radial:2 FILE] [--size 512] [--tolerance 0.004]
 
 Writes `results/oracle.json`.
 """
@@ -26,6 +26,7 @@ from jax import Array
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
+import workloads
 
 import jaxsph as js
 from jaxsph.access.cells import Cells, cells_with_borders
@@ -254,15 +255,15 @@ def best(frame: Cut, errors: np.ndarray, families: tuple[str, ...], tolerance: f
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--scenes", nargs="+", default=["mixer", "radial", "checker_board", "dam_break"], choices=js.scenes.names()
+        "--scenes", nargs="+", default=["mixer", "radial", "checker_board", "dam_break"], help="names, or particle files"
     )
     parser.add_argument("--size", type=int, default=512, help="pixels on a side")
-    parser.add_argument("--particles", type=int, help="instead of each scene's own number")
     parser.add_argument("--tolerance", type=float, nargs="+", default=[0.004])
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS)
     arguments = parser.parse_args()
     records = []
-    for name in arguments.scenes:
-        scene, camera = js.scenes.load(name, arguments.particles, width=arguments.size, height=arguments.size)
+    for view in arguments.scenes:
+        name, (scene, camera) = pathlib.Path(view).name, workloads.view(view, arguments.size)
         frame = cut(scene, camera)
         errors = true_errors(frame)
         for tolerance in arguments.tolerance:
@@ -273,8 +274,10 @@ def main() -> None:
                     flush=True,
                 )
                 records.append({"scene": name, "tolerance": tolerance, "candidates": mix, **found})
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"machine": peers.machine(), "size": arguments.size, "records": records}, indent=1) + "\n")
+    arguments.output.parent.mkdir(exist_ok=True)
+    arguments.output.write_text(
+        json.dumps({"machine": peers.machine(), "size": arguments.size, "records": records}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":

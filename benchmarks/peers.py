@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="fail where a ratio is over its limit")
     arguments = parser.parse_args()
     records = []
-    for load in (workloads.cube(46), workloads.cube(100), workloads.dam_break()):
+    for load in (workloads.cube(workloads.CUBE), workloads.cube(100), workloads.dam_break()):
         found = measure(load, ["poly6", "cubic_spline"], arguments.repeats)
         records += found
         for record in found:

@@ -25,7 +25,6 @@ import workloads
 
 import jaxsph as js
 
-CUBE = 46  # particles along an edge of the peers' filled cube
 SCENES = ("mixer", "radial", "checker_board", "dam_break", "cube")
 SEQUENCES = tuple(f"{name}:{frame}" for name in ("mixer", "dam_break") for frame in range(3))  # at the smallest size
 SHOWN_AT = 0.004  # in the figure
@@ -38,19 +37,6 @@ def contenders() -> dict[tuple[str, float | None], js.Settings]:
     """Settings by variant and tolerance, full rate first."""
     pilots = {("pilot", limit): js.Settings(tolerance=limit, estimator="pilot") for limit in tolerance.TOLERANCES}
     return {(tolerance.FULL_RATE, None): js.Settings()} | pilots
-
-
-def load(name: str, size: int) -> tuple[js.Scene, js.Camera]:
-    """A built-in scene, maybe of a frame (`mixer:2`), the peers' cube, or the particles of a file, framed."""
-    if name == "cube":
-        work = workloads.cube(CUBE, size=size)
-        return work.scene("poly6"), work.camera()
-    if pathlib.Path(name).is_file():
-        particles = js.io.read_particles(name)
-        transfer = js.scenes.default_transfer(particles)
-        return js.Scene(particles=particles, transfer=transfer), js.Camera.framing(particles, width=size, height=size)
-    scene, _, frame = name.partition(":")
-    return js.scenes.load(scene, frame=int(frame) if frame else None, width=size, height=size)
 
 
 def oracles() -> dict[tuple[str, int, float], float]:
@@ -123,7 +109,7 @@ def main() -> None:
     print(HEADER)
     for size in arguments.sizes:
         for name in [*arguments.scenes, *arguments.sequences * (size == min(arguments.sizes))]:
-            scene, camera = load(name, size)
+            scene, camera = workloads.view(name, size)
             label = pathlib.Path(name).name
             found = tolerance.measure(label, scene, camera, arguments.repeats, contenders())
             found = [record | {"size": size} for record in found if record["tolerance"] is not None]

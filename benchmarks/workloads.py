@@ -1,13 +1,16 @@
-"""What the contenders render: a filled cube of jittered particles, and a dam break that is mostly empty space."""
+"""What the contenders render: a filled cube of jittered particles, a dam break that is mostly empty space, scenes and files."""
 
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 
 import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
+
+CUBE = 46  # particles along an edge of the smaller filled cube
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,3 +85,16 @@ def blocks(particles: int, size: int) -> tuple[js.Scene, js.Camera]:
     quantity = np.array([0.1, 0.4, 0.7, 1.0], np.float32)[octant % 4]
     held = dataclasses.replace(scene.particles, quantity=jnp.asarray(quantity))
     return dataclasses.replace(scene, particles=held), camera
+
+
+def view(name: str, size: int) -> tuple[js.Scene, js.Camera]:
+    """A built-in scene, maybe of a frame (`mixer:2`), the filled `cube`, or the particles of a file, framed."""
+    if name == "cube":
+        work = cube(CUBE, size=size)
+        return work.scene("poly6"), work.camera()
+    if pathlib.Path(name).is_file():
+        particles = js.io.read_particles(name)
+        transfer = js.scenes.default_transfer(particles)
+        return js.Scene(particles=particles, transfer=transfer), js.Camera.framing(particles, width=size, height=size)
+    scene, _, frame = name.partition(":")
+    return js.scenes.load(scene, frame=int(frame) if frame else None, width=size, height=size)
