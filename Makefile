@@ -34,12 +34,14 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@$(PIP) install --editable '.[all]'
 	@touch $(VENV)/.installed-test $@
 
+SUITE = compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
+	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal
+
 test: lint
-	@compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
-	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal $(PYTEST_ARGS)
+	@$(SUITE) $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
-	@$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder -m '' $(PYTEST_ARGS)
+	@$(SUITE) -m '' $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .
