@@ -189,8 +189,8 @@ def cast_part(
     """What the rays of the `nth` of `parts` of a band meet. The grid is of the whole band, and so is the work with a lattice."""
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     if lattice is not None:
-        work, evaluations = dealt((work, lattice.evaluations), nth, parts)
-        lattice = dataclasses.replace(lattice, evaluations=evaluations)
+        work, spent = dealt((work, lattice.evaluations), nth, parts)
+        lattice = dataclasses.replace(lattice, evaluations=spent)
     return cast(part_of(grid, nth, parts), work, camera, transfer, kernel, plan_of_part(plan.cast, parts), lattice)
 
 
