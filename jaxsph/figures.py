@@ -157,12 +157,13 @@ def _error(points: Sequence[Point], title: str) -> Any:
     figure, (axis,) = _canvas(title, 1)
     controlled = [point for point in points if point.tolerance is not None and point.tolerance > 0]
     tolerances = sorted({point.tolerance for point in controlled if point.tolerance is not None})
+    axis.set(xscale="log", yscale="log")  # before its limits: of a linear axis they would start below zero
     if tolerances:
         ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
         axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
         axis.fill_between(ends, ends, [tolerances[-1] * 4] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
-        axis.set_ylim(top=tolerances[-1] * 4)
-        axis.set_xlim(ends)
+        least = min(_shown(value) for point in controlled for value in (point.error, point.bound or 0.0))
+        axis.set(xlim=ends, ylim=(min(least, ends[0]) / 2, tolerances[-1] * 4))
     for method, color in COLORS.items():
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
@@ -178,7 +179,7 @@ def _error(points: Sequence[Point], title: str) -> Any:
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
             axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
-    axis.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="largest error of a pixel, against full rate")
+    axis.set(xlabel="tolerance", ylabel="largest error of a pixel, against full rate")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)
     _label_zero(axis, [value for point in controlled for value in (point.error, point.bound or 0.0)], "y")

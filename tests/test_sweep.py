@@ -273,6 +273,17 @@ def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
     assert [point.time for point in points] == pytest.approx([(row.total + 2) / (row.full_total + 4) for row in rows])
 
 
+@pytest.mark.parametrize("least", [0.0, 0.0003])
+def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, least):
+    """Whether or not some are zero: from the least to the tolerance they take up a good part of the axis."""
+    pytest.importorskip("matplotlib")
+    wrong = [row if row.tolerance is None else dataclasses.replace(row, max_error=least, max_bound=0.001) for row in rows]
+    (axis,) = figures._error(figures.summary(wrong), "a title").axes
+    bottom, top = axis.get_ylim()
+    lowest = max(least, figures.LEAST)
+    assert lowest / 10 < bottom < lowest < max(CHOSEN["tolerances"]) < top
+
+
 def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--frames", 0, 2, *LEAST_WORK)
