@@ -230,7 +230,7 @@ def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Hel
 
         return seen, (light, sums), lax.fori_loop(0, stretch.chunks, settle_chunk, owed)
 
-    *light, thickness = unlit(plan.held + 1, plan.slab_samples, dtype)
+    *light, thickness = unlit(stretches.places + 1, plan.slab_samples, dtype)
     owed = (
         jnp.zeros((grid.ordered.x.shape[0], WIDTH), dtype),
         jnp.zeros((), dtype),

@@ -21,13 +21,13 @@ from jaxsph.access.lattice import GAP, REACH, Lattice, Region, Spacing, between,
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
-from jaxsph.control.worklist import CELL
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.staging import computed_once
 
 CHUNK = 256  # cells at once
 BLOCK = 8  # particles unrolled in the inner loop
+NODES = 8  # in depth and across, times the nodes down, share a window: deeper ones hold particles that miss most of their nodes
 
 
 def sum_at_nodes(
@@ -47,15 +47,17 @@ def sum_at_nodes(
         origin: quantity that sums are taken relative to.
     """
     spacing, (row, column, has_nodes) = region.spacing, region.place(grid)
-    cells = -(-grid.cells.count.shape[0] * slab_samples // CELL)
-    windows = coarser_windows(grid.cells, slab_samples)[(CELL // slab_samples).bit_length() - 1]
+    across = spacing.across
+    layers = max(NODES // across, slab_samples // spacing.samples)
+    depth = layers * spacing.samples
+    cells = -(-grid.cells.count.shape[0] * slab_samples // depth)
+    windows = coarser_windows(grid.cells, slab_samples)[(depth // slab_samples).bit_length() - 1]
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
     count = jnp.where(wanted & has_nodes, length.sum(0, dtype=jnp.int32), 0)
     bundles = count.shape[1]
     chunk = min(CHUNK, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
-    layers, across = CELL // spacing.samples, spacing.across
     shape = REACH + cells * layers + GAP, *(across * number + GAP for number in (region.rows, region.columns))
     deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (layers, across, across))
 
@@ -64,7 +66,7 @@ def sum_at_nodes(
         real = step * chunk + jnp.arange(chunk, dtype=jnp.int32) < number
         cell, bundle = at // bundles, at % bundles
         u, v = (rays[:: spacing.pixels] for rays in grid.rays(camera, bundle))
-        s = grid.half_steps[jnp.minimum(2 * (cell * CELL + deep[:, None] * spacing.samples) + 1, last)]
+        s = grid.half_steps[jnp.minimum(2 * (cell * depth + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
         found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
         first = row[bundle] * across, column[bundle] * across
@@ -98,16 +100,25 @@ def _summed(
         x, y, z, scale, size, quantity = (column[particle] for column in columns)
         return [x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), quantity - origin]
 
+    def separate(*particles: Array) -> tuple[Array, Array]:
+        """The two parts of the squared distance, see `points.gather_field`."""
+        x, y, z, scale, size, _ = (column[..., None, None, :] for column in particles)
+        across = ((su - x) * scale) ** 2
+        along = ((s[:, None] - z) * scale) ** 2 + ((sv - y) * scale) ** 2
+        return across, smooth.prepare(along, size)
+
+    several = u.shape[0] > 1  # of a single node across, neither part would be read twice
+
     def add_block(block: Array, sums: Array) -> Array:
         index = block * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[:, None]
         particles = computed_once(block >= 0, fetch, index)
+        parts = computed_once(block >= 0, separate, *particles) if several else ()
         weight, weighted = sums.real, sums.imag
         for k in range(BLOCK):
-            x, y, z, scale, size, quantity = (column[k] for column in particles)
-            across = ((su - x) * scale) ** 2
-            along = ((s[:, None] - z) * scale) ** 2 + ((sv - y) * scale) ** 2
-            w = smooth.weigh(smooth.prepare(along, size)[:, :, None], across[:, None], size, jnp)
-            weight, weighted = weight + w, weighted + w * quantity
+            one = [column[k] for column in particles]
+            across, along = (part[k] for part in parts) if several else separate(*one)
+            w = smooth.weigh(along[:, :, None], across[:, None], one[4], jnp)
+            weight, weighted = weight + w, weighted + w * one[5]
         return lax.complex(weight, weighted)
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)

@@ -97,7 +97,7 @@ def cast_points(
         return composite(rays, light, stretch.held_at, border, stretches.stacks.start, stretch.first, stretch.number), light
 
     dtype = grid.half_steps.dtype
-    state = fresh(work.count.shape[1], dtype), unlit(plan.held + 1, plan.slab_samples, dtype)
+    state = fresh(work.count.shape[1], dtype), unlit(stretches.places + 1, plan.slab_samples, dtype)
     state = lax.fori_loop(0, stretches.number, march_stretch, state)
     *color, transmittance, depth = (field[stretches.stacks.place].reshape(-1, BUNDLE, BUNDLE) for field in state[0])
     spent = evaluations(work, grid.samples, plan)
@@ -115,29 +115,19 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
 def _with_lattice(
     lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], marched: Callable[[], Array], plan: CastPlan
 ) -> Array:
-    """Sums of items, `marched` or from the lattice at their level: of a chunk either one of these, or all where it is mixed."""
+    """Sums of items, which are all of one kind: `marched`, or from the lattice at their level."""
     slab, bundle = at
     inside = item.interpolated
     assert inside is not None
-    # the corner of the bundle in nodes; what is not interpolated reads some nodes and drops them
     row, column, _ = (side[bundle] * lattice.region.spacing.across for side in lattice.region.place(grid))
-    corner = row, column
-    levels = jnp.where(inside, item.level, -1)
+    found = functools.partial(interpolate, lattice, slab, (row, column), plan.slab_samples)
 
-    def found(level: int) -> Array:
-        return interpolate(lattice, slab, corner, plan.slab_samples, level).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
+    def at_level(level: int) -> Array:
+        return found(level).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
 
-    def mixed() -> Array:
-        sums = marched()
-        for level in range(WIDEST + 1):
-            sums = jnp.where((levels == level)[:, None, None, None], found(level), sums)
-        return sums
-
-    highest = levels.max()
-    lowest = jnp.where(slab < grid.cells.count.shape[0], levels, highest).min()
-    kind = jnp.where(lowest == highest, highest + 2, 0)
-    every = [functools.partial(found, level) for level in range(WIDEST + 1)]
-    return lax.switch(kind, [mixed, marched, *every])
+    # a dummy reads some nodes and drops them
+    kind = jnp.where(inside & (slab < grid.cells.count.shape[0]), 1 + item.level, 0).max()
+    return lax.switch(kind, [marched, *(functools.partial(at_level, level) for level in range(WIDEST + 1))])
 
 
 def gather_field(

@@ -3,7 +3,8 @@
 Flow: worklist -> [stretches] -> points, adjoint.
 
 The slabs of all bundles, stacked front to back (`access.stacks`), are taken `held` at a time. Within such a stretch they are
-marched in order of how many particles they have, such that those of a chunk take equally long.
+marched in order of how many particles they have, such that those of a chunk take equally long. Slabs whose sums come from a
+lattice have chunks of their own, filled up with dummies: mixed ones would take as long as all that they are mixed of.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.stacks import Stacks, stack
+from jaxsph.control.spacing import WIDEST
 from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.numerics.checks import require_sizes
 
 BLOCK = 16  # particles unrolled in the inner loop
+KINDS = WIDEST + 2  # of slabs, by how their sums are found: from particles, or from the lattice at one of its levels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,14 +52,14 @@ class Stretch:
 
     Attributes:
         items: `slab * bundles + bundle` of each, in the order of the stacks.
-        fullest: the same, in the order in which they are marched.
+        marched: the same, in the order in which they are marched, and dummies such that chunks hold slabs of one kind.
         held_at: where in that order each of `items` is.
         first, number: where the stretch begins in the stacks, and how many of its slabs are real.
-        chunks: how many chunks that is.
+        chunks: how many chunks are marched.
     """
 
     items: Int[Array, " held"]
-    fullest: Int[Array, " held"]
+    marched: Int[Array, " places"]
     held_at: Int[Array, " held"]
     first: Int[Array, ""]
     number: Int[Array, ""]
@@ -85,6 +88,11 @@ class Stretches:
         return self.work.count.shape[1]
 
     @property
+    def places(self) -> int:
+        """How many slabs and dummies the chunks of a stretch can hold."""
+        return self.plan.held + (0 if self.work.interpolated is None else (KINDS - 1) * self.plan.chunk)
+
+    @property
     def number(self) -> Array:
         """How many stretches there are."""
         return (self.stacks.start[-1] + self.plan.held - 1) // self.plan.held
@@ -94,16 +102,36 @@ class Stretches:
         first = nth * self.plan.held
         items = lax.dynamic_slice(self.order, (first,), (self.plan.held,))
         dummy = self.work.count.size
-        inside = jnp.minimum(items, dummy - 1)
-        level = self.work.level.ravel()[inside] if self.work.interpolated is not None else None
-        place, number = _by_fullness(self.work.count.ravel()[inside], level, items < dummy)
-        held_at = jnp.zeros(self.plan.held, jnp.int32).at[place].set(jnp.arange(self.plan.held, dtype=jnp.int32))
-        return Stretch(items, items[place], held_at, first, number, (number + self.plan.chunk - 1) // self.plan.chunk)
+        inside, real = jnp.minimum(items, dummy - 1), items < dummy
+        order = _by_fullness(self.work.count.ravel()[inside], self._kind(inside), real)
+        number = real.sum(dtype=jnp.int32)
+        place, end = self._places(self._kind(inside), real, number)
+        held_at = jnp.zeros(self.plan.held, jnp.int32).at[order].set(place)
+        marched = jnp.full(self.places, dummy, jnp.int32).at[place].set(items[order])
+        return Stretch(items, marched, held_at, first, number, (end + self.plan.chunk - 1) // self.plan.chunk)
+
+    def _kind(self, items: Int[Array, " held"]) -> Int[Array, " held"] | None:
+        """How the sums of items are found: 0 from particles, else 1 + level from the lattice; None where there is none."""
+        if self.work.interpolated is None:
+            return None
+        return jnp.where(self.work.interpolated.ravel()[items], 1 + self.work.level.ravel()[items], 0)
+
+    def _places(self, kind: Int[Array, " held"] | None, real: Bool[Array, " held"], number: Array) -> tuple[Array, Array]:
+        """Where the slabs are marched, kind after kind, each from the beginning of a chunk on; and where that ends."""
+        each = jnp.arange(self.plan.held, dtype=jnp.int32)
+        if kind is None:
+            return each, number
+        place, past, skipped = each, jnp.int32(0), jnp.int32(0)
+        for k in range(KINDS - 1):
+            some = (real & (kind == k)).sum(dtype=jnp.int32)
+            past, gap = past + some, -some % self.plan.chunk
+            place, skipped = jnp.where(each >= past, place + gap, place), skipped + gap
+        return place, number + skipped
 
     def chunk(self, stretch: Stretch, nth: Array) -> tuple[Array, Array]:
         """Items of a chunk of a stretch, and where they begin in it."""
         begin = nth * self.plan.chunk
-        return lax.dynamic_slice(stretch.fullest, (begin,), (self.plan.chunk,)), begin
+        return lax.dynamic_slice(stretch.marched, (begin,), (self.plan.chunk,)), begin
 
     def item(self, at: Int[Array, " some"]) -> tuple[Worklist, Array, Array]:
         """What is to be done for items, their slabs and their bundles; a dummy has no particles."""
@@ -143,18 +171,15 @@ def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Ar
     return jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
 
 
-def _by_fullness(
-    count: Int[Array, " held"], level: Int[Array, " held"] | None, real: Bool[Array, " held"]
-) -> tuple[Array, Array]:
-    """Places of slabs in order of how many blocks of particles they have, those that are not `real` last; and how many are.
-
-    With `level`, slabs of no particles are in order of level.
-    """
+def _by_fullness(count: Int[Array, " held"], kind: Int[Array, " held"] | None, real: Bool[Array, " held"]) -> Int[Array, " held"]:
+    """Slabs in order of kind if any, then of how many blocks of particles they have; those that are not `real` last."""
     bits = (count.shape[0] - 1).bit_length()
-    most = (1 << (31 - bits)) - 2
-    rank = (count + BLOCK - 1) // BLOCK
-    if level is not None:
-        rank = jnp.where(count > 0, rank + COARSEST, COARSEST - jnp.minimum(level, COARSEST))
-    key = jnp.where(real, most - jnp.minimum(rank, most), most + 1).astype(jnp.uint32) << bits
+    most = (1 << (31 - bits)) - 1 - KINDS
+    rank = most - jnp.minimum((count + BLOCK - 1) // BLOCK, most)
+    if kind is not None:
+        rank = jnp.where(kind > 0, most + kind, rank)
+    key = jnp.where(real, rank, most + KINDS).astype(jnp.uint32) << bits
     key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
-    return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32), real.sum(dtype=jnp.int32)
+    return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
+
+
