@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 
 import hypothesis
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.access.grid import Grid
 from jaxsph.access.lists import ListPlan
 from jaxsph.cast.stretches import CastPlan
+from jaxsph.control.worklist import origins
+from jaxsph.stages import grid_parts, order
 
 hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
 hypothesis.settings.load_profile("jaxsph")
@@ -145,3 +149,17 @@ def compare() -> Callable[..., None]:
         assert (close | grazing).mean() >= share, f"depth differs on {(~(close | grazing)).sum()} pixels"
 
     return check
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def grid_of(particles, camera, *, plan):
+    """The grid of a frame of one band, and what its sums are taken relative to."""
+    ordered = order(particles, camera, plan=plan)
+    grid = Grid(ordered, *grid_parts(ordered, camera, 0, plan=plan))
+    return grid, origins(grid.cells, grid.lists.rank, ordered.quantity)
+
+
+@pytest.fixture(scope="session")
+def stages():
+    """The stages of a frame, for tests that look between them."""
+    return grid_of

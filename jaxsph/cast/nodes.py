@@ -68,7 +68,7 @@ def sum_at_nodes(
         u, v = (rays[:: spacing.pixels] for rays in grid.rays(camera, bundle))
         s = grid.half_steps[jnp.minimum(2 * (cell * depth + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
-        found = _summed(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
+        found = sums_at(grid, window, (u, v, s), origin, camera.is_perspective, kernel)
         first = row[bundle] * across, column[bundle] * across
         place = cell * layers + deep[:, None, None, None], first[0] + down[:, None, None], first[1] + right[:, None]
         target = jnp.where(real, node_at(shape, *place), math.prod(shape) - 1)  # the last one stays zero
@@ -81,10 +81,16 @@ def sum_at_nodes(
     return Lattice(weight.reshape(shape), weighted.reshape(shape), origin, region, spent)
 
 
-def _summed(
+def sums_at(
     grid: Grid, window: tuple[Array, Array], nodes: tuple[Array, Array, Array], origin: Array, perspective: bool, kernel: str
 ) -> Float[Array, "2 deep down across chunk"]:
-    """Sums of V W and (q - origin) V W at the nodes of a chunk of cells; see `points.gather_field`."""
+    """Sums of V W and (q - origin) V W at the nodes of a chunk of cells; see `points.gather_field`.
+
+    Args:
+        window: where the particles of each cell begin in the lists, and how many there are, by class of supports.
+        nodes: u (across, chunk), v (down, chunk) and depths (deep, chunk).
+        origin: one for all cells, or one each.
+    """
     ordered, rank = grid.ordered, grid.lists.rank
     u, v, s = nodes
     total = window[1].sum(0)

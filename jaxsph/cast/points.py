@@ -32,9 +32,10 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.cast.composite import Light, State, composite, fresh, unlit
 from jaxsph.cast.nodes import interpolate
 from jaxsph.cast.shading import shade
-from jaxsph.cast.stretches import BLOCK, CastPlan, stretches_of
+from jaxsph.cast.sparse import gather_sparse
+from jaxsph.cast.stretches import BLOCK, CastPlan, kind_of, stretches_of
 from jaxsph.control.spacing import WIDEST
-from jaxsph.control.worklist import Worklist
+from jaxsph.control.worklist import SPARSE, Worklist
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
@@ -76,7 +77,11 @@ def cast_points(
         u, v = (rays.T for rays in grid.rays(camera, bundle))
         s, border = stretches.depths(item, slab)
         marched = functools.partial(gather_field, grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
-        sums = marched() if lattice is None else _with_lattice(lattice, grid, item, (slab, bundle), marched, plan)
+        if lattice is None:
+            sums = marched()
+        else:
+            sparse = functools.partial(gather_sparse, grid, item, (u, v, s), perspective, kernel)
+            sums = _with_lattice(lattice, grid, item, (slab, bundle), [marched, sparse], plan)
         return shade(sums, (u, v, border), segments, item, perspective)
 
     def march_stretch(nth: Array, state: tuple[State, Light]) -> tuple[State, Light]:
@@ -109,16 +114,15 @@ def evaluations(work: Worklist, samples: int, plan: CastPlan) -> Float[Array, " 
     """Kernel evaluations that `work` takes for each ray of a bundle."""
     beyond = (jnp.arange(work.count.shape[0]) + 1) * plan.slab_samples - samples
     in_slab = plan.slab_samples - jnp.maximum(beyond, 0)[:, None] * (work.level == 0)
-    return (work.count.astype(jnp.float32) * in_slab.astype(jnp.float32)).sum(0)
+    rays = 1 if work.sparse is None else jnp.where(work.sparse, len(SPARSE) ** 2 / BUNDLE**2, 1)
+    return (work.count.astype(jnp.float32) * rays * in_slab.astype(jnp.float32)).sum(0)
 
 
 def _with_lattice(
-    lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], marched: Callable[[], Array], plan: CastPlan
+    lattice: Lattice, grid: Grid, item: Worklist, at: tuple[Array, Array], marched: list[Callable[[], Array]], plan: CastPlan
 ) -> Array:
-    """Sums of items, which are all of one kind: `marched`, or from the lattice at their level."""
+    """Sums of items, which are all of one kind: `marched` at all rays or at some, or from the lattice at their level."""
     slab, bundle = at
-    inside = item.interpolated
-    assert inside is not None
     row, column, _ = (side[bundle] * lattice.region.spacing.across for side in lattice.region.place(grid))
     found = functools.partial(interpolate, lattice, slab, (row, column), plan.slab_samples)
 
@@ -126,8 +130,8 @@ def _with_lattice(
         return found(level).reshape(-1, plan.slab_samples, BUNDLE, BUNDLE)
 
     # a dummy reads some nodes and drops them
-    kind = jnp.where(inside & (slab < grid.cells.count.shape[0]), 1 + item.level, 0).max()
-    return lax.switch(kind, [marched, *(functools.partial(at_level, level) for level in range(WIDEST + 1))])
+    kind = jnp.where(slab < grid.cells.count.shape[0], kind_of(item), 0).max()
+    return lax.switch(kind, [*marched, *(functools.partial(at_level, level) for level in range(WIDEST + 1))])
 
 
 def gather_field(

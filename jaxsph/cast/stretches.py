@@ -23,7 +23,7 @@ from jaxsph.control.worklist import COARSEST, Worklist
 from jaxsph.numerics.checks import require_sizes
 
 BLOCK = 16  # particles unrolled in the inner loop
-KINDS = WIDEST + 2  # of slabs, by how their sums are found: from particles, or from the lattice at one of its levels
+KINDS = WIDEST + 3  # of slabs, see `kind_of`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,10 +111,10 @@ class Stretches:
         return Stretch(items, marched, held_at, first, number, (end + self.plan.chunk - 1) // self.plan.chunk)
 
     def _kind(self, items: Int[Array, " held"]) -> Int[Array, " held"] | None:
-        """How the sums of items are found: 0 from particles, else 1 + level from the lattice; None where there is none."""
+        """Of what kind items are; None where all are marched at all rays."""
         if self.work.interpolated is None:
             return None
-        return jnp.where(self.work.interpolated.ravel()[items], 1 + self.work.level.ravel()[items], 0)
+        return kind_of(self.work).ravel()[items]
 
     def _places(self, kind: Int[Array, " held"] | None, real: Bool[Array, " held"], number: Array) -> tuple[Array, Array]:
         """Where the slabs are marched, kind after kind, each from the beginning of a chunk on; and where that ends."""
@@ -171,15 +171,19 @@ def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Ar
     return jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
 
 
+def kind_of(work: Worklist) -> Int[Array, "*any"]:
+    """How the sums of items are found: from particles at all rays (0), at some (1), or from the lattice (2 + level)."""
+    assert work.interpolated is not None
+    assert work.sparse is not None
+    return jnp.where(work.interpolated, 2 + work.level, work.sparse.astype(jnp.int32))
+
+
 def _by_fullness(count: Int[Array, " held"], kind: Int[Array, " held"] | None, real: Bool[Array, " held"]) -> Int[Array, " held"]:
     """Slabs in order of kind if any, then of how many blocks of particles they have; those that are not `real` last."""
+    each = jnp.iinfo(jnp.uint32).bits - (count.shape[0] - 1).bit_length() - KINDS.bit_length()
+    most = (1 << each) - 1
+    rank = (most - jnp.minimum((count + BLOCK - 1) // BLOCK, most)).astype(jnp.uint32)
+    of_kind = jnp.where(real, 0 if kind is None else kind, KINDS).astype(jnp.uint32)
     bits = (count.shape[0] - 1).bit_length()
-    most = (1 << (31 - bits)) - 1 - KINDS
-    rank = most - jnp.minimum((count + BLOCK - 1) // BLOCK, most)
-    if kind is not None:
-        rank = jnp.where(kind > 0, most + kind, rank)
-    key = jnp.where(real, rank, most + KINDS).astype(jnp.uint32) << bits
-    key = lax.sort(key | lax.iota(jnp.uint32, count.shape[0]))
+    key = lax.sort((of_kind << (each + bits)) | (rank << bits) | lax.iota(jnp.uint32, count.shape[0]))
     return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
-
-

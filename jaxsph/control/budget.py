@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-HALVINGS = 16  # of the range of prices in octaves
+HALVINGS = 10  # of the range of prices in octaves
 
 
 def cheapest(

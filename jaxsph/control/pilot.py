@@ -15,13 +15,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import FINEST, Lattice, Spacing
+from jaxsph.access.lists import BUNDLE
 from jaxsph.control.budget import cheapest
 from jaxsph.control.residuals import Residuals
 from jaxsph.control.spacing import spaced
-from jaxsph.control.worklist import Worklist, full_rate
+from jaxsph.control.worklist import SPARSE, Worklist, full_rate
 from jaxsph.model.camera import Camera
 
-DEVIATIONS = 5.25  # standard deviations that pixels are taken to stay within
+DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
 WORTHWHILE = 0.25  # least share of a band's work that the lattice must resolve: sampling it costs up to a tenth
 
@@ -60,13 +61,19 @@ def pilot(
     count = grid.cells.count
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
-    taken, total = cheapest(found.variance, jnp.maximum(count, 1).astype(budget.dtype), allowed, budget)
+    # first to march fewer rays, then none: what the second step gains is dearer, so that it is never taken without the first
+    steps = jnp.concatenate([found.sparse * found.variance, (1 - found.sparse) * found.variance])
+    gain, rays = jnp.maximum(count, 1).astype(budget.dtype), len(SPARSE) ** 2 / BUNDLE**2
+    chosen, total = cheapest(steps, jnp.concatenate([(1 - rays) * gain, rays * gain]), jnp.tile(allowed, (2, 1)), budget)
+    fewer, taken = chosen[: count.shape[0]], chosen[count.shape[0] :]
     level, more = spaced(taken, found.bend, budget - total, lattice.region.spacing.samples)
-    estimate = jnp.where(taken.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
+    estimate = jnp.where(chosen.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
     work = full_rate(grid.cells, jnp.where(taken, lattice.origin, origin))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0
     empty = {"length": jnp.where(taken, 0, work.length), "count": jnp.where(taken, 0, work.count)}
-    return dataclasses.replace(work, **empty, filled=work.filled & begins, level=level, interpolated=taken), estimate
+    return dataclasses.replace(
+        work, **empty, filled=work.filled & begins, level=level, interpolated=taken, sparse=fewer & ~taken
+    ), estimate
 
 
 def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:

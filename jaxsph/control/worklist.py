@@ -19,6 +19,7 @@ from jaxsph.access.cells import Cells, position
 
 COARSEST = 4  # level at which a cell has one sample
 CELL = 1 << COARSEST  # fine samples of a cell along depth: D_z of the first paper
+SPARSE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that a sparse slab is marched at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Worklist:
         origin: quantity that the item's sums are taken relative to, that of a particle near by: so that their rounding is a
             share of how much quantities differ, and a constant is rendered as that constant.
         interpolated: items whose sums are those of the lattice, with `count` 0; None where there is none.
+        sparse: items that are marched at `SPARSE` rays, between which their sums are interpolated; None without a lattice.
         paint: red, green, blue and extinction of super-pixels, where `painted`; None where there can be none.
     """
 
@@ -45,6 +47,7 @@ class Worklist:
     painted: Bool[Array, "slabs bundles"] | None = None
     paint: Float[Array, "4 slabs bundles"] | None = None
     interpolated: Bool[Array, "slabs bundles"] | None = None
+    sparse: Bool[Array, "slabs bundles"] | None = None
 
 
 def full_rate(cells: Cells, origin: Float[Array, "slabs bundles"]) -> Worklist:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsph.cast.stretches import BLOCK, CastPlan, stretches_of
+from jaxsph.cast.stretches import BLOCK, KINDS, CastPlan, kind_of, stretches_of
 from jaxsph.control.worklist import COARSEST, Worklist
 
 SLABS, BUNDLES, PLAN = 11, 13, CastPlan(chunk=8, slab_samples=4, held=24)
@@ -28,38 +28,49 @@ def stretches(work, samples=SLABS * 4 - 1):
     return stretches_of(grid, work, PLAN)
 
 
+def chunks_of(found, stretch):
+    """Items of the chunks of a stretch, without dummies."""
+    chunks = []
+    for nth in range(int(stretch.chunks)):
+        items, begin = found.chunk(stretch, jnp.int32(nth))
+        assert int(begin) == nth * PLAN.chunk
+        chunks.append(np.asarray(items)[np.asarray(items) < SLABS * BUNDLES])
+        assert chunks[-1].size, "no chunk is marched for nothing"
+    return chunks
+
+
 def test_every_filled_slab_is_in_one_chunk():
     work = work_of(np.random.default_rng(0))
     found, seen = stretches(work), []
     for nth in range(int(found.number)):
         stretch = found.stretch(jnp.int32(nth))
-        of_stretch = []
-        for chunk in range(int(stretch.chunks)):
-            items, begin = found.chunk(stretch, jnp.int32(chunk))
-            assert int(begin) == chunk * PLAN.chunk
-            of_stretch += items.tolist()
-        number = int(stretch.number)
-        of_stretch = of_stretch[:number]
-        assert [int(stretch.fullest[k]) for k in stretch.held_at[: int(stretch.number)]] == stretch.items[
-            : int(stretch.number)
-        ].tolist()
-        blocks = [-(-int(work.count.ravel()[item]) // BLOCK) for item in of_stretch]
-        assert blocks == sorted(blocks, reverse=True)
-        seen += of_stretch
+        number, of_stretch = int(stretch.number), np.concatenate(chunks_of(found, stretch))
+        np.testing.assert_array_equal(stretch.marched[stretch.held_at[:number]], stretch.items[:number])
+        blocks = -(-np.asarray(work.count).ravel()[of_stretch] // BLOCK)
+        assert (np.diff(blocks) <= 0).all()
+        seen += of_stretch.tolist()
     assert sorted(seen) == np.flatnonzero(np.asarray(work.filled)).tolist()
 
 
-def test_slabs_from_the_lattice_go_by_level():
-    work = work_of(np.random.default_rng(2))
-    level = jnp.asarray(np.random.default_rng(3).integers(0, 3, work.count.shape), jnp.int32)
-    count = jnp.where(level > 0, 0, work.count)
-    found = stretches(dataclasses.replace(work, count=count, level=level, interpolated=count == 0))
+def test_chunks_hold_slabs_of_one_kind():
+    rng = np.random.default_rng(2)
+    work = work_of(rng)
+    kind = rng.integers(0, KINDS, work.count.shape)
+    interpolated = jnp.asarray(kind > 1)
+    level, count = jnp.asarray(np.maximum(kind - 2, 0), jnp.int32), jnp.where(interpolated, 0, work.count)
+    sparse = jnp.asarray(kind == 1)
+    found = stretches(dataclasses.replace(work, count=count, level=level, interpolated=interpolated, sparse=sparse))
+    np.testing.assert_array_equal(kind_of(found.work), kind)
+    seen = []
     for nth in range(int(found.number)):
         stretch = found.stretch(jnp.int32(nth))
-        items = np.asarray(stretch.fullest)[: int(stretch.number)]
-        blocks, levels = -(-np.asarray(count).ravel()[items] // BLOCK), np.asarray(level).ravel()[items]
-        assert (np.diff(blocks) <= 0).all()
-        assert (np.diff(levels[blocks == 0]) >= 0).all()
+        number = int(stretch.number)
+        np.testing.assert_array_equal(stretch.marched[stretch.held_at[:number]], stretch.items[:number])
+        for items in chunks_of(found, stretch):
+            assert len(set(kind.ravel()[items])) == 1
+            assert (np.diff(-(-np.asarray(count).ravel()[items] // BLOCK)) <= 0).all()
+            seen += items.tolist()
+    assert sorted(seen) == np.flatnonzero(np.asarray(work.filled)).tolist()
 
 
 @pytest.mark.parametrize("level", range(COARSEST + 1))

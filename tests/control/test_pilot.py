@@ -6,11 +6,15 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.access.lattice import FINEST, Spacing
+from jaxsph.control.pilot import DEVIATIONS, pilot
+from jaxsph.control.residuals import residuals
+from jaxsph.stages import sum_part
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
 FULL = js.Settings(samples=128)
@@ -125,6 +129,26 @@ def test_a_jump_of_the_transfer_function_is_kept_sharp():
     truth, image = draw(scene, camera)
     assert image.stats["evaluations"] < truth.stats["evaluations"]
     assert error_of(image, truth).max() <= PILOT.tolerance
+
+
+def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_allows(stages):
+    scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
+    plan = js.plan(scene, camera, PILOT)
+    grid, origin = stages(scene.particles, camera, plan=plan)
+    lattice = sum_part(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
+    found = residuals(grid, lattice, camera, scene.transfer, plan.cast.slab_samples)
+    choose = functools.partial(pilot, grid, lattice, found, camera, origin, slab_samples=plan.cast.slab_samples)
+    variance, before = np.asarray(found.variance), 0
+    for tolerance in (0.001, 0.01, 0.1):
+        work, estimate = choose(tolerance=jnp.float32(tolerance))
+        taken, sparse = np.asarray(work.interpolated), np.asarray(work.sparse)
+        assert taken.any() and sparse.any() and not (taken & sparse).any()
+        np.testing.assert_array_equal(work.count, np.where(taken, 0, grid.cells.count))
+        spent = np.where(taken, variance, np.where(sparse, np.asarray(found.sparse) * variance, 0)).sum(0)
+        assert (DEVIATIONS * np.sqrt(spent) <= np.asarray(estimate) * (1 + 1e-5)).all()
+        assert (np.asarray(estimate) <= np.float32(tolerance)).all()
+        assert taken.sum() > before
+        before = taken.sum()
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -12,7 +12,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.access.lattice import FINEST, GAP, Spacing, region_of
-from jaxsph.control.residuals import residuals
+from jaxsph.control.residuals import LEFT, residuals
 from jaxsph.stages import sum_part
 
 
@@ -33,6 +33,8 @@ def test_some_slabs_with_particles_can_be_interpolated(band):
     usable = np.isfinite(found.variance)
     assert (usable & filled).sum() > 0.1 * filled.sum()
     assert (np.asarray(found.variance)[usable] > 0).all() and (np.asarray(found.bend) >= 0).all()
+    share = np.asarray(found.sparse)[usable]
+    assert (share > 0).all() and (share <= np.float32(LEFT)).all() and share.min() < share.max()
 
 
 def test_rougher_sums_are_judged_worse(band):
