@@ -1,9 +1,10 @@
-r"""The pilot estimator: which slabs are interpolated from the lattice, and how widely their samples are spaced.
+r"""The pilot estimator: which slabs are interpolated, from the lattice or between some of their rays, and how widely they sample.
 
 Flow: lattice -> residuals -> [pilot] -> worklist -> cast -> image.
 
 Errors are treated as noise whose variances add up along a bundle, and `DEVIATIONS` standard deviations are the estimate: not a
-bound. The budget goes to interpolation first (`residuals`); what that leaves is spent on wider spaced samples (`spacing`).
+bound. The budget goes to interpolation first (`residuals`): wherever it is taken, the price of an evaluation saved is the same.
+What that leaves is spent on wider spaced samples (`spacing`).
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ def pilot(
 ) -> tuple[Worklist, Float[Array, " bundles"]]:
     """Choose the slabs that are interpolated: as many evaluations saved as the tolerance allows.
 
-    Slabs whose stencils leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice
-    are marched at full rate.
+    A slab is interpolated from the lattice, marched at `SPARSE` of its rays, or marched at all. At all are those whose stencils
+    leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice.
 
     Returns:
         The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is
@@ -61,7 +62,7 @@ def pilot(
     count = grid.cells.count
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
-    # first to march fewer rays, then none: what the second step gains is dearer, so that it is never taken without the first
+    # a slab is first marched at fewer rays, then at none: the second step is always the dearer, so never taken without the first
     steps = jnp.concatenate([found.sparse * found.variance, (1 - found.sparse) * found.variance])
     gain, rays = jnp.maximum(count, 1).astype(budget.dtype), len(SPARSE) ** 2 / BUNDLE**2
     chosen, total = cheapest(steps, jnp.concatenate([(1 - rays) * gain, rays * gain]), jnp.tile(allowed, (2, 1)), budget)
