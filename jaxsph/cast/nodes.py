@@ -21,13 +21,14 @@ from jaxsph.access.lattice import GAP, REACH, Lattice, Region, Spacing, between,
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.stacks import fullest_first
 from jaxsph.control.merge import coarser_windows
+from jaxsph.control.worklist import CELL
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.staging import computed_once
 
 CHUNK = 256  # cells at once
 BLOCK = 8  # particles unrolled in the inner loop
-NODES = 8  # in depth and across, times the nodes down, share a window: deeper ones hold particles that miss most of their nodes
+NODES = 8  # at most, in depth and across, times those down, share a window: deeper ones hold particles that miss most of theirs
 
 
 def sum_at_nodes(
@@ -48,7 +49,7 @@ def sum_at_nodes(
     """
     spacing, (row, column, has_nodes) = region.spacing, region.place(grid)
     across = spacing.across
-    layers = max(NODES // across, slab_samples // spacing.samples)
+    layers = max(min(NODES // across, CELL // spacing.samples), slab_samples // spacing.samples)
     depth = layers * spacing.samples
     cells = -(-grid.cells.count.shape[0] * slab_samples // depth)
     windows = coarser_windows(grid.cells, slab_samples)[(depth // slab_samples).bit_length() - 1]

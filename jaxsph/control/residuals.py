@@ -68,7 +68,7 @@ def residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFu
 
     def nothing() -> Residuals:
         shape, dtype = grid.cells.count.shape, lattice.weight.dtype
-        return Residuals(jnp.full(shape, jnp.inf, dtype), jnp.ones(shape, dtype), jnp.zeros(shape, dtype))
+        return Residuals(jnp.full(shape, jnp.inf, dtype), jnp.full(shape, LEFT, dtype), jnp.zeros(shape, dtype))
 
     found = functools.partial(_residuals, grid, lattice, camera, transfer, slab_samples)
     return lax.cond((lattice.evaluations > 0).any(), found, nothing)
@@ -138,7 +138,7 @@ def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferF
 
     def skip(state: tuple[Array, ...], _: Array) -> tuple[tuple[Array, ...], tuple[Array, Array, Array]]:
         nothing = jnp.zeros((rows, columns), path.dtype)
-        return (state[0], *(jnp.zeros_like(value) for value in state[1:])), (nothing, nothing, nothing)
+        return (state[0], *(jnp.zeros_like(value) for value in state[1:])), (nothing, nothing + LEFT, nothing)
 
     filled = jnp.append((grid.cells.count > 0).any(1), False)
     judged = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
