@@ -22,6 +22,7 @@ from jaxsph.numerics.staging import computed_once
 
 RAYS = BUNDLE * BUNDLE  # of a bundle, in one row: short rows do not vectorise
 TOGETHER = 256  # bundles of a layer that are composited together
+FEW = 32  # bundles among them whose depths of half transmittance are found together
 Light = tuple[Array, ...]  # of slabs: red, green, blue, transmittance (slabs, 64); optical thickness (slabs, samples, 64)
 State = tuple[Array, ...]  # of rays: red, green, blue, transmittance, and depth where that is one half (bundles, 64)
 
@@ -106,8 +107,24 @@ def _put(rays: State, light: Light, at: Array, border: Array) -> State:
     *emission, left = (field[at] for field in light[:-1])
     behind = transmittance * left
     crossed = (transmittance > 0.5) & (behind <= 0.5)
-    depth = lax.cond(crossed.any(), _half_depth, lambda depth, *_: depth, depth, crossed, transmittance, light[-1], at, border)
+    depth = _with_half_depth(depth, crossed, transmittance, light[-1], at, border)
     return *(color + transmittance * added for color, added in zip(colors, emission, strict=True)), behind, depth
+
+
+def _with_half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
+    """`depth` of rays, found for a few bundles at a time of those where any ray has crossed one half: others cost nothing."""
+    each = jnp.arange(TOGETHER, dtype=jnp.int32)
+    some = crossed.any(1)
+    bundles = lax.sort(jnp.where(some, each, TOGETHER))
+
+    def settle(nth: Array, depth: Array) -> Array:
+        bundle = lax.dynamic_slice_in_dim(bundles, nth * FEW, FEW)
+        here = jnp.minimum(bundle, TOGETHER - 1)
+        rays = [value[here] for value in (depth, crossed, transmittance)]
+        found = computed_once(nth >= 0, _half_depth, *rays, thickness, at[here], border[here])
+        return depth.at[bundle].set(found, mode="drop")
+
+    return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + FEW - 1) // FEW, settle, depth)
 
 
 def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
