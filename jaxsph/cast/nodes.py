@@ -122,10 +122,10 @@ def sums_at(
         parts = computed_once(block >= 0, separate, *particles) if several else ()
         weight, weighted = sums.real, sums.imag
         for k in range(BLOCK):
-            one = [column[k] for column in particles]
+            *_, size, quantity = one = [column[k] for column in particles]
             across, along = (part[k] for part in parts) if several else separate(*one)
-            w = smooth.weigh(along[:, :, None], across[:, None], one[4], jnp)
-            weight, weighted = weight + w, weighted + w * one[5]
+            w = smooth.weigh(along[:, :, None], across[:, None], size, jnp)
+            weight, weighted = weight + w, weighted + w * quantity
         return lax.complex(weight, weighted)
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)

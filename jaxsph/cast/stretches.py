@@ -103,9 +103,9 @@ class Stretches:
         items = lax.dynamic_slice(self.order, (first,), (self.plan.held,))
         dummy = self.work.count.size
         inside, real = jnp.minimum(items, dummy - 1), items < dummy
-        order = _by_fullness(self.work.count.ravel()[inside], self._kind(inside), real)
-        number = real.sum(dtype=jnp.int32)
-        place, end = self._places(self._kind(inside), real, number)
+        kind, number = self._kind(inside), real.sum(dtype=jnp.int32)
+        order = _by_fullness(self.work.count.ravel()[inside], kind, real)
+        place, end = self._places(kind, real, number)
         held_at = jnp.zeros(self.plan.held, jnp.int32).at[order].set(place)
         marched = jnp.full(self.places, dummy, jnp.int32).at[place].set(items[order])
         return Stretch(items, marched, held_at, first, number, (end + self.plan.chunk - 1) // self.plan.chunk)
@@ -180,10 +180,10 @@ def kind_of(work: Worklist) -> Int[Array, "*any"]:
 
 def _by_fullness(count: Int[Array, " held"], kind: Int[Array, " held"] | None, real: Bool[Array, " held"]) -> Int[Array, " held"]:
     """Slabs in order of kind if any, then of how many blocks of particles they have; those that are not `real` last."""
-    each = jnp.iinfo(jnp.uint32).bits - (count.shape[0] - 1).bit_length() - KINDS.bit_length()
-    most = (1 << each) - 1
-    rank = (most - jnp.minimum((count + BLOCK - 1) // BLOCK, most)).astype(jnp.uint32)
-    of_kind = jnp.where(real, 0 if kind is None else kind, KINDS).astype(jnp.uint32)
     bits = (count.shape[0] - 1).bit_length()
-    key = lax.sort((of_kind << (each + bits)) | (rank << bits) | lax.iota(jnp.uint32, count.shape[0]))
+    bits_of_rank = 32 - bits - KINDS.bit_length()
+    most = (1 << bits_of_rank) - 1
+    rank = (most - jnp.minimum((count + BLOCK - 1) // BLOCK, most)).astype(jnp.uint32)
+    first = jnp.where(real, 0 if kind is None else kind, KINDS).astype(jnp.uint32)
+    key = lax.sort((first << (bits_of_rank + bits)) | (rank << bits) | lax.iota(jnp.uint32, count.shape[0]))
     return (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)

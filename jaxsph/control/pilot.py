@@ -72,9 +72,8 @@ def pilot(
     work = full_rate(grid.cells, jnp.where(taken, lattice.origin, origin))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0
     empty = {"length": jnp.where(taken, 0, work.length), "count": jnp.where(taken, 0, work.count)}
-    return dataclasses.replace(
-        work, **empty, filled=work.filled & begins, level=level, interpolated=taken, sparse=fewer & ~taken
-    ), estimate
+    kinds = {"interpolated": taken, "sparse": fewer & ~taken}
+    return dataclasses.replace(work, **empty, **kinds, filled=work.filled & begins, level=level), estimate
 
 
 def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
