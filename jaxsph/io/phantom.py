@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError
-from .table import ParticleTable
+from .table import ParticleTable, scalar_of_width_one
 
 SOURCE = "Phantom HDF5"
 GAS = 1
@@ -32,11 +32,13 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
         if name not in holder:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
-    position, h = group["xyz"][()], group["h"][()].astype(np.float64)
+    position, h = group["xyz"][()], scalar_of_width_one(group["h"][()]).astype(np.float64)
     count = len(position)
     if len(h) != count:
         raise DataError(f"has {count} positions but {len(h)} smoothing lengths; dump it again")
-    kind = np.abs(group["itype"][()].astype(np.int64)) if "itype" in group else np.full(count, GAS)
+    kind = np.full(count, GAS)
+    if "itype" in group:
+        kind = np.abs(scalar_of_width_one(group["itype"][()]).astype(np.int64))
     said, alive = [], h > 0
     if not alive.all():
         said.append(f"dropped {int((~alive).sum())} dead or accreted particles (h <= 0)")

@@ -95,17 +95,20 @@ def table_from_columns(
 ) -> ParticleTable:
     """A table of a general-purpose format, where the meaning of a column is only in its name.
 
-    `support` or `support_radius` is the support radius and `volume` the volume. A smoothing length (`h`, ...) is kept
-    as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that wrote it.
+    `support` or `support_radius` is the support radius and `volume` the volume, (N,) or (N, 1). A smoothing length (`h`,
+    ...) is kept as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that
+    wrote it.
     """
     said = list(conventions)
-    rest = dict(columns)
+    rest = {name: scalar_of_width_one(np.asarray(column)) for name, column in columns.items()}
     special: dict[str, np.ndarray] = {}
     for role, names in (("support", SUPPORT_NAMES), ("volume", VOLUME_NAMES)):
         stored = next((name for name in rest if plain(name) in map(plain, names)), None)
-        if stored is not None and np.ndim(rest[stored]) == 1:
+        if stored is not None and rest[stored].ndim == 1:
             special[role] = rest.pop(stored)
             said.append(f"{role} = column `{stored}`")
+        elif stored is not None and rest[stored].ndim == 2:
+            said.append(f"column `{stored}` has {rest[stored].shape[1]} components and is not used as the {role}")
     smoothing = next((name for name in rest if plain(name) in map(plain, SMOOTHING_NAMES)), None)
     if smoothing is not None and "support" not in special:
         said.append(
@@ -120,10 +123,13 @@ def native(array: np.ndarray) -> np.ndarray:
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
+def scalar_of_width_one(column: np.ndarray) -> np.ndarray:
+    """(N,) for (N, 1), as VTK and many codes store scalars; any other shape as it is."""
+    return column[:, 0] if column.ndim == 2 and column.shape[1] == 1 else column
+
+
 def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:
-    column = native(np.asarray(column))
-    if column.ndim == 2 and column.shape[1] == 1:
-        column = column[:, 0]
+    column = scalar_of_width_one(native(np.asarray(column)))
     if column.ndim not in (1, 2) or len(column) != count:
         raise DataError(
             f"column `{name}` has shape {column.shape}, but there are {count} particles; "
