@@ -29,23 +29,30 @@ def read(path: Path) -> ParticleTable:
         content = path.read_bytes()
         encoding, count, record, start = _header(content)
         if encoding == "ascii":
-            rows = content[start:].split(b"\n")[:count]
-            if len(rows) < count or (count and not rows[-1].strip()):
-                raise DataError(f"is cut short: {count} vertices are announced, fewer are there; copy it again")
-            names = record.names or ()
-            values = np.loadtxt([row.decode("ascii") for row in rows], ndmin=2) if count else np.zeros((0, len(names)))
-            if values.shape[1] != len(names):
-                raise DataError(f"has {values.shape[1]} numbers a vertex, but {len(names)} properties are announced")
-            fields = {name: values[:, i].astype(record[name]) for i, name in enumerate(names)}
+            points = _ascii_points(content[start:], count, record)
         else:
-            available = (len(content) - start) // record.itemsize
-            if available < count:
-                raise DataError(f"is cut short: {count} vertices are announced, {available} are there; copy it again")
+            _refuse_missing(count, (len(content) - start) // record.itemsize)
             points = np.frombuffer(content, record, count, start)
-            fields = {name: np.ascontiguousarray(points[name]) for name in record.names or ()}
-        position, columns = gather_vectors(fields)
+        position, columns = gather_vectors({name: np.ascontiguousarray(points[name]) for name in record.names or ()})
         said = [UNENDED_NOTE] if encoding == "ascii" and not content.endswith(b"\n") else []
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _ascii_points(content: bytes, count: int, record: np.dtype) -> np.ndarray:
+    """The first `count` lines that are not blank, each number read as its own type: an id has more digits than float64."""
+    rows = [row for row in content.split(b"\n") if row.strip()][:count]
+    _refuse_missing(count, len(rows))
+    if not rows:
+        return np.zeros(0, record)
+    width, num_properties = len(rows[0].split()), len(record.names or ())
+    if width != num_properties:
+        raise DataError(f"has {width} numbers a vertex, but {num_properties} properties are announced; write it again")
+    return np.loadtxt([row.decode("ascii") for row in rows], dtype=record, ndmin=1, comments=None)
+
+
+def _refuse_missing(count: int, available: int) -> None:
+    if available < count:
+        raise DataError(f"is cut short: {count} vertices are announced, {available} are there; copy it again")
 
 
 def _header(content: bytes) -> tuple[str, int, np.dtype, int]:
@@ -67,6 +74,8 @@ def _header(content: bytes) -> tuple[str, int, np.dtype, int]:
     properties = [words[1:] for words in lines[elements[0] : stop] if words[:1] == ["property"]]
     if any(words[0] not in TYPES for words in properties):
         raise DataError("has vertex properties that are lists or of unknown type; save the vertices without them")
+    if not properties:
+        raise DataError("has vertices without properties, so there are no positions; write it again with x, y and z")
     order = BYTE_ORDERS[formats[0]]
     record = np.dtype([(name, order + TYPES[kind]) for kind, name in properties])
     count = int(lines[elements[0]][2])

@@ -2,7 +2,7 @@
 
 Names come from a first line of words, or from a `#` comment right above the numbers; without names the first three
 columns are x, y, z. An XYZ file begins with the number of particles and a comment, and each line with the name of an
-element; extended XYZ names its columns in the comment (`Properties=species:S:1:pos:R:3:...`).
+element or its number; extended XYZ names its columns in the comment (`Properties=species:S:1:pos:R:3:...`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from .vectors import gather_vectors
 
 SOURCE = "text table"
 DELIMITERS = (",", ";", "\t")
+MAX_COLUMNS = 2**16
+"""Columns that a comment of a few bytes may ask for."""
+ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
 
 
 def read(path: Path) -> ParticleTable:
@@ -40,6 +43,9 @@ def read(path: Path) -> ParticleTable:
         if not rows and not ended:
             raise DataError("is cut short: its first line has no end; copy it again")
         said = [] if ended else [UNENDED_NOTE]
+        if names is None and _is_counted(lines) and _elements_are_numbers(rows):
+            said.append(ELEMENT_NOTE)
+            names = ["element", "x", "y", "z", *(f"column{index}" for index in range(5, len(rows[0].split()) + 1))]
         fields, left_out = _fields(rows, names, delimiter)
         if left_out:
             said.append(f"left out {', '.join(left_out)}: not numbers")
@@ -49,7 +55,7 @@ def read(path: Path) -> ParticleTable:
 
 def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
     """Column names if there are any, the rows of data, and the delimiter (`None` for spaces)."""
-    if lines[0].strip().isdigit():
+    if _is_counted(lines):
         count, comment = int(lines[0]), "".join(lines[1:2])
         rows = [line for line in lines[2:] if line.strip()]
         if len(rows) != count:
@@ -72,6 +78,21 @@ def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
     named = _split(above, delimiter if delimiter and delimiter in above else None)
     fits = len(named) == len(first) and not any(map(_is_number, named))
     return (named if fits else None), data, delimiter
+
+
+def _is_counted(lines: list[str]) -> bool:
+    """Whether the first line is a number of particles, as in XYZ files."""
+    return lines[0].strip().isdecimal()
+
+
+def _elements_are_numbers(rows: list[str]) -> bool:
+    """Whether rows of four or more numbers begin with a whole one, written as such: XYZ has the element there."""
+    return bool(rows) and all(_is_number(word) for word in rows[0].split()) and all(map(_begins_with_element, rows))
+
+
+def _begins_with_element(row: str) -> bool:
+    first, *rest = row.split(maxsplit=4)
+    return first.isdecimal() and len(rest) >= 3
 
 
 def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -104,9 +125,14 @@ def _extended_names(comment: str) -> list[str] | None:
     if match is None:
         return None
     parts = match[1].split(":")
+    if len(parts) % 3 or not all(width.isdecimal() for width in parts[2::3]):
+        raise DataError(f"has `{match[0][:80]}`, which is not a sequence of name:type:width; write its comment again")
+    widths = [int(width) for width in parts[2::3]]
+    if sum(widths) > MAX_COLUMNS:
+        raise DataError(f"names {sum(widths)} columns in its comment, at most {MAX_COLUMNS} are read; write it again")
     names = []
-    for name, _, width in zip(parts[0::3], parts[1::3], parts[2::3], strict=True):
-        suffixes = [""] if width == "1" else [f"_{c}" for c in ("xyz" if width == "3" else map(str, range(int(width))))]
+    for name, width in zip(parts[0::3], widths, strict=True):
+        suffixes = [""] if width == 1 else [f"_{c}" for c in ("xyz" if width == 3 else map(str, range(width)))]
         names += [name + suffix for suffix in suffixes]
     return names
 

@@ -16,12 +16,16 @@ POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coor
 def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Positions (N, 3) and the other columns, with `a_x, a_y, a_z` or `a:0, a:1, a:2` joined to the vector `a`.
 
-    Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names.
+    Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`.
 
     Raises:
-        ValueError: no `x y z`, nor another triple that is named as a position.
+        ValueError: no `x y z`, nor another triple that is named as a position; names that differ in their unit only.
     """
-    columns = {_without_unit(name): values for name, values in fields.items()}
+    columns: dict[str, np.ndarray] = {}
+    for name, values in fields.items():
+        if _without_unit(name) in columns:
+            raise DataError(f"has the column `{_without_unit(name)}` twice, but for its unit; give them two names")
+        columns[_without_unit(name)] = values
     positions: dict[str, np.ndarray] = {}
     for name in list(columns):
         for first, second, third in TRIPLES:
@@ -33,7 +37,7 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
                 if label.lower() in POSITION_BASES:
                     positions[label.lower()] = vector
                 else:
-                    columns[label] = vector
+                    columns[f"{label}_xyz" if label in columns else label] = vector
                 break
     for base in POSITION_BASES:
         if base in positions:

@@ -22,7 +22,9 @@ points = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.5]])
         ("windows.csv", "\ufeffX,Y,Z,a\r\n1,2,3,7\r\n4,5,6.5,8\r\n"),
         ("words.csv", "kind,x,y,z,a\nwater,1,2,3,7\nwater,4,5,6.5,8\n"),
         ("element.xyz", "2\nhello\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
-        ("bare.xyz", "2\nhello there\n1 2 3 7\n4 5 6.5 8\n"),
+        ("bare.xyz", "2\nhello there\n1.0 2 3 7\n4 5 6.5 8\n"),
+        ("number.xyz", "2\nhello\n18 1 2 3 7\n6 4 5 6.5 8\n"),
+        ("extended_number.xyz", "2\nProperties=Z:I:1:pos:R:3:a:R:1\n18 1 2 3 7\n6 4 5 6.5 8\n"),
         ("blank.xyz", "2\n\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
         ("extended.xyz", "2\nProperties=species:S:1:pos:R:3:a:R:1\nAr 1 2 3 7\nAr 4 5 6.5 8\n"),
     ],
@@ -31,7 +33,7 @@ def test_points_and_a_scalar_are_found_in(name, content, tmp_path):
     (tmp_path / name).write_text(content, encoding="utf-8", newline="")
     table = io.read_table(tmp_path / name)
     np.testing.assert_array_equal(table.position, points)
-    np.testing.assert_array_equal(table.columns[table.scalars[0]], [7, 8])
+    np.testing.assert_array_equal(table.columns[table.scalars[-1]], [7, 8])
 
 
 def test_columns_of_words_are_left_out_and_said_so(tmp_path):
@@ -71,3 +73,46 @@ def test_bad_tables_are_refused_with_the_reason(content, reason, tmp_path):
     with pytest.raises(ValueError, match=reason) as caught:
         io.read_table(tmp_path / "a.csv")
     assert "a.csv" in str(caught.value)
+
+
+def test_atomic_numbers_in_xyz_are_no_coordinates_and_said_so(tmp_path):
+    (tmp_path / "a.xyz").write_text("2\n\n18 1 2 3\n6 4 5 6\n")
+    table = io.read_table(tmp_path / "a.xyz")
+    np.testing.assert_array_equal(table.position, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(table.columns["element"], [18, 6])
+    assert any("whole numbers in the first column are taken for elements" in said for said in table.conventions)
+    (tmp_path / "a.xyz").write_text("2\n\n1 2 3\n4 5 6\n")  # three columns can only be coordinates
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.xyz").position, [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        ("1\nProperties=pos:R:3:a:R:10000000000", "1 2 3 4"),
+        ("0\nProperties=pos:R:3:a:R:10000000000", ""),
+        ("10000000000\n", "Ar 1 2 3"),
+    ],
+)
+def test_an_xyz_header_is_given_no_more_than_the_file_holds(header, rows, tmp_path):
+    (tmp_path / "a.xyz").write_text(f"{header}\n{rows}\n")
+    with pytest.raises(ValueError, match=r"a\.xyz: (announces|names) 10000000\d+ "):
+        io.read_table(tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize("properties", ["pos:R", "pos:R:three", "pos:R:3:a"])
+def test_xyz_properties_that_are_no_triples_are_refused(properties, tmp_path):
+    (tmp_path / "a.xyz").write_text(f"1\nProperties={properties}\n1 2 3\n")
+    with pytest.raises(ValueError, match=r"a\.xyz: has `Properties=.*name:type:width"):
+        io.read_table(tmp_path / "a.xyz")
+
+
+def test_two_columns_that_differ_in_their_unit_only_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("x [m],y [m],z [m],a [kg],a [g]\n1,2,3,4,4000\n")
+    with pytest.raises(ValueError, match=r"a\.csv: has the column `a` twice"):
+        io.read_table(tmp_path / "a.csv")
+
+
+def test_a_vector_does_not_take_the_place_of_a_scalar_of_its_name(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,B,B_x,B_y,B_z\n1,2,3,13,3,4,12\n")
+    columns = io.read_table(tmp_path / "a.csv").columns
+    assert columns["B"].tolist() == [13] and columns["B_xyz"].tolist() == [[3, 4, 12]]
