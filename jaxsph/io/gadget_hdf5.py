@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError
+from .datasets import read_dataset, read_positions
 from .table import ParticleTable, plain
 
 SOURCE = "Gadget HDF5"
@@ -46,7 +47,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
     chosen, group = _choose(file, part_type)
-    position = group["Coordinates"][()]
+    position = read_positions(group["Coordinates"])
     count = len(position)
     said = [f"particles of PartType{chosen}"]
     swift = _is_swift(file)
@@ -59,7 +60,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         elif dataset.shape[0] != count:
             raise DataError(f"PartType{chosen}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
         else:
-            columns[name] = dataset[()]
+            columns[name] = read_dataset(dataset)
     if dropped:
         said.append(f"left out {', '.join(dropped)}: not numbers")
     header = file["Header"].attrs if "Header" in file else {}
@@ -68,7 +69,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         if mass:
             columns["Masses"] = np.full(count, mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
-    files = int(np.ravel(header.get("NumFilesPerSnapshot", 1))[0])
+    files = _num_files(header)
     if files > 1:
         said.append(f"this is one of {files} files of the snapshot; only its particles are read")
     smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
@@ -111,6 +112,12 @@ def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[
         )
     gamma = SWIFT_GAMMA[kernel]
     return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {kernel} kernel)"
+
+
+def _num_files(header: Any) -> int:
+    """How many files a snapshot has; one where the header does not say, or holds no number."""
+    stored = np.ravel(np.asarray(header.get("NumFilesPerSnapshot", 1)))
+    return int(stored[0]) if len(stored) and stored.dtype.kind in "iuf" and np.isfinite(stored[0]) else 1
 
 
 def _table_mass(header: Any, chosen: int) -> float:

@@ -10,12 +10,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from . import gadget_hdf5, phantom
 from .damage import DataError, explained
+from .datasets import numeric_datasets, read_positions
 from .optional import require
 from .table import ParticleTable, plain, table_from_columns
 
@@ -44,17 +42,5 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             )
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
-        position = file[stored][()]
+        position = read_positions(file[stored])
         return table_from_columns(position, numeric_datasets(file, len(position), skip=(stored,)), source=SOURCE)
-
-
-def numeric_datasets(group: Any, count: int, skip: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
-    """The datasets of `group` with `count` rows of one or more numbers."""
-    return {
-        name: dataset[()]
-        for name, dataset in group.items()
-        if name not in skip
-        and getattr(dataset, "ndim", 0) in (1, 2)
-        and dataset.shape[0] == count
-        and dataset.dtype.kind in "fiub"
-    }

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError
+from .datasets import numeric_datasets, read_dataset, read_positions
 from .table import ParticleTable, scalar_of_width_one
 
 SOURCE = "Phantom HDF5"
@@ -32,13 +33,14 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
         if name not in holder:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
-    position, h = group["xyz"][()], scalar_of_width_one(group["h"][()]).astype(np.float64)
+    position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
     count = len(position)
     if len(h) != count:
         raise DataError(f"has {count} positions but {len(h)} smoothing lengths; dump it again")
     kind = np.full(count, GAS)
     if "itype" in group:
-        kind = np.abs(scalar_of_width_one(group["itype"][()]).astype(np.int64))
+        kind = np.abs(scalar_of_width_one(read_dataset(group["itype"])).astype(np.int64))
+    _refuse_nan(h)
     said, alive = [], h > 0
     if not alive.all():
         said.append(f"dropped {int((~alive).sum())} dead or accreted particles (h <= 0)")
@@ -51,15 +53,13 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     others = int((alive & ~keep).sum())
     if others:
         said.append(f"particles of itype {part_type}; left out {others} of other types")
-    masses = np.ravel(header["massoftype"][()])
+    masses = np.ravel(read_dataset(header["massoftype"]))
     if not 1 <= part_type <= len(masses):
         raise DataError(f"has no mass for particles of type {part_type}; there are {len(masses)} types")
-    hfact, mass = float(header["hfact"][()]), float(masses[part_type - 1])
-    columns = {
-        name: dataset[()][keep]
-        for name, dataset in group.items()
-        if name != "xyz" and dataset.ndim in (1, 2) and len(dataset) == count and dataset.dtype.kind in "fiub"
-    }
+    hfact, mass = float(read_dataset(header["hfact"])), float(masses[part_type - 1])
+    if not 0 < hfact < np.inf:
+        raise DataError(f"has `hfact` {hfact:g} in its header, which must be positive: volumes follow from it; dump it again")
+    columns = {name: column[keep] for name, column in numeric_datasets(group, count, skip=("xyz",)).items()}
     h = h[keep]
     columns |= {"mass": np.full(len(h), mass), "density": mass * (hfact / h) ** 3}
     said += [
@@ -69,3 +69,13 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
     return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, (h / hfact) ** 3, source=SOURCE, conventions=tuple(said))
+
+
+def _refuse_nan(h: np.ndarray) -> None:
+    """Only `h <= 0` marks the dead; what is no number was damaged, or written so by a run that failed."""
+    unknown = np.isnan(h)
+    if unknown.any():
+        raise DataError(
+            f"smoothing lengths `h` must be numbers, but {int(unknown.sum())} of {len(h)} are NaN, the first at index "
+            f"{int(np.argmax(unknown))}; remove these particles, or dump it again"
+        )

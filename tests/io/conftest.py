@@ -1,7 +1,9 @@
 """Small files of every format, written from scratch: readers are tested against the format, not against themselves."""
 
+import contextlib
 import gzip
 import struct
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -205,3 +207,20 @@ def samples():
     """What makes small files: `samples.particles()`, `samples.writers[name](path, particles)`, `write_...`."""
     writers = {name: value for name, value in globals().items() if name.startswith("write_")}
     return SimpleNamespace(particles=make_particles, writers=WRITERS, **writers)
+
+
+@pytest.fixture(scope="session")
+def measured():
+    """`with measured() as memory:`, and then `memory.peak` in bytes, of Python and NumPy."""
+
+    @contextlib.contextmanager
+    def measure():
+        memory = SimpleNamespace(peak=0)
+        tracemalloc.start()
+        try:
+            yield memory
+        finally:
+            memory.peak = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+
+    return measure

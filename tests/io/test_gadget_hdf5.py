@@ -90,3 +90,12 @@ def test_an_hdf5_file_of_no_known_flavour_is_answered_with_what_it_holds(tmp_pat
         file["spectrum"] = np.zeros(4)
     with pytest.raises(ValueError, match=r"a\.h5: is HDF5 with spectrum at its top"):
         io.read_table(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("value", [h5py.Empty("i4"), np.zeros(0, np.int32), "many", np.nan])
+def test_a_snapshot_that_does_not_say_of_how_many_files_it_is_one_is_read(value, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["Header"].attrs["NumFilesPerSnapshot"] = value
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert len(table) == 7 and not any("files of the snapshot" in sentence for sentence in table.conventions)

@@ -46,3 +46,26 @@ def test_a_dump_without_hfact_is_refused(samples, tmp_path):
         del file["header/hfact"]
     with pytest.raises(ValueError, match=r"a\.h5: has no `hfact`"):
         io.read_table(tmp_path / "a.h5")
+
+
+def test_a_smoothing_length_that_is_no_number_is_not_taken_for_dead(samples, tmp_path):
+    h = np.array([0.5, -1, 0.5, np.nan, 0.5, np.nan, 0.5])
+    samples.write_phantom(tmp_path / "a.h5", samples.particles(), h=h)
+    with pytest.raises(ValueError, match=r"a\.h5: smoothing lengths .*2 of 7 are NaN, the first at index 3"):
+        io.read_table(tmp_path / "a.h5")
+
+
+def test_groups_among_the_data_sets_are_passed_over(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["particles"].create_group("derived")["speed"] = np.ones(7)
+    table = io.read_table(tmp_path / "a.h5")
+    assert len(table) == 7 and "derived" not in table.columns
+
+
+def test_a_dump_whose_hfact_is_not_positive_is_refused(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["header/hfact"][()] = 0
+    with pytest.raises(ValueError, match=r"a\.h5: has `hfact` 0"):
+        io.read_table(tmp_path / "a.h5")
