@@ -7,19 +7,22 @@ Source: VTK File Formats, Kitware, "Simple Legacy Formats".
 
 from __future__ import annotations
 
+from collections.abc import Set
 from pathlib import Path
 
 import numpy as np
 
 from .damage import UNENDED_NOTE, DataError, explained
 from .table import ParticleTable, table_from_columns
+from .tokens import numbers
 
 SOURCE = "legacy VTK"
 TYPES = {
     "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4",
-    "unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtktypeint64": "i8", "vtkidtype": "i8",
+    "unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtktypeint64": "i8", "vtkidtype": "i4",
     "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
 }  # fmt: skip
+"""`vtkIdType` has 8 bytes in memory, but VTK's legacy writer and reader (vtkDataWriter, vtkDataReader) store it as int."""
 DATASETS = ("POLYDATA", "UNSTRUCTURED_GRID")
 CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS")
 WIDTHS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9}
@@ -64,7 +67,7 @@ class _Cursor:
         if count < 0 or count > len(self.content):
             raise DataError(f"announces {count} numbers of {what}, more than it has room for: it is cut short or damaged")
         if self.is_ascii:
-            return np.array(self._tokens(count, what)).astype(dtype.newbyteorder("="))
+            return numbers(self._tokens(count, what), dtype)
         stop = self.at + count * dtype.itemsize
         if stop > len(self.content):
             raise DataError(f"is cut short: {what} need {stop - self.at} bytes, {len(self.content) - self.at} are left")
@@ -97,6 +100,8 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             if rest[0].upper() not in DATASETS:
                 raise DataError(f"holds a {rest[0]}; only {' and '.join(DATASETS)} are particles")
         elif word == "POINTS":
+            if position is not None:
+                raise DataError("has POINTS twice, so its data cannot be told apart; write one set of particles a file")
             position = cursor.array(rest[1], 3 * int(rest[0]), "points").reshape(-1, 3)
         elif word in CELLS:
             _skip_cells(cursor, word, int(rest[0]), int(rest[1]))
@@ -111,6 +116,7 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         else:
             found = _attributes(cursor, word, rest, count)
             if in_points:
+                _refuse_twice(columns.keys() & found.keys())
                 columns.update(found)
     if position is None:
         raise DataError("holds no POINTS; it is cut short, or not a particle file")
@@ -120,7 +126,7 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict[str, np.ndarray]:
     """The arrays of one attribute section of a point or cell data block."""
     if word == "FIELD":
-        found = {}
+        found: dict[str, np.ndarray] = {}
         for _ in range(int(rest[1])):
             line = cursor.line()
             if line == "METADATA":
@@ -128,6 +134,7 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict
                 line = cursor.line()
             name, *shape, kind = line.split()
             columns, rows = map(int, shape)
+            _refuse_twice(found.keys() & {name})
             found[name] = cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns)
         return found
     if word == "SCALARS":
@@ -148,6 +155,11 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict
         cursor.array(rest[2], int(rest[1]) * count, "texture coordinates")
         return {}
     raise DataError(f"has a section {word[:40]!r} which is not known; it is damaged, or not a particle file")
+
+
+def _refuse_twice(names: Set[str]) -> None:
+    for name in names:
+        raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; write it once")
 
 
 def _skip_cells(cursor: _Cursor, word: str, first: int, second: int) -> None:

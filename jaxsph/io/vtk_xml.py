@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import base64
 import itertools
-import lzma
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,6 +16,8 @@ import numpy as np
 
 from .damage import DataError, explained
 from .table import ParticleTable, table_from_columns
+from .tokens import numbers
+from .unpack import DEFLATE_RATIO, LZMA_RATIO, Decompressor, inflating, unlzma, unpack_blocks
 
 SOURCE = "VTK XML"
 DATASETS = ("UnstructuredGrid", "PolyData")
@@ -26,11 +25,12 @@ TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-COMPRESSORS: dict[str | None, Callable[[bytes], bytes] | None] = {
-    None: None,
-    "vtkZLibDataCompressor": zlib.decompress,
-    "vtkLZMADataCompressor": lzma.decompress,
+COMPRESSORS: dict[str | None, tuple[Decompressor | None, int]] = {
+    None: (None, 4),  # a number of eight bytes is a digit and a space, where it is text
+    "vtkZLibDataCompressor": (inflating, DEFLATE_RATIO),
+    "vtkLZMADataCompressor": (unlzma, LZMA_RATIO),
 }
+"""How data is unpacked, and the most bytes that one byte of the file can hold."""
 
 
 def read(path: Path) -> ParticleTable:
@@ -46,7 +46,7 @@ def read(path: Path) -> ParticleTable:
         kind = root.get("type", "unknown")
         if root.tag != "VTKFile" or kind not in DATASETS:
             raise DataError(f"is XML of type {kind}; save it as {' or '.join(DATASETS)} (.vtu, .vtp)")
-        decoder = _Decoder(root, tail)
+        decoder = _Decoder(root, tail, len(content))
         pieces = [_piece(piece, decoder) for piece in root.iter("Piece")]
         if not pieces:
             raise DataError("has no Piece, so it is cut short or damaged; copy it again")
@@ -75,24 +75,29 @@ def _piece(piece: ElementTree.Element, decoder: _Decoder) -> tuple[np.ndarray, d
         raise DataError("has points that are not three numbers each; write it again")
     columns = {}
     for array in piece.iterfind("PointData/DataArray"):
+        name = array.get("Name", "unnamed")
         values = decoder.array(array, count, 1)
+        if name in columns:
+            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
         if values is not None:
-            columns[array.get("Name", "unnamed")] = values
+            columns[name] = values
     return position, columns
 
 
 class _Decoder:
     """What all data arrays of a file share: byte order, compression, and the appended data."""
 
-    def __init__(self, root: ElementTree.Element, tail: bytes) -> None:
+    def __init__(self, root: ElementTree.Element, tail: bytes, file_bytes: int) -> None:
         order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
         self.order = order
         self.length = np.dtype(order + TYPES[root.get("header_type", "UInt32")])
         compressor = root.get("compressor") or None
         if compressor not in COMPRESSORS:
             raise DataError(f"is compressed by {compressor}, which is not supported; save it with zlib")
-        self.decompress = COMPRESSORS[compressor]
-        tag, _, self.appended = tail.partition(b"_")
+        self.decompressor, ratio = COMPRESSORS[compressor]
+        self.file_bytes, self.room = file_bytes, ratio * file_bytes
+        tag, _, appended = tail.partition(b"_")
+        self.appended = memoryview(appended)
         self.appended_is_text = b"base64" in tag
         self.words: list[str] = []
 
@@ -104,7 +109,11 @@ class _Decoder:
             return None
         width = int(element.get("NumberOfComponents") or default_width)
         dtype = np.dtype(self.order + TYPES[kind])
-        values = self._values(element, dtype) if count else np.zeros(0, dtype)
+        need = count * max(width, 0) * dtype.itemsize
+        self.room -= need
+        if self.room < 0:
+            raise DataError(f"announces more data than its {self.file_bytes} bytes can hold, so it is damaged; write it again")
+        values = self._values(element, dtype, need, name) if count else np.zeros(0, dtype)
         if width < 1 or len(values) != count * width:
             raise DataError(
                 f"has {len(values)} numbers of `{name}`, but {count} points of {width} components each; "
@@ -112,30 +121,34 @@ class _Decoder:
             )
         return values.reshape(count, width)
 
-    def _values(self, element: ElementTree.Element, dtype: np.dtype) -> np.ndarray:
+    def _values(self, element: ElementTree.Element, dtype: np.dtype, need: int, name: str) -> np.ndarray:
         encoding, text = element.get("format", "ascii"), element.text or ""
         if encoding == "ascii":
-            return np.array(text.split()).astype(dtype)
+            return numbers(text.split(), dtype)
         if encoding == "binary":
-            return np.frombuffer(self._decode("".join(text.split()).encode("ascii"), True), dtype)
+            stored = memoryview("".join(text.split()).encode("ascii"))
+            return np.frombuffer(self._decode(stored, True, need, name), dtype)
         if encoding == "appended":
             offset = int(element.get("offset", "0"))
-            return np.frombuffer(self._decode(self.appended[offset:], self.appended_is_text), dtype)
+            if offset < 0:
+                raise DataError(f"has `{name}` at the offset {offset} of its appended data; it is damaged: copy it again")
+            return np.frombuffer(self._decode(self.appended[offset:], self.appended_is_text, need, name), dtype)
         raise DataError(f"has data of format {encoding!r}; known are ascii, binary and appended")
 
-    def _decode(self, data: bytes, is_text: bool) -> bytes:
+    def _decode(self, data: memoryview, is_text: bool, need: int, name: str) -> bytes | memoryview:
         """The bytes of one array: a header of lengths, then the data, in blocks if compressed."""
         size = self.length.itemsize
         first = int(np.frombuffer(_take(data, 0, size, is_text), self.length)[0])
-        if self.decompress is None:
-            if is_text and b"=" in data[: _span(size, True)]:  # padding inside: the header was encoded alone
+        if self.decompressor is None:
+            if is_text and b"=" in bytes(data[: _span(size, True)]):  # padding inside: the header was encoded alone
                 return _take(data, _span(size, True), first, True)
             return _take(data, 0, size + first, is_text)[size:]
         header_size = (3 + first) * size
         sizes = np.frombuffer(_take(data, 0, header_size, is_text), self.length)[3:].tolist()
         packed = _take(data, _span(header_size, is_text), sum(sizes), is_text)
-        ends = np.cumsum([0, *sizes]).tolist()
-        return b"".join(self.decompress(packed[a:b]) for a, b in itertools.pairwise(ends))
+        ends = itertools.accumulate(sizes, initial=0)
+        blocks = (packed[a:b] for a, b in itertools.pairwise(ends))
+        return unpack_blocks(blocks, self.decompressor, need, f"`{name}`")
 
 
 def _span(size: int, is_text: bool) -> int:
@@ -143,7 +156,7 @@ def _span(size: int, is_text: bool) -> int:
     return 4 * -(-size // 3) if is_text else size
 
 
-def _take(data: bytes, start: int, size: int, is_text: bool) -> bytes:
+def _take(data: memoryview, start: int, size: int, is_text: bool) -> bytes | memoryview:
     """`size` bytes of data that begin at `start` in the file."""
     stored = data[start : start + _span(size, is_text)]
     if len(stored) < _span(size, is_text):

@@ -49,3 +49,36 @@ def test_a_count_that_the_file_has_no_room_for_is_refused_before_memory_is_asked
     (tmp_path / "a.vtk").write_text("# vtk DataFile Version 3.0\nt\nBINARY\nDATASET POLYDATA\nPOINTS 99999999999 float\n")
     with pytest.raises(ValueError, match="cut short"):
         io.read_table(tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize("section", ["SCALARS id vtkIdType 1\nLOOKUP_TABLE default\n", "FIELD FieldData 1\nid 1 2 vtkIdType\n"])
+def test_vtk_writes_its_ids_as_int(section, tmp_path):
+    head = "# vtk DataFile Version 3.0\nt\n{}\nDATASET POLYDATA\nPOINTS 2 float\n{}\nPOINT_DATA 2\n" + section
+    points, ids = np.array([[1, 2, 3], [4, 5, 6]]), np.array([7, -8])
+    binary = head.encode().replace(b"{}", b"BINARY", 1).replace(b"{}", points.astype(">f4").tobytes())
+    for content in (binary + ids.astype(">i4").tobytes() + b"\n", head.format("ASCII", "1 2 3 4 5 6").encode() + b"7 -8\n"):
+        (tmp_path / "a.vtk").write_bytes(content)
+        table = io.read_table(tmp_path / "a.vtk")
+        np.testing.assert_array_equal(table.position, points)
+        np.testing.assert_array_equal(table.columns["id"], ids)
+
+
+@pytest.mark.parametrize(("old", "new"), [(b"density 1", b"velocity 1"), (b"density 1", b"id 1"), (b"VERTICES", b"POINTS")])
+def test_what_is_there_twice_is_refused(old, new, samples, tmp_path):
+    samples.write_vtk(tmp_path / "a.vtk", samples.particles(), binary=False)
+    content = (tmp_path / "a.vtk").read_bytes().replace(old, new)
+    if new == b"POINTS":
+        content = content.replace(b"POINTS 7 14", b"POINTS 4 float\n0 0 0 0 0 0 0 0 0 0 0 0\nVERTICES 7 14")
+    (tmp_path / "a.vtk").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.vtk: has .* twice"):
+        io.read_table(tmp_path / "a.vtk")
+
+
+def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
+    numbers = ["1"] * 2999 + ["2." + "0" * 50_000]
+    (tmp_path / "a.vtk").write_text(
+        f"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\nPOINTS 1000 float\n{' '.join(numbers)}\n"
+    )
+    with measured() as memory:
+        table = io.read_table(tmp_path / "a.vtk")
+    assert table.position[-1, -1] == 2 and memory.peak < 2**24

@@ -1,6 +1,8 @@
 import base64
 import itertools
+import lzma
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -107,3 +109,72 @@ def test_pieces_are_joined(tmp_path):
     </Points></Piece>"""
     (tmp_path / "a.vtp").write_text(f'<VTKFile type="PolyData"><PolyData>{piece * 3}</PolyData></VTKFile>')
     np.testing.assert_array_equal(io.read_table(tmp_path / "a.vtp").position, [[1, 2, 3]] * 3)
+
+
+def write_compressed(path, blocks, compressor="vtkZLibDataCompressor", points=2):
+    """One array of points in compressed blocks."""
+    compress = {"vtkZLibDataCompressor": zlib.compress, "vtkLZMADataCompressor": lzma.compress}[compressor]
+    packed = [compress(block) for block in blocks]
+    head = struct.pack(f"<{3 + len(packed)}I", len(packed), len(blocks[0]), len(blocks[-1]), *map(len, packed))
+    body = (base64.b64encode(head) + base64.b64encode(b"".join(packed))).decode()
+    path.write_text(
+        f"""<VTKFile type="PolyData" byte_order="LittleEndian" compressor="{compressor}"><PolyData>
+        <Piece NumberOfPoints="{points}"><Points><DataArray type="Float32" NumberOfComponents="3" format="binary">{body}
+        </DataArray></Points></Piece></PolyData></VTKFile>"""
+    )
+
+
+@pytest.mark.parametrize("compressor", ["vtkZLibDataCompressor", "vtkLZMADataCompressor"])
+def test_compressed_data_is_unpacked_to_what_the_points_need_and_no_further(compressor, tmp_path, measured):
+    content = POINTS.astype("<f4").tobytes()
+    write_compressed(tmp_path / "a.vtp", [content[:16], content[16:]], compressor)
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.vtp").position, POINTS)
+    write_compressed(tmp_path / "a.vtp", [content, bytes(2**25)], compressor)
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.vtp: .*more than the 24 bytes that `points` need"):
+        io.read_table(tmp_path / "a.vtp")
+    assert memory.peak < 2**24
+
+
+def test_a_compressed_block_that_does_not_end_is_refused(tmp_path):
+    write_compressed(tmp_path / "a.vtp", [POINTS.astype("<f4").tobytes()])
+    text = (tmp_path / "a.vtp").read_text()
+    packed = zlib.compress(POINTS.astype("<f4").tobytes())
+    cut = packed[:-4]  # the check sum is missing
+    body = base64.b64encode(struct.pack("<4I", 1, 24, 24, len(cut))) + base64.b64encode(cut)
+    start, stop = text.index('format="binary">') + 16, text.index("\n        </DataArray>")
+    (tmp_path / "a.vtp").write_text(text[:start] + body.decode() + text[stop:])
+    with pytest.raises(ValueError, match=r"a\.vtp: is cut short inside `points`"):
+        io.read_table(tmp_path / "a.vtp")
+
+
+def test_many_arrays_over_the_same_data_take_no_more_memory_than_the_file_can_hold(tmp_path, measured):
+    count = 100_000
+    array = '<DataArray type="Float32" Name="{}" NumberOfComponents="{}" format="appended" offset="0"/>'
+    arrays = "".join(array.format(index, 3) for index in range(1000))
+    content = f"""<VTKFile type="PolyData" byte_order="LittleEndian"><PolyData><Piece NumberOfPoints="{count}"><Points>
+    {array.format("p", 3)}</Points><PointData>{arrays}</PointData></Piece></PolyData><AppendedData encoding="raw">_""".encode()
+    content += struct.pack("<I", 12 * count) + bytes(12 * count) + b"</AppendedData></VTKFile>"
+    (tmp_path / "a.vtu").write_bytes(content)
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.vtu: .*more data than"):
+        io.read_table(tmp_path / "a.vtu")
+    assert memory.peak < 16 * len(content)
+
+
+def test_an_array_that_is_there_twice_is_refused_by_name(tmp_path):
+    write_by_hand(tmp_path / "a.vtu")
+    text = (tmp_path / "a.vtu").read_text()
+    array = text[text.index('<DataArray type="Float64"') : text.index("</PointData>")]
+    (tmp_path / "a.vtu").write_text(text.replace(array, array + array))
+    with pytest.raises(ValueError, match=r"a\.vtu: has the array `a` twice"):
+        io.read_table(tmp_path / "a.vtu")
+
+
+def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
+    numbers = " ".join(["1"] * 2999 + ["2." + "0" * 50_000])
+    (tmp_path / "a.vtp").write_text(
+        f"""<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="1000"><Points><DataArray type="Float32"
+        NumberOfComponents="3">{numbers}</DataArray></Points></Piece></PolyData></VTKFile>"""
+    )
+    with measured() as memory:
+        table = io.read_table(tmp_path / "a.vtp")
+    assert table.position[-1, -1] == 2 and memory.peak < 2**24
