@@ -11,14 +11,18 @@ from __future__ import annotations
 import gzip
 import struct
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 
 from .damage import DataError, explained
 from .table import ParticleTable, table_from_columns
+from .unpack import read_to_end, read_up_to
 
 SOURCE = "Houdini bgeo"
 GZIP_MAGIC = b"\x1f\x8b"
+MAX_HEADER_BYTES = 2**24
+"""More than names and strings of any header: what is unpacked before the number of points is known."""
 FLOAT, INTEGER, STRING, MIXED, INDEX, VECTOR = range(6)
 SMALLEST_NORMAL = np.finfo(np.float32).smallest_normal
 
@@ -29,20 +33,26 @@ def read(path: Path) -> ParticleTable:
     Raises:
         ValueError: damaged or of another version; positions that are integers written over floats.
     """
-    with explained(path, SOURCE):
-        content = path.read_bytes()
-        if content[:2] == GZIP_MAGIC:
-            content = gzip.decompress(content)
-        count, layout, start = _header(content)
+    with explained(path, SOURCE), _opened(path) as stream:
+        begin = bytes(read_up_to(stream, MAX_HEADER_BYTES))
+        count, layout, start = _header(begin)
         record = np.dtype(layout)
-        available = (len(content) - start) // record.itemsize
+        content = read_up_to(stream, count * record.itemsize, begin[start : start + count * record.itemsize])
+        available = len(content) // record.itemsize
         if available < count:
             raise DataError(f"is cut short: {count} points are announced, {available} are there; copy it again")
-        points = np.frombuffer(content, dtype=record, count=count, offset=start)
+        read_to_end(stream)
+        points = np.frombuffer(content, dtype=record, count=count)
         columns = {name: np.ascontiguousarray(points[name]) for name, *_ in layout[1:]}
         position = np.ascontiguousarray(points["\0position"][:, :3])
         _refuse_overwritten(position, columns)
         return table_from_columns(position.astype(np.float32), columns, source=SOURCE)
+
+
+def _opened(path: Path) -> BinaryIO:
+    with path.open("rb") as file:
+        zipped = file.read(2) == GZIP_MAGIC
+    return cast(BinaryIO, gzip.open(path)) if zipped else path.open("rb")
 
 
 def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]], int]:
@@ -58,27 +68,33 @@ def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]]
     if count < 0 or not 0 <= num_attributes < 2**15:
         raise DataError(f"announces {count} points with {num_attributes} attributes, so its header is damaged")
     at = 5 + 9 * 4
-    layout: list[tuple[str, str, tuple[int, ...]]] = [("\0position", ">f4", (4,))]  # a name no attribute can have
+    layout: dict[str, tuple[str, int]] = {"\0position": (">f4", 4)}  # a name no attribute can have
     for _ in range(num_attributes):
         (length,) = struct.unpack_from(">H", content, at)
         name = content[at + 2 : at + 2 + length].decode("utf-8")
         width, kind = struct.unpack_from(">Hi", content, at + 2 + length)
-        at += 8 + length
-        if kind in (FLOAT, INTEGER, VECTOR):
-            at += 4 * width
-        elif kind == INDEX:
-            (num_strings,) = struct.unpack_from(">i", content, at)
-            at += 4
-            for _ in range(num_strings):
-                at += 2 + struct.unpack_from(">H", content, at)[0]
-        else:
-            raise DataError(f"has attribute `{name}` of type {kind}, which is not supported; save it without")
-        if name in (known for known, *_ in layout):
+        at = _skip_defaults(content, at + 8 + length, name, width, kind)
+        if name in layout:
             raise DataError(f"has the attribute `{name}` twice, so its data cannot be told apart; export it once")
-        if width == 0:
-            raise DataError(f"has attribute `{name}` of width 0, so its header is damaged; export it again")
-        layout.append((name, ">f4" if kind in (FLOAT, VECTOR) else ">i4", (width,)))
-    return count, layout, at
+        if width == 0 or not name:
+            raise DataError(f"has attribute `{name}` of width {width}, so its header is damaged; export it again")
+        layout[name] = ">f4" if kind in (FLOAT, VECTOR) else ">i4", width
+    return count, [(name, kind, (width,)) for name, (kind, width) in layout.items()], at
+
+
+def _skip_defaults(content: bytes, at: int, name: str, width: int, kind: int) -> int:
+    """Where the next attribute begins: past the defaults, or past the strings that indices are for."""
+    if kind in (FLOAT, INTEGER, VECTOR):
+        return at + 4 * width
+    if kind != INDEX:
+        raise DataError(f"has attribute `{name}` of type {kind}, which is not supported; save it without")
+    (num_strings,) = struct.unpack_from(">i", content, at)
+    at += 4
+    if not 0 <= num_strings <= (len(content) - at) // 2:  # a string takes two bytes for its length
+        raise DataError(f"has attribute `{name}` with {num_strings} strings, for which its header has no room; export it again")
+    for _ in range(num_strings):
+        at += 2 + struct.unpack_from(">H", content, at)[0]
+    return at
 
 
 def _refuse_overwritten(position: np.ndarray, columns: dict[str, np.ndarray]) -> None:

@@ -25,6 +25,8 @@ HEADER = [
     ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
     ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
 ]  # fmt: skip
+MAX_RECORDS = 512
+"""More than any code writes; a tail of zeros reads as empty records, one every eight bytes."""
 GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
 COLUMN_NAMES = {
     "VEL": "velocity", "ID": "id", "MASS": "mass", "U": "internal_energy", "RHO": "density", "POT": "potential",
@@ -83,8 +85,11 @@ def _byte_order(content: np.ndarray) -> Order:
 
 
 def _records(content: np.ndarray, order: Order) -> list[np.ndarray]:
-    records, at = [], 0
+    records: list[np.ndarray] = []
+    at = 0
     while at < len(content):
+        if len(records) == MAX_RECORDS:
+            raise DataError(f"has more than {MAX_RECORDS} records (at byte {at}), so it is damaged or was not written to its end")
         length = int(content[at : at + 4].view(f"{order}u4")[0]) if at + 4 <= len(content) else 0
         stop = at + 4 + length
         if stop + 4 > len(content):
@@ -103,6 +108,9 @@ def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
         names = [record[:4].tobytes().decode("ascii", errors="replace").strip() for record in records[0::2]]
         if any(len(record) != 8 for record in records[0::2]) or len(records) % 2:
             raise DataError("is damaged: its block names (format 2) are not where they must be; copy it again")
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise DataError(f"has the block `{twice}` twice, so its data cannot be told apart; write each block once")
         blocks = dict(zip(names, records[1::2], strict=True))
     else:
         header = _header(records[0], order)

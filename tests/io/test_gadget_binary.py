@@ -51,3 +51,20 @@ def test_a_block_that_fits_no_number_of_particles_is_refused(samples, tmp_path):
     (tmp_path / "a.gadget").write_bytes(content)
     with pytest.raises(ValueError, match="which fits no number of its particles"):
         io.read_table(tmp_path / "a.gadget")
+
+
+def test_two_blocks_of_one_name_are_refused(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
+    content = (tmp_path / "a.gadget").read_bytes()
+    (tmp_path / "a.gadget").write_bytes(content.replace(b"VEL ", b"POS "))
+    with pytest.raises(ValueError, match=r"a\.gadget: has the block `POS` twice"):
+        io.read_table(tmp_path / "a.gadget")
+
+
+@pytest.mark.parametrize("form", [1, 2])
+def test_a_tail_of_zeros_is_not_read_as_a_million_empty_blocks(form, samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), form=form)
+    with (tmp_path / "a.gadget").open("ab") as file:
+        file.write(bytes(2**22))
+    with pytest.raises(ValueError, match=r"a\.gadget: has more than 512 records .*at byte"):
+        io.read_table(tmp_path / "a.gadget")
