@@ -11,7 +11,7 @@ from __future__ import annotations
 import gzip
 import struct
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import IO, cast
 
 import numpy as np
 
@@ -49,10 +49,10 @@ def read(path: Path) -> ParticleTable:
         return table_from_columns(position.astype(np.float32), columns, source=SOURCE)
 
 
-def _opened(path: Path) -> BinaryIO:
+def _opened(path: Path) -> IO[bytes]:
     with path.open("rb") as file:
         zipped = file.read(2) == GZIP_MAGIC
-    return cast(BinaryIO, gzip.open(path)) if zipped else path.open("rb")
+    return cast(IO[bytes], gzip.open(path)) if zipped else path.open("rb")
 
 
 def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]], int]:

@@ -22,13 +22,16 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
     """Re-raise every failure inside the block as a `ValueError` that begins with `path`.
 
     A `DataError` keeps its own words. What a library raises on bytes it did not expect (`struct.error`, `KeyError`,
-    `OSError` of HDF5, ...) is quoted after the name of the format. Files that are missing or may not be opened,
-    libraries that are missing, and memory that runs out say so themselves and pass through.
+    `OSError` of HDF5, ...) is quoted after the name of the format. Memory that runs out stays a `MemoryError`, with the
+    name of the file. Files that are missing or may not be opened, and libraries that are missing, say so themselves and
+    pass through.
     """
     try:
         yield
-    except (FileNotFoundError, PermissionError, ImportError, MemoryError):
+    except (FileNotFoundError, PermissionError, ImportError):
         raise
+    except MemoryError as error:
+        raise MemoryError(f"{path}: needs more memory than there is ({error})") from error
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
     except Exception as error:

@@ -17,6 +17,9 @@ SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
 
+MAX_COMPONENTS = 2**16
+"""Numbers of one column a particle: beyond, the names of its components alone would fill the memory."""
+
 
 def plain(name: str) -> str:
     """`name` in lower case with letters and digits only, so that `Points:0` and `points_0` compare equal."""
@@ -134,6 +137,10 @@ def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:
         raise DataError(
             f"column `{name}` has shape {column.shape}, but there are {count} particles; "
             f"a column must be (N,) or (N, k): leave it out, or write the file again"
+        )
+    if column.ndim == 2 and not 1 <= column.shape[1] <= MAX_COMPONENTS:
+        raise DataError(
+            f"column `{name}` has shape {column.shape}, but must have 1 to {MAX_COMPONENTS} numbers a particle; leave it out"
         )
     if column.dtype.kind not in "fiub":
         raise DataError(f"column `{name}` must hold numbers, got dtype {column.dtype}; leave it out")

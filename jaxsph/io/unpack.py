@@ -8,7 +8,7 @@ from __future__ import annotations
 import lzma
 import zlib
 from collections.abc import Callable, Iterable
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from .damage import DataError
 
@@ -52,7 +52,7 @@ def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompress
     return b"".join(parts)
 
 
-def read_up_to(stream: BinaryIO, size: int, begin: bytes = b"") -> bytearray:
+def read_up_to(stream: IO[bytes], size: int, begin: bytes = b"") -> bytearray:
     """`begin` and what follows it, `size` bytes or all there are: memory is taken as bytes come, not as announced."""
     content = bytearray(begin)
     while len(content) < size and (part := stream.read(min(size - len(content), CHUNK_BYTES))):
@@ -60,7 +60,7 @@ def read_up_to(stream: BinaryIO, size: int, begin: bytes = b"") -> bytearray:
     return content
 
 
-def read_to_end(stream: BinaryIO) -> None:
+def read_to_end(stream: IO[bytes]) -> None:
     """Read the rest and forget it: only at its end does a gzip stream compare its check sum."""
     while stream.read(CHUNK_BYTES):
         pass

@@ -1,3 +1,7 @@
+import io as memory_io
+import struct
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -34,3 +38,86 @@ def test_positions_that_are_not_finite_are_refused_with_the_files_name(tmp_path)
     np.savez(tmp_path / "a.npz", position=np.full((2, 3), np.nan))
     with pytest.raises(ValueError, match=r"a\.npz: positions must be finite"):
         io.read_table(tmp_path / "a.npz")
+
+
+def npy(array, shape=None):
+    """`array` as an `.npy` file that may announce another shape."""
+    buffer = memory_io.BytesIO()
+    if shape is None:
+        np.save(buffer, array)
+    else:
+        description = {"descr": array.dtype.str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(buffer, description)
+        buffer.write(array.tobytes())
+    return buffer.getvalue()
+
+
+def write_entries(path, entries, method=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, content in entries:
+            archive.writestr(name, content)
+
+
+@pytest.mark.parametrize("shape", [(10**10, 3), (2**62, 3), (-1, 3), (3, 3)])
+def test_a_shape_that_the_bytes_cannot_hold_is_refused_before_memory_is_asked_for(shape, tmp_path, measured):
+    write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((4, 3)), shape))])
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.npz: `position` .*but its entry holds 96"):
+        io.read_table(tmp_path / "a.npz")
+    assert memory.peak < 2**22
+
+
+def test_rows_of_no_numbers_are_refused_before_other_columns_are_made_for_them(tmp_path, measured):
+    position = npy(np.zeros((0, 0)), (10**12, 0))
+    write_entries(tmp_path / "a.npz", [("position.npy", position), ("mass.npy", npy(np.float64(1)))])
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.npz: positions must have shape \(N, 3\)"):
+        io.read_table(tmp_path / "a.npz")
+    assert memory.peak < 2**22
+
+
+def test_only_what_belongs_to_particles_is_unpacked(tmp_path, measured):
+    np.savez_compressed(tmp_path / "a.npz", position=np.ones((4, 3)), mass=np.ones(4), image=np.zeros((2**12, 2**12)))
+    with measured() as memory:
+        table = io.read_table(tmp_path / "a.npz")
+    assert set(table.columns) == {"mass"} and memory.peak < 2**22
+
+
+def test_an_entry_that_unpacks_to_more_than_its_directory_says_is_not_unpacked_further(tmp_path, measured):
+    header, body = npy(np.zeros((4, 3))), bytes(2**26)
+    write_entries(tmp_path / "a.npz", [("position.npy", header + body)])
+    content = (tmp_path / "a.npz").read_bytes()
+    (tmp_path / "a.npz").write_bytes(content.replace(struct.pack("<I", len(header + body)), struct.pack("<I", len(header))))
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.npz: .*CRC"):
+        io.read_table(tmp_path / "a.npz")
+    assert memory.peak < 2**22
+
+
+def test_an_entry_that_says_it_shrank_more_than_deflate_can_is_refused(tmp_path):
+    write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((4, 3)), (10**6, 3)))])
+    content, size = (tmp_path / "a.npz").read_bytes(), len(npy(np.zeros((4, 3))))
+    claimed = struct.pack("<I", 24 * 10**6 + 128)
+    (tmp_path / "a.npz").write_bytes(content.replace(struct.pack("<I", size), claimed))
+    with pytest.raises(ValueError, match=r"a\.npz: `position` .*to 24000128 bytes, more than they can"):
+        io.read_table(tmp_path / "a.npz")
+
+
+def test_an_array_that_is_there_twice_is_refused_by_name(tmp_path):
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((2, 3)))), ("position.npy", npy(np.ones((2, 3))))])
+    with pytest.raises(ValueError, match=r"a\.npz: has the array `position` twice"):
+        io.read_table(tmp_path / "a.npz")
+
+
+def test_a_packing_that_numpy_does_not_use_is_refused(tmp_path):
+    write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((2, 3))))], zipfile.ZIP_BZIP2)
+    with pytest.raises(ValueError, match=r"a\.npz: `position` is packed by a method .*numpy\.savez"):
+        io.read_table(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<i8"])
+def test_every_layout_of_an_array_is_read(order, dtype, tmp_path):
+    position = np.arange(12).reshape(4, 3).astype(dtype, order=order)
+    np.savez(tmp_path / "a.npz", position=position, big=np.asfortranarray(position))
+    table = io.read_table(tmp_path / "a.npz")
+    np.testing.assert_array_equal(table.position, position)
+    np.testing.assert_array_equal(table.columns["big"], position)

@@ -65,3 +65,9 @@ def test_a_smoothing_length_of_unknown_convention_is_kept_but_not_used():
     table = table_from_columns(np.zeros((2, 3)), {"h": np.ones(2)}, source="s")
     assert table.support is None and "h" in table.columns
     assert any("differs between codes" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("shape", [(0, 2**16 + 1), (3, 0)])
+def test_columns_wider_than_any_or_of_no_width_are_refused(shape):
+    with pytest.raises(ValueError, match=r"column `a` has shape \(., \d+\).* 1 to 65536 numbers a particle"):
+        ParticleTable(np.zeros((shape[0], 3)), {"a": np.zeros(shape)})
