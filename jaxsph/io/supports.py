@@ -18,11 +18,17 @@ from scipy.spatial import KDTree
 
 from jaxsph.model import kernels
 
+from .damage import DataError
+
 NEIGHBOURS = 32
 """Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
 
 PAIR_BUDGET = 2**22
 """Pairs looked at in one go: about 100 MB of distances, indices and weights."""
+
+MAX_PAIRS = 2**36
+"""Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit."""
+SAMPLED_PARTICLES = 256
 
 SHOW_PROGRESS_FROM = 100_000
 """Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
@@ -54,24 +60,23 @@ def nearest_neighbour_supports(
     count = len(position)
     if count == 0:
         return np.zeros(0)
-    reach = min(neighbours, count - 1)
-    if reach == 0:
+    places, place_of = _distinct(position)
+    if len(places) == 1:
         return np.ones(count)
-    tree = KDTree(position)
-    support = np.empty(count)
-    for rows in _slices(np.full(count, reach + 1), progress, "supports"):
-        distance, _ = tree.query(position[rows], k=reach + 1, workers=-1)  # the first is the particle itself
-        support[rows] = distance[:, -1]
-    support *= (neighbours / reach) ** (1 / 3)
-    crowded = support == 0
-    if crowded.any():
-        places = np.unique(position, axis=0)
-        if len(places) == 1:
-            return np.ones(count)
-        reach = min(neighbours, len(places) - 1)
-        distance, _ = KDTree(places).query(position[crowded], k=reach + 1, workers=-1)
-        support[crowded] = distance[:, -1] * (neighbours / reach) ** (1 / 3)
-    return support
+    points, multiplicity = position[places], np.bincount(place_of)
+    tree = KDTree(points)
+    reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
+    support = np.empty(len(places))
+    for rows in _slices(np.full(len(places), nearest), progress, "supports"):
+        distance, place = tree.query(points[rows], k=nearest, workers=-1)
+        others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
+        found = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
+        by_particles, by_places = (
+            found * (neighbours / reach) ** (1 / 3),
+            distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3),
+        )
+        support[rows] = np.where(found > 0, by_particles, by_places)
+    return support[place_of]
 
 
 def kernel_sum(
@@ -96,26 +101,59 @@ def kernel_sum(
 
     Returns:
         (N,) float64 sums, positive where weights are, in units of `weight` over a volume.
+
+    Raises:
+        ValueError: supports that reach so many particles that the sum would take hours.
     """
     chosen = kernels.by_name(kernel)
     position = np.asarray(position, dtype=np.float64)
     support = np.asarray(support, dtype=np.float64)
-    total = np.zeros(len(position))
     if len(position) == 0:
-        return total
-    padded_weight = np.append(np.ones(len(position)) if weight is None else np.asarray(weight, np.float64), 0.0)
-    tree = KDTree(position)
-    reached = tree.query_ball_point(position, support, return_length=True, workers=-1)
+        return np.zeros(0)
+    places, place_of = _distinct(position)
+    askers, asker_of = _distinct(np.column_stack([position, support]))
+    weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
+    tree, points, radii = KDTree(position[places]), position[askers], support[askers]
+    _refuse_too_many_pairs(tree, points, radii)
+    total = np.empty(len(askers))
+    reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
     order = np.argsort(reached, kind="stable")  # alike counts together, so that a block has little padding
     for block in _slices(reached[order], progress, "kernel sums"):
         rows = order[block]
-        most, farthest = max(2, int(reached[rows].max())), float(support[rows].max())  # k = 1 would drop an axis
-        distance, neighbour = tree.query(position[rows], k=most, distance_upper_bound=farthest, workers=-1)
-        q = distance / support[rows, None]
+        most, farthest = max(2, int(reached[rows].max())), float(radii[rows].max())  # k = 1 would drop an axis
+        distance, neighbour = tree.query(points[rows], k=most, distance_upper_bound=farthest, workers=-1)
+        q = distance / radii[rows, None]
         q[~np.isfinite(q)] = 1.0
         shape = chosen.of_square(q * q, np)
-        total[rows] = (shape * padded_weight[neighbour]).sum(axis=1)
-    return chosen.norm * total / support**3
+        total[rows] = (shape * weights[neighbour]).sum(axis=1)
+    return chosen.norm * total[asker_of] / support**3
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The index of one of each group of equal rows, and for every row the number of its group.
+
+    A tree cannot part points that coincide, and would compare each with all others. Rows that all differ keep their order.
+    """
+    order = np.lexsort(rows.T)
+    ordered = rows[order]
+    is_first = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    if is_first.all():
+        every = np.arange(len(rows))
+        return every, every
+    group = np.empty(len(rows), np.int64)
+    group[order] = np.cumsum(is_first) - 1
+    return order[is_first], group
+
+
+def _refuse_too_many_pairs(tree: KDTree, points: np.ndarray, radii: np.ndarray) -> None:
+    """Refuse supports that a sample of the particles shows to reach too far."""
+    some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
+    reached = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
+    if reached * len(points) > MAX_PAIRS:
+        raise DataError(
+            f"supports reach about {reached:.0f} particles each, {reached * len(points):.0f} pairs in all, and a kernel sum "
+            f"over them would take hours; give smaller supports, or check their unit"
+        )
 
 
 def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:

@@ -78,3 +78,33 @@ def test_a_progress_bar_is_shown_when_asked_and_otherwise_not(capsys):
     assert capsys.readouterr().err == ""
     nearest_neighbour_supports(position, progress=True)
     assert "supports" in capsys.readouterr().err
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 2)] * 3), min_size=2, max_size=60), st.integers(1, 12), st.integers(1, 3))
+@settings(max_examples=50, deadline=None)
+def test_coincident_particles_are_neighbours_and_sources_each_on_its_own(points, neighbours, num_supports):
+    position = np.array(points, float)
+    distance = np.sort(np.linalg.norm(position[:, None] - position[None], axis=-1), axis=1)
+    reach = min(neighbours, len(position) - 1)
+    expected = distance[:, reach] * (neighbours / reach) ** (1 / 3)
+    apart = expected > 0
+    np.testing.assert_allclose(nearest_neighbour_supports(position, neighbours)[apart], expected[apart], rtol=1e-12)
+    support, weight = 0.7 + np.arange(len(position)) % num_supports, np.arange(1.0, len(position) + 1)
+    got = kernel_sum(position, support, weight)
+    np.testing.assert_allclose(got, brute_force_sum(position, support, weight, "poly6"), rtol=1e-12)
+
+
+def test_where_many_particles_coincide_each_place_is_looked_at_once():
+    position = np.repeat([[0.0, 0, 0], [3, 0, 0]], 50_000, axis=0)
+    support = nearest_neighbour_supports(position)
+    np.testing.assert_allclose(support, 3 * 32 ** (1 / 3))
+    got = kernel_sum(position, np.full(100_000, 2.0))
+    np.testing.assert_allclose(got, 50_000 * kernels.KERNELS["poly6"].norm / 8, rtol=1e-12)
+
+
+def test_supports_that_reach_more_pairs_than_can_be_summed_are_refused(monkeypatch):
+    monkeypatch.setattr(supports, "MAX_PAIRS", 10_000)
+    position = np.random.default_rng(3).random((200, 3))
+    with pytest.raises(ValueError, match=r"supports reach about 200 particles each, 40000 pairs.* give smaller supports"):
+        kernel_sum(position, np.full(200, 2.0))
+    assert (kernel_sum(position, np.full(200, 0.05)) > 0).all()
