@@ -1,4 +1,5 @@
-# make setup: .venv with everything. make test: lint and the whole suite. make demo: one picture. Nothing but Python is needed.
+# make setup: .venv with everything. make test: lint and the whole suite. make notebooks: they run. make demo: one picture.
+# Nothing but Python is needed.
 # make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
 SHELL := /bin/bash
 VENV := .venv
@@ -10,7 +11,7 @@ PYTEST_ARGS ?=
 SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.1 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
-.PHONY: setup test test-slow lint format demo results clean
+.PHONY: setup test test-slow test-slow-share notebooks lint format demo results clean
 
 setup: $(VENV)/.installed-all
 
@@ -42,6 +43,17 @@ test: lint
 
 test-slow: $(VENV)/.installed-test
 	@$(SUITE) -m '' $(PYTEST_ARGS)
+
+# Of the tests marked slow, a part that changes with the week, so that all have their turn in as many weeks as there are parts.
+SLOW_PARTS ?= 8
+SLOW_SHARE ?= $(shell echo $$(( ($$(date -u +%s) / 86400 + 3) / 7 % $(SLOW_PARTS) )))/$(SLOW_PARTS)
+SLOW_SECONDS ?= 300
+test-slow-share: $(VENV)/.installed-test
+	@echo "week $$(date -u +%G-W%V): share $(SLOW_SHARE) of the tests marked slow, none begun after $(SLOW_SECONDS) s"
+	@$(SUITE) -m slow --share=$(SLOW_SHARE) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
+
+notebooks: $(VENV)/.installed-test
+	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Iterator
 
 import hypothesis
@@ -19,9 +20,12 @@ from jaxsph.cast.stretches import CastPlan
 from jaxsph.control.worklist import origins
 from jaxsph.stages import grid_parts, order
 
+pytest_plugins = ["share"]
+
 hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
 hypothesis.settings.load_profile("jaxsph")
 
+MOST_MAPS = 20_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
 CAPACITY = 24
 WIDTH, HEIGHT, SAMPLES = 21, 18, 37
 
@@ -120,11 +124,29 @@ def adversary(frames) -> Adversary:
     return Adversary(frames)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """A core for each of the processes that share the tests: else all of them start threads for all cores."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker is not None and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
+
+
+def memory_maps() -> int:
+    """How many this process has; where that cannot be known, too many."""
+    try:
+        with open("/proc/self/maps") as maps:
+            return sum(1 for _ in maps)
+    except OSError:
+        return MOST_MAPS + 1
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_programs() -> Iterator[None]:
     """Compiled programs hold memory maps, of which a process may have only so many."""
     yield
-    jax.clear_caches()
+    if memory_maps() > MOST_MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture

@@ -13,11 +13,17 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.numerics import faults
 
-kernel_names = ["poly6", "cubic_spline", "wendland_c2"]
+IN_FLOAT32 = [("poly6", "perspective"), ("cubic_spline", "orthographic"), ("wendland_c2", "perspective")]
+IN_FLOAT64 = [("poly6", "orthographic"), ("cubic_spline", "perspective"), ("wendland_c2", "orthographic")]
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@pytest.mark.parametrize("kernel", kernel_names)
+def with_kernels_and_projections(chosen, others):
+    """Those `chosen`, and the `others` among the slow tests: so each kernel, projection and dtype meets each other choice."""
+    slow = [pytest.param(*other, marks=pytest.mark.slow) for other in others]
+    return pytest.mark.parametrize(("kernel", "projection"), [*chosen, *slow])
+
+
+@with_kernels_and_projections(IN_FLOAT32, IN_FLOAT64)
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 1.0, 4.0]), distance=st.sampled_from([3.0, 0.5]))
 def test_float32_agrees_with_the_reference_to_1e_4_on_999_of_1000_pixels(
@@ -60,8 +66,7 @@ def edge_flips(scene, camera, samples):
     return (covered(1 - 3e-6) != covered(1 + 3e-6)).any(-1)
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@pytest.mark.parametrize("kernel", kernel_names)
+@with_kernels_and_projections(IN_FLOAT64, IN_FLOAT32)
 @settings(max_examples=5)
 @given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0.0, 4.0]))
 def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, projection, seed, decades):
@@ -77,11 +82,11 @@ def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, pro
 
 
 SIZES, SAMPLES = [(1, 1), (8, 8), (9, 7), (33, 16), (5, 40)], [1, 5, 16, 33]
-EACH_ONCE = [((1, 1), 1), ((8, 8), 16), ((9, 7), 5), ((33, 16), 33), ((5, 40), 1)]  # each is a plan, and so a compilation
+IN_FEW = [((9, 7), 5), ((33, 16), 33)]  # each is a plan, and so a compilation; one pixel: `test_extremes`
 
 
 @pytest.mark.parametrize(("size", "samples"), [
-    pytest.param(*both, marks=() if both in EACH_ONCE else pytest.mark.slow) for both in itertools.product(SIZES, SAMPLES)
+    pytest.param(*both, marks=() if both in IN_FEW else pytest.mark.slow) for both in itertools.product(SIZES, SAMPLES)
 ])  # fmt: skip
 def test_any_image_size_and_number_of_samples(frames, compare, size, samples):
     rng = np.random.default_rng(size[0] * samples)
@@ -89,7 +94,7 @@ def test_any_image_size_and_number_of_samples(frames, compare, size, samples):
     camera = dataclasses.replace(frames.camera(rng), width=size[0], height=size[1])
     settings = js.Settings(samples=samples)
     image = js.render(scene, camera, settings)
-    assert image.shape == (size[1], size[0])
+    assert image.shape == (size[1], size[0]) and image.faults == 0
     assert image.transmittance.shape == image.depth.shape == image.error_bound.shape == (size[1], size[0])
     compare(image, js.reference.render(scene, camera, settings), 1e-4)
 
@@ -112,27 +117,31 @@ def test_a_scene_behind_the_camera_is_black(frames):
 
 
 def test_a_camera_inside_a_particle_that_covers_the_screen(frames, compare):
-    particles = js.Particles.from_arrays([[0, 0, 0], [0.3, 0, 0]], [50.0, 0.2], [0.2, 0.9])
-    scene = js.Scene(particles=particles, transfer=js.TransferFunction.from_points([0, 1], np.eye(3)[:2], [0.1, 3.0]))
-    camera = js.Camera.look_at((0, 0, 1), (0, 0, 0), fov_degrees=150, width=30, height=20, near=0.01, far=60)
-    image = js.render(scene, camera, frames.settings)
+    particles = js.Particles.from_arrays([[0, 0, 0], [0.3, 0, 0]], [50.0, 0.2], [0.2, 0.9], capacity=frames.capacity)
+    ramp = np.linspace(0, 1, 5)
+    transfer = js.TransferFunction.from_points(ramp, np.stack([1 - ramp, ramp, 0 * ramp], -1), 0.1 + 2.9 * ramp)
+    scene, size = js.Scene(particles=particles, transfer=transfer), {"width": frames.width, "height": frames.height}
+    camera = js.Camera.look_at((0, 0, 1), (0, 0, 0), fov_degrees=150, **size, near=0.01, far=60)
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
     compare(image, js.reference.render(scene, camera, frames.settings), 1e-5)
     assert float(image.alpha.min()) > 0.1
 
 
-@pytest.mark.parametrize("rows", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
-def test_bands_give_the_same_image_bit_for_bit(frames, rows):
+@pytest.mark.parametrize(("height", "rows"), [(18, 1), *(pytest.param(75, rows, marks=pytest.mark.slow) for rows in (1, 2, 3))])
+def test_bands_give_the_same_image_bit_for_bit(frames, height, rows):
     rng = np.random.default_rng(0)
     scene = frames.scene(rng, decades=1)
-    camera = dataclasses.replace(frames.camera(rng), height=75)
-    whole = js.plan(scene, camera, frames.settings)
-    lists = dataclasses.replace(whole.lists, tile_rows=rows)
-    banded = dataclasses.replace(whole, bands=-(-5 // rows), lists=lists)
+    camera = dataclasses.replace(frames.camera(rng), height=height)
+    whole = frames.plan() if height == frames.height else js.plan(scene, camera, frames.settings)
+    lists, tiles = dataclasses.replace(whole.lists, tile_rows=rows), -(-height // 16)
+    banded = dataclasses.replace(whole, bands=-(-tiles // rows), lists=lists)
     calls = []
     image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))
-    assert calls[-1] == (banded.bands, banded.bands)
+    assert calls[-1] == (banded.bands, banded.bands) and banded.bands > 1
+    one = js.render(scene, camera, frames.settings, plan=whole)
     for layer in ("color", "transmittance", "depth", "evaluations"):
-        assert np.array_equal(getattr(image, layer), getattr(js.render(scene, camera, frames.settings, plan=whole), layer))
+        assert np.array_equal(getattr(image, layer), getattr(one, layer))
+    assert float(image.alpha.max()) > 0.1
 
 
 def test_the_memory_limit_makes_bands_and_too_little_is_refused(frames):
@@ -148,17 +157,24 @@ def test_the_memory_limit_makes_bands_and_too_little_is_refused(frames):
         js.plan(scene, camera, js.Settings(samples=64, memory_limit=1000))
 
 
-def test_a_plan_that_is_too_small_raises_and_without_a_plan_it_cannot_be(frames):
+@pytest.mark.parametrize(("capacity", "bit"), [
+    ("list_capacity", faults.LIST_OVERFLOW), pytest.param("tile_capacity", faults.TILE_OVERFLOW, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_plan_that_is_too_small_raises_and_is_a_fault_under_jit(frames, capacity, bit):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng, decades=0), frames.camera(rng)
     plan = frames.plan()
-    for capacity in ("tile_capacity", "list_capacity"):
-        small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 4}))
-        with pytest.raises(js.CapacityError, match="make a new plan"):
-            js.render(scene, camera, frames.settings, plan=small)
-        word = int(jax.jit(lambda s, p=small: js.render(s, camera, frames.settings, plan=p).faults)(scene))
-        assert word & faults.OVERFLOWS
-    assert js.render(scene, camera, frames.settings).faults == 0
+    small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 4}))
+    with pytest.raises(js.CapacityError, match="make a new plan"):
+        js.render(scene, camera, frames.settings, plan=small)
+    assert int(jax.jit(lambda s: js.render(s, camera, frames.settings, plan=small).faults)(scene)) & bit
+
+
+def test_tiles_that_do_not_fit_are_a_fault(frames, stages):
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
+    small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, tile_capacity=4))
+    assert int(stages(scene.particles, camera, plan=small)[0].lists.faults) & faults.TILE_OVERFLOW
 
 
 @pytest.mark.parametrize("change", ["camera", "samples", "particles"])
@@ -173,6 +189,11 @@ def test_a_plan_for_other_shapes_is_refused(frames, change):
         scene = dataclasses.replace(scene, particles=js.Particles.from_arrays([[0, 0, 0]], 1.0, 0.0))
     with pytest.raises(ValueError, match="`plan` was made for"):
         js.render(scene, camera, settings, plan=frames.plan())
+
+
+@pytest.fixture(scope="module")
+def jitted(frames):
+    return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
 
 
 @pytest.mark.parametrize(
@@ -190,7 +211,7 @@ def test_a_plan_for_other_shapes_is_refused(frames, change):
         ("camera", "far", 0.001, "camera is not usable"),
     ],
 )
-def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, part, field, value, message):
+def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, jitted, part, field, value, message):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng), frames.camera(rng)
 
@@ -202,7 +223,7 @@ def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, part, field,
         camera = spoil(camera)
     else:
         scene = dataclasses.replace(scene, **{part: spoil(getattr(scene, part))})
-    image = jax.jit(lambda s, c: js.render(s, c, frames.settings, plan=frames.plan()))(scene, camera)
+    image = jitted(scene, camera)
     assert int(image.faults) != 0
     if part == "particles":
         assert np.isfinite(image.color).all()
@@ -228,15 +249,6 @@ def test_padding_changes_nothing(frames):
     bare = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[:20], scene.particles))
     padded, exact = js.render(scene, camera, frames.settings, plan=frames.plan()), js.render(bare, camera, frames.settings)
     assert np.array_equal(padded.color, exact.color)
-
-
-def test_pairs_count_the_particles_of_all_bundles():
-    """One particle that all four bundles of the image can meet."""
-    camera = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=16, height=16, near=1.0, far=5.0)
-    particles = js.Particles.from_arrays([[0, 0, 0]], 2.0, 0.5)
-    transfer = js.TransferFunction.from_points([0, 1], [[1, 1, 1], [1, 1, 1]], [1, 1])
-    image = js.render(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=16))
-    assert image.stats["pairs"] == 4
 
 
 def test_plans_share_grid_and_cast_whatever_controls_the_error():
