@@ -102,7 +102,8 @@ def analyse(
         if camera.is_perspective:
             paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
         misplaced = sum_rounding(count.ravel()[at], dtype) * (quantities[1] - quantities[0])
-        merging = tables.steepest[:, None] * misplaced
+        # a look-up changes by no more than its channel has, even at a jump, and by nothing where all quantities are one
+        merging = jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0)
         errors = functools.partial(cell_errors, fitting=fits(slab_samples))
         path = paths.min((0, 1)), paths.max((0, 1))
         found = computed_once(step >= 0, errors, bounds, edges, *path, (merging[:3].max(0), merging[3]), relax)
