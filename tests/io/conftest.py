@@ -4,12 +4,17 @@ import contextlib
 import gzip
 import struct
 import tracemalloc
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import jaxsph.io as io
+
 COUNT = 7
+MEMORY, MEMORY_PER_BYTE = 2**23, 64
+"""What reading a file of some size may take: far more than any needs, and far less than what a header can ask for."""
 
 
 def make_particles(count=COUNT, seed=0):
@@ -69,12 +74,12 @@ def write_vtk5(path, p):
     path.write_bytes(out)
 
 
-def write_vtu(path, p):
+def write_vtu(path, p, **options):
     import meshio
 
     cells = [("vertex", np.arange(len(p.position))[:, None])]
     data = {"velocity": p.velocity, "density": p.density[:, None], "id": p.id}
-    meshio.Mesh(p.position, cells, point_data=data).write(path)
+    meshio.Mesh(p.position, cells, point_data=data).write(path, **options)
 
 
 def write_ply(path, p, encoding="binary_big_endian"):
@@ -182,23 +187,32 @@ def write_xyz(path, p):
     path.write_text("\n".join(lines) + "\n")
 
 
+def write_extended_xyz(path, p):
+    rows = (f"18 {x} {y} {z} {density}" for (x, y, z), density in zip(p.position.tolist(), p.density.tolist(), strict=True))
+    path.write_text("\n".join([str(len(p.position)), "Properties=Z:I:1:pos:R:3:density:R:1", *rows]) + "\n")
+
+
 WRITERS = {
     "a.npz": write_npz,
     "polydata.vtk": write_vtk,
     "ascii.vtk": lambda path, p: write_vtk(path, p, "UNSTRUCTURED_GRID", binary=False),
     "five.vtk": write_vtk5,
     "a.vtu": write_vtu,
+    "ascii.vtu": lambda path, p: write_vtu(path, p, binary=False),
+    "plain.vtu": lambda path, p: write_vtu(path, p, compression=None),
     "big.ply": write_ply,
     "ascii.ply": lambda path, p: write_ply(path, p, "ascii"),
     "zipped.bgeo": write_bgeo,
     "plain.bgeo": lambda path, p: write_bgeo(path, p, compressed=False),
     "gadget.hdf5": write_gadget_hdf5,
+    "swift.hdf5": lambda path, p: write_gadget_hdf5(path, p, swift_kernel="Wendland C2"),
     "phantom.h5": write_phantom,
     "points.hdf5": write_points,
     "two.gadget": write_gadget_binary,
     "one.gadget": lambda path, p: write_gadget_binary(path, p, ">", form=1),
     "a.csv": write_csv,
     "a.xyz": write_xyz,
+    "extended.xyz": write_extended_xyz,
 }
 
 
@@ -210,17 +224,49 @@ def samples():
 
 
 @pytest.fixture(scope="session")
+def written(samples, tmp_path_factory):
+    """A folder with a whole file of every format, each read once: what libraries keep from then on is no file's memory."""
+    folder = tmp_path_factory.mktemp("whole")
+    for name, write in samples.writers.items():
+        write(folder / name, samples.particles())
+        io.read_table(folder / name)
+    return folder
+
+
+@contextlib.contextmanager
+def measure():
+    memory = SimpleNamespace(peak=0)
+    tracemalloc.start()
+    try:
+        yield memory
+    finally:
+        memory.peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+
+
+def read_or_refuse(path):
+    """Read a damaged file: a valid table or a `ValueError` with its name, in memory that its size bounds."""
+    table = None
+    with measure() as memory, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            table = io.read_table(path)
+        except ValueError as error:
+            assert str(path) in str(error)
+    assert memory.peak < MEMORY + MEMORY_PER_BYTE * path.stat().st_size
+    if table is not None:
+        assert np.isfinite(table.position).all() and table.position.shape == (len(table), 3)
+        assert all(len(column) == len(table) for column in table.columns.values())
+        assert {"x", "y", "z"} <= set(io.available_quantities(table))
+
+
+@pytest.fixture(scope="session")
 def measured():
     """`with measured() as memory:`, and then `memory.peak` in bytes, of Python and NumPy."""
-
-    @contextlib.contextmanager
-    def measure():
-        memory = SimpleNamespace(peak=0)
-        tracemalloc.start()
-        try:
-            yield memory
-        finally:
-            memory.peak = tracemalloc.get_traced_memory()[1]
-            tracemalloc.stop()
-
     return measure
+
+
+@pytest.fixture(scope="session")
+def reader_holds():
+    """`reader_holds(path)`: what must hold of reading any file, however damaged."""
+    return read_or_refuse
