@@ -35,20 +35,17 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
     position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
     count = len(position)
-    if len(h) != count:
-        raise DataError(f"has {count} positions but {len(h)} smoothing lengths; dump it again")
     kind = np.full(count, GAS)
     if "itype" in group:
         kind = np.abs(scalar_of_width_one(read_dataset(group["itype"])).astype(np.int64))
+    for name, values in (("h", h), ("itype", kind)):
+        if values.shape != (count,):
+            raise DataError(f"has {count} positions, but `{name}` has the shape {values.shape}; dump it again")
     _refuse_nan(h)
     said, alive = [], h > 0
     if not alive.all():
         said.append(f"dropped {int((~alive).sum())} dead or accreted particles (h <= 0)")
-    kinds = np.unique(kind[alive])
-    if part_type is None:
-        part_type = GAS if GAS in kinds or not len(kinds) else int(kinds[0])
-    if len(kinds) and part_type not in kinds:
-        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, kinds))}")
+    part_type = _choose(np.unique(kind[alive]), part_type)
     keep = alive & (kind == part_type)
     others = int((alive & ~keep).sum())
     if others:
@@ -69,6 +66,14 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
     return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, (h / hfact) ** 3, source=SOURCE, conventions=tuple(said))
+
+
+def _choose(kinds: np.ndarray, part_type: int | None) -> int:
+    if part_type is None:
+        return GAS if GAS in kinds or not len(kinds) else int(kinds[0])
+    if len(kinds) and part_type not in kinds:
+        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, kinds))}")
+    return part_type
 
 
 def _refuse_nan(h: np.ndarray) -> None:

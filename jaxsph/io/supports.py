@@ -71,11 +71,9 @@ def nearest_neighbour_supports(
         distance, place = tree.query(points[rows], k=nearest, workers=-1)
         others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
         found = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
-        by_particles, by_places = (
-            found * (neighbours / reach) ** (1 / 3),
-            distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3),
-        )
-        support[rows] = np.where(found > 0, by_particles, by_places)
+        among_particles = found * (neighbours / reach) ** (1 / 3)
+        among_places = distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3)
+        support[rows] = np.where(found > 0, among_particles, among_places)
     return support[place_of]
 
 

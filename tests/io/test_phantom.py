@@ -69,3 +69,11 @@ def test_a_dump_whose_hfact_is_not_positive_is_refused(samples, tmp_path):
         file["header/hfact"][()] = 0
     with pytest.raises(ValueError, match=r"a\.h5: has `hfact` 0"):
         io.read_table(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (7, 2)])
+@pytest.mark.parametrize("name", ["h", "itype"])
+def test_lengths_and_types_of_another_shape_are_refused_by_name(name, shape, samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles(), **{name: np.ones(shape)})
+    with pytest.raises(ValueError, match=rf"a\.h5: has 7 positions, but `{name}` has the shape \("):
+        io.read_table(tmp_path / "a.h5")
