@@ -148,7 +148,7 @@ def backward(size: int, repeats: int) -> dict:
         "backward_to_frame": found["gradient"]["seconds"] / frame["seconds"] - 1,
         "memory_to_frame": found["gradient"]["bytes"] / frame["bytes"],
     }
-    return {"scene": "mixer", "particles": scene.particles.capacity, "size": size, **ratios, "programs": found}
+    return {"scene": "mixer", "particles": scene.particles.num_particles, "size": size, **ratios, "programs": found}
 
 
 def against_scan(samples: int, repeats: int) -> dict:

@@ -31,10 +31,13 @@ import workloads
 import jaxsph as js
 from jaxsph.access.cells import Cells, cells_with_borders
 from jaxsph.access.grid import Grid
+from jaxsph.access.ordering import rank_particles
+from jaxsph.access.view import view_particles
 from jaxsph.cast.points import gather_field
 from jaxsph.control.worklist import CELL, full_rate, origins
 from jaxsph.model.transfer import Segments, look_up
-from jaxsph.stages import grid_parts, order
+from jaxsph.stages import make_grid
+from jaxsph.viewing import half_steps
 
 CHUNK = 64  # cells at a time
 HALVINGS = 60
@@ -194,8 +197,11 @@ def cut(scene: js.Scene, camera: js.Camera) -> Cut:
 
 
 def grid_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Grid:
-    ordered = order(scene.particles, camera, plan=plan)
-    return Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
+    depths = half_steps(camera, scene.particles.dtype, plan.samples)[1::2]
+    ordered = rank_particles(
+        view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
+    )
+    return make_grid(ordered, camera, jnp.int32(0), plan=plan).of(ordered)
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

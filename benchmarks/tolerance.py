@@ -84,7 +84,7 @@ def measure(
     records = []
     for (variant, tolerance), turns in times.items():
         middle, noise = medians(turns)
-        record = {"scene": label, "particles": scene.particles.capacity, "variant": variant, "tolerance": tolerance}
+        record = {"scene": label, "particles": scene.particles.num_particles, "variant": variant, "tolerance": tolerance}
         record |= quality[variant, tolerance] | middle
         record |= {"total_to_full": middle["total"] / full["total"], "noise": noise + full_noise}
         records.append(record | {"adapt_to_full_cast": middle["adapt"] / full["cast"]})

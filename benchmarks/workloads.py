@@ -67,14 +67,15 @@ def dam_break(**size: int) -> Workload:
     """The packaged dam break: 60 k particles, most of the frustum is empty."""
     scene, _ = js.scenes.load("dam_break", frame=1)
     particles = scene.particles
-    position, support = np.asarray(particles.position), float(particles.support[0])
+    columns = particles.to_numpy()
+    position, support = columns["position"], float(columns["support"][0])
     lower, upper = particles.bounds()
     middle, extent = (lower + upper) / 2, float((upper - lower).max())
     depth = float(upper[2] - lower[2])
     eye = (float(middle[0]), float(middle[1]), float(lower[2] - 1.5 * extent))
     near, far = 1.5 * extent, 1.5 * extent + depth
     half = 0.52 * extent / near
-    quantity = np.asarray(particles.quantity)
+    quantity = columns["quantity"]
     return Workload("dam break", position, support, quantity, _table(4 / extent), eye, half, near, far, **size)
 
 

@@ -2,7 +2,8 @@
 
 from jaxsph import io, reference, scenes
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
-from jaxsph.plan import Plan, plan
+from jaxsph.plan import Plan
+from jaxsph.planning import plan
 from jaxsph.render import CapacityError, render
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__

@@ -230,7 +230,7 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
         scene, camera = scenes.load(name, options.particles, options.frame, width=width, height=height)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.support)}")
+    say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.to_numpy()['support'])}")
     if options.command != "info":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
             scene = dataclasses.replace(scene, transfer=_transfer(scene.particles, options, "concentration"))
@@ -253,9 +253,10 @@ def _particles_of_file(options: argparse.Namespace) -> tuple[Particles, str]:
     table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    say("support", f"{span(particles.support)}: {report.support}")
+    columns = particles.to_numpy()
+    say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
-    say("quantity", f"{report.quantity}, {span(particles.quantity)}")
+    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
     for note in report.notes:
         say("note", note)
     return particles, report.quantity
@@ -292,7 +293,7 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
 def _info(options: argparse.Namespace) -> None:
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
-        say("quantity", f"concentration, {span(scene.particles.quantity)}")
+        say("quantity", f"concentration, {span(scene.particles.to_numpy()['quantity'])}")
         say("camera", camera_line(camera))
         return
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for particle files")
@@ -311,8 +312,9 @@ def _info(options: argparse.Namespace) -> None:
         print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
     print("\n`jaxsph render` would show")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    say("quantity", f"{report.quantity}, {span(particles.quantity)}")
-    say("support", f"{span(particles.support)}: {report.support}")
+    columns = particles.to_numpy()
+    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
     say("camera", camera_line(Camera.framing(particles)))
 

@@ -16,19 +16,25 @@ from jaxsph.access.lists import BUNDLE
 from jaxsph.access.parts import gathered
 from jaxsph.cast.parts import joined
 from jaxsph.cast.points import Rays
-from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.numerics.programs import light
 from jaxsph.plan import Plan
 
+OfParts = tuple[tuple[Rays, ...], tuple[tuple[Array, ...], ...]]
+"""Of all parts of a band: what their rays met; and error bound, full evaluations, and levels if there are any."""
 
+
+@light
 @functools.partial(jax.jit, static_argnames="plan")
+def develop(bands: tuple[OfParts, ...], *, plan: Plan) -> tuple[Array, ...]:
+    """Layers of the image, see `crop`, of all of its bands."""
+    layers = [unbundle(*band, plan=plan) for band in bands]
+    return crop(tuple(jnp.stack(layer) for layer in zip(*layers, strict=True)), plan)
+
+
 def unbundle(cast: tuple[Rays, ...], decided: tuple[tuple[Array, ...], ...], *, plan: Plan) -> tuple[Array, ...]:
     """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
     and levels of bundles.
-
-    Args:
-        cast: of all parts of the band.
-        decided: the same; error bound, full evaluations, and levels if there are any.
     """
     (bound, full, *levels), rays = gathered(decided), joined(cast)
     rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
@@ -46,20 +52,18 @@ def unbundle(cast: tuple[Rays, ...], decided: tuple[tuple[Array, ...], ...], *, 
     return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in levels))
 
 
-def stacked(bands: list[tuple[Array, ...]]) -> tuple[Array, ...]:
-    """The layers of all bands, band by band."""
-    return tuple(jnp.stack(layers) for layers in zip(*bands, strict=True))
-
-
-def assemble(layers: tuple[Array, ...], camera: Camera, plan: Plan, word: Array) -> tuple[Image, Array]:
-    """Join the bands, cut off what lies beyond the image; and the evaluations that full rate takes."""
+def crop(layers: tuple[Array, ...], plan: Plan) -> tuple[Array, ...]:
+    """Join the layers of all bands, and cut off what lies beyond the image."""
     joined = [layer.reshape(-1, *layer.shape[2:]) for layer in layers]
-    color, transmittance, depth, spent, bound, full = (layer[: camera.height, : camera.width] for layer in joined[:6])
-    image = Image(color, transmittance, depth, bound, spent, True, word, {})
-    if len(joined) == 6:
-        return image, full
-    rows, columns = (-(-size // BUNDLE) for size in (camera.height, camera.width))
-    return dataclasses.replace(image, levels=jnp.moveaxis(joined[6][:rows, :columns], -1, 0)), full
+    images = [layer[: plan.height, : plan.width] for layer in joined[:6]]
+    rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
+    return *images, *(jnp.moveaxis(levels[:rows, :columns], -1, 0) for levels in joined[6:])
+
+
+def assemble(layers: tuple[Array, ...], word: Array | int) -> tuple[Image, Array]:
+    """The image of those layers, and the evaluations that full rate takes."""
+    color, transmittance, depth, spent, bound, full, *levels = layers
+    return Image(color, transmittance, depth, bound, spent, True, word, {}, levels=levels[0] if levels else None), full
 
 
 def blank_if(unusable: Bool[Array, ""], image: Image) -> Image:

@@ -24,7 +24,7 @@ from jaxsph.contenders import BASELINES, ESTIMATORS, FULL_RATE, TOLERANCES, Cont
 from jaxsph.measurement import JOURNAL, KEY, TABLE, Measurement, append, read_journal, write_table
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.plan import Plan
-from jaxsph.plan import plan as make_plan
+from jaxsph.planning import plan as make_plan
 from jaxsph.provenance import of_frame, of_this_run
 from jaxsph.render import render
 

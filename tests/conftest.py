@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.access.grid import Grid
 from jaxsph.access.lists import ListPlan
+from jaxsph.access.ordering import rank_particles
+from jaxsph.access.view import view_particles
 from jaxsph.cast.stretches import CastPlan
-from jaxsph.control.worklist import origins
-from jaxsph.stages import grid_parts, order
+from jaxsph.control.errors import fits
+from jaxsph.control.worklist import CELL, COARSEST, origins
+from jaxsph.stages import make_grid
+from jaxsph.viewing import half_steps
 
 pytest_plugins = ["share"]
 
@@ -43,6 +46,10 @@ class Frames:
         lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
         cast = CastPlan(16, slab_samples, 48)  # stretches that end within a layer
         return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
+
+    def deep(self, slab_samples: int) -> Frames:
+        """Frames of as many whole cells as the coarsest level merges, and one that is not whole."""
+        return dataclasses.replace(self, samples=(CELL << COARSEST - fits(slab_samples)) + 3)
 
     @property
     def settings(self) -> js.Settings:
@@ -176,8 +183,10 @@ def compare() -> Callable[..., None]:
 @functools.partial(jax.jit, static_argnames="plan")
 def grid_of(particles, camera, *, plan):
     """The grid of a frame of one band, and what its sums are taken relative to."""
-    ordered = order(particles, camera, plan=plan)
-    grid = Grid(ordered, *grid_parts(ordered, camera, 0, plan=plan))
+    depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
+    viewed = view_particles(particles, camera, depths, plan.num_classes)
+    ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
+    grid = make_grid(ordered, camera, 0, plan=plan).of(ordered)
     return grid, origins(grid.cells, grid.lists.rank, ordered.quantity)
 
 

@@ -51,13 +51,13 @@ def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], 
 
 
 def _windows(lists: BundleLists, first: Array, last: Array) -> Cells:
-    begin, end = (_bisect(lists.rank, wanted, lists.start, lists.end) for wanted in (first, last))
+    begin, end = _bisect(lists.rank, jnp.stack([first, last]), lists.start, lists.end)
     length = jnp.maximum(end - begin, 0)
     return Cells(begin, length, length.sum(0, dtype=jnp.int32))
 
 
 def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
-    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (class, slab) pairs.
+    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (end, class, slab).
 
     By steps of powers of two from `low`, as long as all that is stepped over is smaller: one array goes round the loop, where
     of two ends XLA copies both in every turn.

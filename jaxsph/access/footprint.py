@@ -1,6 +1,6 @@
 r"""Which rays a support sphere can touch: exact tests, rounded outwards.
 
-Flow: ordering -> [footprint] -> lists.
+Flow: particles -> [footprint] -> view, lists.
 
 Every test errs on the side of touching. Rounding is covered by terms that bound it, `ROUNDING * eps` of the magnitudes that
 enter, never by a share of the support.
@@ -11,33 +11,39 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.ordering import ROUNDING, Ordered
+from jaxsph.access.resolution import ROUNDING
 from jaxsph.model.camera import Camera
 
 
 def pixel_ranges(
-    ordered: Ordered, camera: Camera, first_depth: Float[Array, ""], last_depth: Float[Array, ""]
+    x: Float[Array, " particles"],
+    y: Float[Array, " particles"],
+    z: Float[Array, " particles"],
+    reach: Float[Array, " particles"],
+    live: Bool[Array, " particles"],
+    camera: Camera,
+    between: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> tuple[Int[Array, " particles"], ...]:
-    """First and last column, first and last row of pixels whose rays can meet each sphere between the two depths.
+    """First and last column, first and last row of pixels whose rays can meet each sphere `between` two depths.
 
     Where the whole sphere lies in front of the eye, the tangents of its silhouette in the (x, z) plane bound x / z exactly;
     the box `[x - H, x + H] / [s_0, s_1]` bounds it always. The tighter is taken. Empty ranges have first > last.
     """
-    front = jnp.maximum(ordered.z - ordered.reach, first_depth)
-    back = jnp.minimum(ordered.z + ordered.reach, last_depth)
-    left, right = _lateral(ordered.x, ordered, front, back, camera.is_perspective)
-    bottom, top = _lateral(ordered.y, ordered, front, back, camera.is_perspective)
+    front = jnp.maximum(z - reach, between[0])
+    back = jnp.minimum(z + reach, between[1])
+    left, right = _lateral(x, z, reach, (front, back), camera.is_perspective)
+    bottom, top = _lateral(y, z, reach, (front, back), camera.is_perspective)
     half_width = camera.half_height * (camera.width / camera.height)
     columns = _pixels(0.5 * camera.width * (left / half_width + 1), 0.5 * camera.width * (right / half_width + 1), camera.width)
     half_height = camera.half_height
     rows = _pixels(0.5 * camera.height * (1 - top / half_height), 0.5 * camera.height * (1 - bottom / half_height), camera.height)
-    last_column = jnp.where(ordered.live & (front <= back), columns[1], -1)
+    last_column = jnp.where(live & (front <= back), columns[1], -1)
     return columns[0], last_column, rows[0], rows[1]
 
 
-def _lateral(x: Array, ordered: Ordered, front: Array, back: Array, perspective: bool) -> tuple[Array, Array]:
-    """Bounds of the ray coordinate (x / s, or x if orthographic) over the sphere between `front` and `back`."""
-    z, reach = ordered.z, ordered.reach
+def _lateral(x: Array, z: Array, reach: Array, between: tuple[Array, Array], perspective: bool) -> tuple[Array, Array]:
+    """Bounds of the ray coordinate (x / s, or x if orthographic) over the sphere `between` two depths."""
+    front, back = between
     eps = jnp.finfo(x.dtype).eps * ROUNDING
     low, high = x - reach, x + reach
     if not perspective:

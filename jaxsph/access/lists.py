@@ -1,6 +1,6 @@
 """One depth-ordered list of particles for every ray bundle, from one sort.
 
-Flow: ordering -> footprint -> [lists] -> cells -> cast -> image.
+Flow: ordering -> [lists] -> cells -> cast -> image.
 
 Expanding to (particle, bundle) pairs and sorting them all is the bottleneck of a CPU, so the sort runs on the four times
 coarser *tiles* of 2 x 2 bundles; each tile's sorted list is then split among its bundles by the exact sphere-against-pyramid
@@ -20,9 +20,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
-from jaxsph.access.footprint import pixel_ranges, side_distances, touches
+from jaxsph.access.footprint import side_distances, touches
 from jaxsph.access.ordering import Ordered
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
@@ -31,7 +31,6 @@ from jaxsph.numerics.staging import computed_once
 from jaxsph.numerics.sums import running_sum
 
 MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
-RUNS = 16  # sorts that run side by side
 WORD = 32  # flags in a word
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
 TILE = 2 * BUNDLE
@@ -45,12 +44,14 @@ class ListPlan:
         tile_rows, tile_columns: tiles of 16 x 16 pixels in a band.
         tile_capacity: (particle, tile) pairs that fit.
         list_capacity: (particle, bundle) pairs that fit.
+        runs: sorts that the pairs are shared among, which run side by side.
     """
 
     tile_rows: int
     tile_columns: int
     tile_capacity: int
     list_capacity: int
+    runs: int = 4
 
     def __post_init__(self) -> None:
         require_sizes(self)
@@ -93,11 +94,9 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
     return row, column
 
 
-def build_lists(
-    ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
-) -> BundleLists:
+def build_lists(ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`."""
-    ranges = bundle_ranges(ordered, camera, depths, plan, first_row)
+    ranges = bundle_ranges(ordered, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
     touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
     return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
@@ -118,13 +117,11 @@ class Ranges:
     bottom: Int[Array, " particles"]
 
 
-def bundle_ranges(
-    ordered: Ordered, camera: Camera, depths: Float[Array, " samples"], plan: ListPlan, first_row: Int[Array, ""] | int
-) -> Ranges:
+def bundle_ranges(ordered: Ordered, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
     """Bundle columns and rows, counted from the band's corner, of the pixels that each particle can touch."""
-    left, right, top, bottom = pixel_ranges(ordered, camera, depths[0], depths[-1])
-    top = jnp.maximum(top - first_row, 0)
-    bottom = jnp.minimum(bottom - first_row, plan.tile_rows * TILE - 1)
+    left, right = ordered.left, ordered.right
+    top = jnp.maximum(ordered.top - first_row, 0)
+    bottom = jnp.minimum(ordered.bottom - first_row, plan.tile_rows * TILE - 1)
     seen = (right >= left) & (bottom >= top)
     past = [jnp.where(seen, last // BUNDLE + 1, 0) for last in (right, bottom)]
     return Ranges(left // BUNDLE, past[0], top // BUNDLE, past[1])
@@ -148,14 +145,14 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
 
     Each run is sorted by itself through one packed key; XLA sorts them side by side.
     """
-    words = RUNS * -(-plan.tile_capacity // (RUNS * WORD))
+    words = plan.runs * -(-plan.tile_capacity // (plan.runs * WORD))
     rectangles = functools.partial(_rectangles, plan=plan, words=words)
     always = ranges.left[0] >= 0
     seen, last, total = computed_once(always, rectangles, ranges)
     bits = max(ranges.left.shape[0] - 1, 1).bit_length()
     wide = bits + plan.num_tiles.bit_length() > 32
     used = jnp.minimum(total, plan.tile_capacity)
-    flags = [value.reshape(RUNS, -1) for value in (last, _counted(last), jnp.arange(words, dtype=jnp.int32) * WORD)]
+    flags = [value.reshape(plan.runs, -1) for value in (last, _flags_before(last), jnp.arange(words, dtype=jnp.int32) * WORD)]
     with jax.enable_x64(wide or jax.config.read("jax_enable_x64")):
         kind = jnp.uint64 if wide else jnp.uint32
 
@@ -164,7 +161,7 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
             return (tile.astype(kind) << bits) | rank.astype(kind)
 
         key = _run_by_run(always, packed, flags)
-        key = jnp.stack([lax.sort(key[run]) for run in range(RUNS)])
+        key = jnp.stack([lax.sort(key[run]) for run in range(plan.runs)])
         rank = (key & kind((1 << bits) - 1)).astype(jnp.int32)
         tile = (key >> bits).astype(jnp.uint16 if plan.num_tiles < 1 << 16 else jnp.int32)
     wanted = jnp.arange(plan.num_tiles + 1, dtype=tile.dtype)
@@ -175,9 +172,9 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
 
 def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: ListPlan) -> tuple[Array, Array]:
     """Tile and rank of each slot of a run."""
-    last, counted, slot = (value[:, None] for value in flags)
+    last, before, slot = (value[:, None] for value in flags)
     lane = jnp.arange(WORD, dtype=jnp.int32)
-    nth = _set_before(last, counted, lane).ravel()
+    nth = _set_before(last, before, lane).ravel()
     slot = (slot + lane).ravel()
     rank, begin, corner, columns = (column[nth] for column in seen)
     # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
@@ -189,14 +186,14 @@ def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: Li
 def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Array, ...], Array, Array]:
     """Particles that can touch a tile: (rank, first slot, first tile, columns), flags of their last slots, slots in all.
 
-    Where the slots are too many to be counted, they are -1 in all.
+    The slots in all are as in `counted`.
     """
     num_particles = ranges.left.shape[0]
     left, top = ranges.left >> 1, ranges.top >> 1
     columns = jnp.where(ranges.right > ranges.left, ((ranges.right + 1) >> 1) - left, 0)
     count = columns * (((ranges.bottom + 1) >> 1) - top)
     end, nth = running_sum(count), running_sum((count > 0).astype(jnp.int32))
-    total = jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, end[-1], -1)
+    total = counted(count, end[-1])
     flag = jnp.where(count > 0, jnp.uint32(1) << ((end - 1) & (WORD - 1)).astype(jnp.uint32), 0)
     last = jnp.zeros(words, jnp.uint32).at[(end - 1) // WORD].add(flag, mode="drop")
     place = jnp.where(count > 0, nth - 1, num_particles)  # always in bounds, as a dropped entry is a branch mispredicted
@@ -205,15 +202,23 @@ def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Ar
     return (seen, *(column[seen] for column in first)), last, total
 
 
-def _counted(word: Int[Array, "*some words"]) -> Int[Array, "*some words"]:
+def counted(count: Int[Array, "*any"], total: Int[Array, ""]) -> Int[Array, ""]:
+    """`total`, the sum of all `count` in 32 bits, where it cannot have wrapped; else -1.
+
+    The sum in float32 tells the two apart but is itself good to some 1e-6 only, so it is not compared with any capacity.
+    """
+    return jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, total, -1)
+
+
+def _flags_before(word: Int[Array, "*some words"]) -> Int[Array, "*some words"]:
     """Flags that are set in the words before each."""
     number = lax.population_count(word).astype(jnp.int32)
     return running_sum(number) - number
 
 
-def _set_before(word: Array, counted: Array, lane: Array) -> Array:
+def _set_before(word: Array, before: Array, lane: Array) -> Array:
     """Flags that are set before a flag: those before its word, and those in it."""
-    return counted + lax.population_count(word & ((jnp.uint32(1) << lane.astype(jnp.uint32)) - 1)).astype(jnp.int32)
+    return before + lax.population_count(word & ((jnp.uint32(1) << lane.astype(jnp.uint32)) - 1)).astype(jnp.int32)
 
 
 def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> BundleLists:
@@ -222,20 +227,21 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
     lane, child = jnp.arange(WORD, dtype=jnp.uint32), jnp.arange(4, dtype=jnp.uint32)[:, None, None]
     flag = (touched.reshape(-1, WORD).astype(jnp.uint32) >> child) & 1
     word = jnp.pad((flag << lane).sum(2, dtype=jnp.uint32), ((0, 0), (0, 1)))
-    counted = _counted(word)
+    before = _flags_before(word)
     start = pairs.start + jnp.arange(runs, dtype=jnp.int32)[:, None] * slots
-    at_start = _set_before(word[:, start // WORD], counted[:, start // WORD], start % WORD)
+    at_start = _set_before(word[:, start // WORD], before[:, start // WORD], start % WORD)
     count = at_start[:, :, 1:] - at_start[:, :, :-1]
-    overflow = pairs.faults | faults.raised(faults.LIST_OVERFLOW, count.astype(jnp.float32).sum() > plan.list_capacity)
     begins = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(jnp.moveaxis(count, 2, 0).ravel())])
+    total = counted(count, begins[-1])
+    overflow = pairs.faults | faults.raised(faults.LIST_OVERFLOW, (total < 0) | (total > plan.list_capacity))
     shift = jnp.moveaxis(begins[:-1].reshape(plan.num_tiles, 4, runs), 0, 2) - at_start[:, :, :-1]
-    word, counted = (value[:, :-1].reshape(4, runs, -1, 1) for value in (word, counted))
+    word, before = (value[:, :-1].reshape(4, runs, -1, 1) for value in (word, before))
 
     def place(run: Array, rank: Array) -> Array:
         tile = jnp.minimum(pairs.tile[run].astype(jnp.int32), plan.num_tiles - 1).reshape(-1, WORD)
         for child in range(4):
             flags = word[child, run]
-            target = _set_before(flags, counted[child, run], lane) + shift[child, run][tile]
+            target = _set_before(flags, before[child, run], lane) + shift[child, run][tile]
             target = jnp.where((flags >> lane) & 1 > 0, target, plan.list_capacity)
             rank = rank.at[target.ravel()].set(pairs.rank[run], mode="drop")
         return rank

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera import Camera
 
+ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 LIFT = 30  # binary digits by which strengths are lifted, so that weights far below the largest are no underflow; of 3, 5 and 6
 OFF = 2  # eps of its distance from the eye that a view coordinate may be off
 SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed

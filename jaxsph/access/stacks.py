@@ -45,8 +45,8 @@ def stack(filled: Bool[Array, "slabs bundles"]) -> Stacks:
     key = lax.sort(((slabs - height).astype(jnp.uint32) << bits) | lax.iota(jnp.uint32, bundles))
     bundle = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
     place = jnp.zeros(bundles, jnp.int32).at[bundle].set(jnp.arange(bundles, dtype=jnp.int32))
-    active = bundles - jnp.searchsorted(height[bundle[::-1]], jnp.arange(slabs, dtype=jnp.int32), side="right")
-    start = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(active.astype(jnp.int32))])
+    active = (height > jnp.arange(slabs, dtype=jnp.int32)[:, None]).sum(1, dtype=jnp.int32)
+    start = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(active)])
     # always in bounds, as a dropped entry is a branch mispredicted
     target = jnp.where(filled, start[jnp.maximum(nth - 1, 0)] + place, slabs * bundles)
     item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)

@@ -92,8 +92,8 @@ def composite(
 
         return lax.fori_loop(0, (past - begin + TOGETHER - 1) // TOGETHER, put_chunk, state)
 
-    top = jnp.searchsorted(starts, first, side="right").astype(jnp.int32) - 1
-    bottom = jnp.searchsorted(starts, first + number, side="left").astype(jnp.int32)
+    top = (starts <= first).sum(dtype=jnp.int32) - 1
+    bottom = (starts < first + number).sum(dtype=jnp.int32)
     return lax.fori_loop(top, bottom, put_layer, state)
 
 

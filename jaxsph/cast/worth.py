@@ -86,8 +86,8 @@ def value_slabs(
 
         return lax.fori_loop(0, (past - begin + TOGETHER - 1) // TOGETHER, put_chunk, carry)
 
-    top = jnp.searchsorted(starts, first, side="right").astype(jnp.int32) - 1
-    bottom = jnp.searchsorted(starts, first + number, side="left").astype(jnp.int32)
+    top = (starts <= first).sum(dtype=jnp.int32) - 1
+    bottom = (starts < first + number).sum(dtype=jnp.int32)
     return lax.fori_loop(top, bottom, put_layer, (seen, jnp.zeros((4, *light[0].shape), light[0].dtype)))
 
 

@@ -103,11 +103,16 @@ def adapt(
         return coarse_work(windows, final, origin, paint, slab_samples), largest, final
 
     def leave() -> tuple[Worklist, Array, Array]:
-        none = jnp.zeros((num_cells, bundles), jnp.int32)
-        return uncoarsened(cells, origin, plan.super_pixels), jnp.zeros(bundles, dtype), none
+        return uncoarsened(cells, origin, plan.super_pixels), jnp.zeros(bundles, dtype), untouched(cells, slab_samples)
 
     work, largest, final = lax.cond(wanted.any(), decide, leave)
     return work, largest, jnp.where(empty, EMPTY, final)
+
+
+def untouched(cells: Cells, slab_samples: int) -> Int[Array, "cells bundles"]:
+    """Levels of cells that are all left at full rate."""
+    empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL), slab_samples)
+    return jnp.where(empty, EMPTY, 0)
 
 
 def _nowhere(cells: Cells, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:

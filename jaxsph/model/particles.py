@@ -19,12 +19,21 @@ from jaxsph.numerics.checks import is_traced, require_finite, require_positive, 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 
 
+NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
+
+
+def capacity_class(count: int) -> int:
+    """The least of 4, 5, 6, 7 times a power of two that is at least `count` and 1: four classes an octave."""
+    step = max(1 << max((count - 1).bit_length() - 1, 0), 4) // 4
+    return max(-(-count // step) * step, 1)
+
+
 @dataclasses.dataclass(frozen=True)
 class Particles:
     """SPH particles that carry a quantity; make them with `from_arrays`.
 
-    The arrays are padded to a common capacity; `valid` marks the particles that exist. Values may be changed by
-    `dataclasses.replace` under jit without recompiling.
+    The arrays are padded to a capacity, with the first particle at volume 0; `valid` marks the particles that exist. Values
+    may be changed by `dataclasses.replace` under jit without recompiling.
 
     Attributes:
         position: view-independent (world) coordinates, length units.
@@ -64,8 +73,8 @@ class Particles:
             quantity: (N,) or a number.
             volume: (N,) or a number, >= 0.
             kernel: name of the smoothing kernel.
-            capacity: pad to this many entries (so that sets of different size share a compiled program); default N, or 1 for an
-                empty set.
+            capacity: pad to this many entries; default the class of N, see `capacity_class`, so that sets of similar size
+                share compiled programs.
 
         Returns:
             Particles of dtype float64 if `position` is float64 and x64 is enabled, else float32. float16 and bfloat16
@@ -95,16 +104,33 @@ class Particles:
             require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
             require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
-        capacity = max(count, 1) if capacity is None else capacity
+        capacity = capacity_class(count) if capacity is None else capacity
         if capacity < max(count, 1):
             raise ValueError(f"`capacity` must be at least the number of particles ({count}) and 1, got {capacity}")
-        padding = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}
-        packed = {name: _padded(value, dtype, capacity, padding[name]) for name, value in arrays.items()}
+        packed = {name: _padded(name, value, dtype, capacity) for name, value in arrays.items()}
         rest = None
         if not is_traced(*arrays.values()) and count:
             _require_representable(arrays, packed)
             rest = _rest(arrays["position"], packed["position"], packed["support"])
         return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel, position_rest=rest)
+
+    def padded(self, capacity: int) -> Particles:
+        """The same particles in arrays of `capacity` entries.
+
+        Raises:
+            ValueError: where that is less than there are.
+        """
+        if capacity < self.capacity:
+            raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
+        padded = {name: _repeated(name, getattr(self, name), capacity, jnp) for name in NOTHING}
+        valid = jnp.pad(self.valid, (0, capacity - self.capacity))
+        rest = None if self.position_rest is None else _repeated("position", self.position_rest, capacity, jnp)
+        return dataclasses.replace(self, **padded, valid=valid, position_rest=rest)
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """The particles that exist, without padding (host side): `position`, `support`, `quantity` and `volume`."""
+        valid = np.asarray(self.valid)
+        return {name: np.asarray(getattr(self, name))[valid] for name in NOTHING}
 
     @property
     def capacity(self) -> int:
@@ -139,18 +165,24 @@ class Particles:
         return (position - support).min(0), (position + support).max(0)
 
 
-def _padded(value: Any, dtype: Any, capacity: int, fill: float) -> Array:
+def _padded(name: str, value: Any, dtype: Any, capacity: int) -> Array:
     xp = jnp if is_traced(value) else np
-    width = [(0, capacity - value.shape[0])] + [(0, 0)] * (value.ndim - 1)
     with np.errstate(over="ignore"):  # what overflows is refused by name, later
-        return jnp.asarray(xp.pad(value, width, constant_values=fill).astype(dtype))
+        return jnp.asarray(_repeated(name, value, capacity, xp).astype(dtype))
+
+
+def _repeated(name: str, value: Any, capacity: int, xp: Any) -> Any:
+    """A column up to its capacity with its first entry: whoever forgets what is `valid` meets no number of our own making."""
+    missing = (capacity - value.shape[0], *value.shape[1:])
+    if name == "volume" or not value.shape[0]:
+        return xp.concatenate([value, xp.full(missing, NOTHING[name], value.dtype)])
+    return xp.concatenate([value, xp.broadcast_to(value[:1], missing)])
 
 
 def _rest(given: Any, packed: Array, support: Array) -> Array | None:
     """What rounding `given` to `packed` has left, or None where that is negligible."""
     given, rounded = np.asarray(given, np.float64), np.asarray(packed, np.float64)
-    rest = np.zeros_like(rounded)
-    rest[: len(given)] = given - rounded[: len(given)]
+    rest = _repeated("position", given - rounded[: len(given)], len(rounded), np)
     if not (np.abs(rest).max(1) > NEGLIGIBLE * np.asarray(support, np.float64)).any():
         return None
     return jnp.asarray(rest, packed.dtype)

@@ -38,7 +38,7 @@ OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
 
 
-def raised(bit: int, when: Bool[Array, ""]) -> Int[Array, ""]:
+def raised(bit: int, when: Bool[Array, "*any"]) -> Int[Array, "*any"]:
     """The fault word that holds `bit` where `when`."""
     return jnp.where(when, jnp.int32(bit), jnp.int32(NONE))
 

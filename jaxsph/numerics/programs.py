@@ -1,55 +1,166 @@
-"""Compiled programs: made once, run with the time they take booked by stage, compile time apart."""
+"""Compiled programs: made once for the shapes that they are given, several at a time, kept while they are used, truly let go.
+
+A program is traced where it is asked for and compiled beside that, on threads of its own; who calls it waits for it. JAX keeps
+what it compiled for as long as the compiled function lives: so each program is a function of its own, and goes with it.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Hashable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+import collections
+import dataclasses
+import functools
+import gc
+import os
+import threading
+import warnings
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import jax
+import numpy as np
+
+from jaxsph.numerics import memory_maps
+
+QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+"""What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
+of its two emitters. Of the stages so compiled none runs for longer; the march would take four times as long."""
+MAX_PROGRAMS = 64  # those of about seven frames of different shapes: some 12,000 memory maps of 65,530, and 300 MB
+
+Function = TypeVar("Function")
 
 
-class Clock:
-    """Seconds by stage, with compile time apart."""
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A function of fixed shapes, compiled or on the way.
 
-    def __init__(self) -> None:
-        self.seconds = {"plan": 0.0, "compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0, "image": 0.0}
-        self._last = time.perf_counter()
+    Attributes:
+        result: shapes of what it returns.
+        compiled: where it is to be found.
+    """
 
-    def mark(self, stage: str) -> None:
-        """Book the time since the last mark."""
-        now = time.perf_counter()
-        self.seconds[stage] += now - self._last
-        self._last = now
+    result: Any
+    compiled: Future[Callable[..., Any]]
 
-    def run(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """Compile `function` for `arguments` if need be, run it, and book both."""
-        return self.run_all(stage, function, [arguments], **static)[0]
-
-    def run_all(self, stage: str, function: Any, inputs: list[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes, side by side."""
-        program = _compiled(function, inputs[0], static)
-        self.mark("compile")
-        if len(inputs) == 1:
-            results = [jax.block_until_ready(program(*inputs[0]))]
-        else:
-            with ThreadPoolExecutor(len(inputs)) as threads:
-                results = list(threads.map(lambda arguments: jax.block_until_ready(program(*arguments)), inputs))
-        self.mark(stage)
-        return results
+    def __call__(self, *arguments: Any) -> Any:
+        """Run it, once it is compiled."""
+        return self.compiled.result()(*arguments)
 
 
-_PROGRAMS: dict[Hashable, Any] = {}
-MOST_PROGRAMS = 24  # compiled stages that are kept, the oldest goes first: each takes up to 2000 of the 65530 memory maps
+class Programs:
+    """The programs of a process, the least recently used of which goes when there are too many."""
+
+    def __init__(self, most: int = MAX_PROGRAMS) -> None:
+        self._most = most
+        self._kept: collections.OrderedDict[Hashable, Program] = collections.OrderedDict()
+        self._lock = threading.RLock()
+        self._warned = False
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __contains__(self, wanted: tuple[Any, tuple[Any, ...], dict[str, Hashable]]) -> bool:
+        return _key(*wanted)[0] in self._kept
+
+    def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+        """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
+        key, shapes = _key(function, arguments, static)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            while len(self._kept) >= self._most:
+                self._kept.popitem(last=False)
+            self.make_room()
+            program = self._kept[key] = _made(function, shapes, static)
+        program.compiled.add_done_callback(functools.partial(self._forget_failed, key))
+        return program
+
+    def make_room(self) -> None:
+        """Let go of programs as long as the process holds too many memory maps: first of these, then of all that JAX holds."""
+        with self._lock:
+            while self._kept and memory_maps.crowded():
+                for _ in range(-(-len(self._kept) // 2)):
+                    self._kept.popitem(last=False)
+                gc.collect()
+            if not memory_maps.crowded():
+                return
+            jax.clear_caches()
+            gc.collect()
+            if not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"compiled programs held over {memory_maps.CROWDED:.0%} of the {memory_maps.limit()} memory maps that a "
+                    "process may have, so that JAX was made to forget all of them; what is called again is compiled again",
+                    stacklevel=2,
+                )
+
+    def clear(self) -> None:
+        """Let go of all."""
+        with self._lock:
+            self._kept.clear()
+        gc.collect()
+
+    def _forget_failed(self, key: Hashable, compiled: Future[Any]) -> None:
+        if compiled.cancelled() or compiled.exception() is not None:
+            with self._lock:
+                self._kept.pop(key, None)
 
 
-def _compiled(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Any:
-    leaves, structure = jax.tree_util.tree_flatten(arguments)
-    shapes = tuple((leaf.shape, leaf.dtype, leaf.weak_type, leaf.sharding) for leaf in leaves)
-    key = (function, tuple(static.items()), structure, shapes, jax.config.read("jax_enable_x64"))
-    if key not in _PROGRAMS:
-        while len(_PROGRAMS) >= MOST_PROGRAMS:
-            del _PROGRAMS[next(iter(_PROGRAMS))]
-        _PROGRAMS[key] = function.lower(*arguments, **static).compile()
-    return _PROGRAMS[key]
+PROGRAMS = Programs()
+
+
+def shapes_of(tree: Any) -> Any:
+    """Arrays as shapes and dtypes, with where they are if that was chosen for them."""
+    return jax.tree.map(_shape_of, tree)
+
+
+def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return leaf
+    sharding = leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None
+    weak = bool(getattr(leaf, "weak_type", False))
+    return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
+
+
+def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
+    shapes = shapes_of(arguments)
+    leaves, structure = jax.tree.flatten(shapes)
+    return (function, tuple(sorted(static.items())), structure, tuple(leaves), jax.config.read("jax_enable_x64")), shapes
+
+
+def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+    def program(*arguments: Any) -> Any:
+        return function.__wrapped__(*arguments, **static)
+
+    program.__name__ = function.__name__
+    traced = jax.jit(program).trace(*shapes)
+    places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
+    place = places.pop() if len(places) == 1 else None
+    result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
+    return Program(result, _threads().submit(_compile, traced.lower(), function in _LIGHT))
+
+
+_LIGHT: set[Any] = set()
+
+
+def light(function: Function) -> Function:
+    """Mark a jitted function as one that takes longer to compile than to run."""
+    _LIGHT.add(function)
+    return function
+
+
+def _compile(lowered: jax.stages.Lowered, quickly: bool) -> Callable[..., Any]:
+    if not quickly or jax.default_backend() != "cpu":
+        return lowered.compile()
+    try:
+        return lowered.compile(compiler_options=QUICKLY)
+    except jax.errors.JaxRuntimeError:  # options are XLA's own affair, and come and go with its versions
+        return lowered.compile()
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Threads that compile: XLA holds no lock of Python's meanwhile, and uses little more than one core for a program."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(min(max(cores, 2), 8), "jaxsph-compile")

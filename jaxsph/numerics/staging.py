@@ -16,11 +16,12 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 
-def computed_once(always: Bool[Array, ""], function: Callable[..., Any], *arguments: Any) -> Any:
+def computed_once(witness: Bool[Array, ""], function: Callable[..., Any], *arguments: Any) -> Any:
     """`function(*arguments)`, computed once however many consumers it has.
 
     Args:
-        always: a scalar that is true in every run but not known to be when compiling; where it were false, zeros come back.
+        witness: any scalar that is not known when compiling. Its value does not matter: the branch is taken where the number
+            of its bits is not negative, which holds for true, for false, and thus for comparisons with NaN.
         function: pure; returns a pytree of arrays.
     """
     shapes = jax.eval_shape(function, *arguments)
@@ -28,4 +29,5 @@ def computed_once(always: Bool[Array, ""], function: Callable[..., Any], *argume
     def nothing(*_: Any) -> Any:
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
+    always = lax.population_count(jnp.asarray(witness).astype(jnp.int32)) >= 0
     return lax.cond(always, function, nothing, *arguments)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.access.cells import find_cells
-from jaxsph.access.footprint import pixel_ranges
 from jaxsph.access.lists import build_lists, bundle_origins
-from jaxsph.access.ordering import order_particles
+from jaxsph.access.ordering import rank_particles
+from jaxsph.access.view import view_particles
 
 
 def sample_depths(camera, samples, dtype):
@@ -23,14 +23,15 @@ def sample_depths(camera, samples, dtype):
 @functools.partial(jax.jit, static_argnames="plan")
 def grid(particles, camera, plan):
     depths = sample_depths(camera, plan.samples, particles.dtype)
-    ordered = order_particles(particles, camera, depths, plan.cast.slab_samples, plan.num_classes)
-    lists = build_lists(ordered, camera, depths, plan.lists, 0)
+    viewed = view_particles(particles, camera, depths, plan.num_classes)
+    ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
+    lists = build_lists(ordered, camera, plan.lists, 0)
     return (
         ordered,
         lists,
         find_cells(ordered, lists),
         bundle_origins(plan.lists, 0),
-        pixel_ranges(ordered, camera, depths[0], depths[-1]),
+        (ordered.left, ordered.right, ordered.top, ordered.bottom),
     )
 
 

@@ -8,23 +8,21 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.access.grid import Grid
 from jaxsph.access.lattice import FINEST, GAP, REACH, Lattice, Region, Spacing, region_of
 from jaxsph.cast.nodes import interpolate, sum_at_nodes
 from jaxsph.control.spacing import WIDEST
 from jaxsph.model import kernels
-from jaxsph.stages import grid_parts, order
 
 WIDER = Spacing(8, 4)
 
 
 @pytest.mark.parametrize("spacing", [FINEST, WIDER])
-def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64, spacing):
+def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spacing):
     rng = np.random.default_rng(5)
     scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
     plan = js.plan(scene, camera, frames.settings)
-    ordered = order(scene.particles, camera, plan=plan)
-    grid = Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
+    grid, _ = stages(scene.particles, camera, plan=plan)
+    ordered = grid.ordered
     lattice = sum_at_nodes(
         grid,
         camera,
@@ -58,13 +56,12 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, x64, spacing):
     assert weight.max() > 0
 
 
-def test_a_region_with_little_room_holds_the_same_nodes(frames):
+def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     """As far as it reaches: from the first row and column of bundles that are touched."""
     rng = np.random.default_rng(5)
     scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
     plan = js.plan(scene, camera, frames.settings)
-    ordered = order(scene.particles, camera, plan=plan)
-    grid = Grid(ordered, *grid_parts(ordered, camera, jnp.int32(0), plan=plan))
+    grid, _ = stages(scene.particles, camera, plan=plan)
     every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
     kept = slice(None), slice(-GAP), slice(-GAP)
     whole, part = (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.model.particles import capacity_class
 
 good = {"position": np.zeros((3, 3)), "support": np.ones(3), "quantity": np.arange(3.0), "volume": np.ones(3)}
 
@@ -54,6 +55,35 @@ def test_padding_is_marked_invalid():
     assert particles.capacity == 8
     assert particles.num_particles == 3
     assert particles.valid.tolist() == [True] * 3 + [False] * 5
+
+
+@pytest.mark.parametrize("count", [*range(70), 20_000, 20_480, 20_481, 10**6, 2**30])
+def test_capacities_come_in_four_classes_an_octave(count):
+    capacity = capacity_class(count)
+    assert max(count, 1) <= capacity <= max(1.25 * count, count + 1)
+    assert capacity_class(capacity) == capacity
+    while capacity > 7 and capacity % 2 == 0:
+        capacity //= 2
+    assert capacity <= 7
+
+
+def test_sets_of_similar_size_have_the_same_capacity_and_keep_their_number():
+    for count in range(900, 1024, 9):
+        particles = js.Particles.from_arrays(np.ones((count, 3)), 0.5, 2.0)
+        assert (particles.num_particles, particles.capacity) == (count, 1024)
+
+
+def test_padding_is_the_first_particle_without_volume():
+    """So that who forgets what is valid meets no place, support or quantity that nobody gave."""
+    for particles in (js.Particles.from_arrays(**good, capacity=8), js.Particles.from_arrays(**good).padded(8)):
+        np.testing.assert_array_equal(particles.position[3:], np.tile(good["position"][:1], (5, 1)))
+        np.testing.assert_array_equal(particles.quantity[3:], [good["quantity"][0]] * 5)
+        np.testing.assert_array_equal(particles.volume[3:], np.zeros(5))
+        assert particles.valid.tolist() == [True] * 3 + [False] * 5
+        for name, column in particles.to_numpy().items():
+            np.testing.assert_array_equal(column, np.asarray(getattr(particles, name))[:3])
+    with pytest.raises(ValueError, match="`capacity` must be at least 8, the entries there are, got 7"):
+        particles.padded(7)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, jnp.bfloat16, np.float32, np.float64, np.int32])

@@ -27,7 +27,7 @@ def test_each_fluid_is_a_ball_at_first_and_sheets_later():
     contact = []
     for frame in (0, 8):
         particles = scenes.load("flubber", 4000, frame)[0].particles
-        position, fluid = np.asarray(particles.position), np.asarray(particles.quantity)
+        position, fluid = (particles.to_numpy()[name] for name in ("position", "quantity"))
         assert (fluid == 0).sum() == (fluid == 1).sum() == 2000
         away, _ = cKDTree(position[fluid == 0]).query(position[fluid == 1])
         contact.append((away < 0.1).mean())

@@ -9,7 +9,8 @@ from jaxsph.scenes.letters import BASIN, GLYPHS, GRAVITY, SECONDS_A_FRAME, STROK
 
 def columns(frame, count=4000):
     particles = scenes.load("letters", count, frame)[0].particles
-    return np.asarray(particles.position, np.float64), np.asarray(particles.quantity)
+    columns = particles.to_numpy()
+    return columns["position"].astype(np.float64), columns["quantity"]
 
 
 def test_dye_tells_the_letters_apart_and_shares_are_those_of_their_volumes():

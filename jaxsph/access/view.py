@@ -1,0 +1,152 @@
+r"""Particles as a camera sees them: view coordinates, strengths, and the pixels that each can touch.
+
+Flow: particles -> [view] -> plan, ordering -> lists -> cells -> cast -> image.
+
+All that is asked of a single particle, whatever the others are: capacities are counted from it, and then it is ranked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.footprint import pixel_ranges
+from jaxsph.access.resolution import LIFT, ROUNDING, unresolved, weakest
+from jaxsph.model import kernels
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles
+from jaxsph.numerics import exponents, faults
+
+DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
+DEAD_CLASS = 255
+
+
+@dataclasses.dataclass(frozen=True)
+class Viewed:
+    """Particles in view space, in their own order; those that no sample can meet are not `live`, and their numbers are 0.
+
+    Attributes:
+        x, y, z: view coordinates, length units.
+        reach: the support widened by the rounding of coordinates: what lies outside has weight zero in floating point.
+        scale, size: the particle's strength m = V / H^3, of which the largest is 2^LIFT, folded into its lengths:
+            `size = m^(1/n)` and `scale = size / H`, with n the degree of its kernel.
+        quantity: that is carried.
+        live: whether any sample can meet the particle.
+        left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
+            `left > right` or `top > bottom`.
+        extent: diameter in samples along depth.
+        key: class of support above depth, what they are ranked by.
+        widest: largest reach of each class.
+        faults: fault word.
+    """
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    reach: Float[Array, " particles"]
+    scale: Float[Array, " particles"]
+    size: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+    live: Bool[Array, " particles"]
+    left: Int[Array, " particles"]
+    right: Int[Array, " particles"]
+    top: Int[Array, " particles"]
+    bottom: Int[Array, " particles"]
+    extent: Float[Array, " particles"]
+    key: Int[Array, " particles"]
+    widest: Float[Array, " classes"]
+    faults: Int[Array, ""]
+
+
+def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int) -> Viewed:
+    """See `particles` from `camera`, with samples at `depths` (ascending).
+
+    Differentiation:
+        The columns x, y, z, scale, size and quantity have derivatives; all else is held fixed.
+    """
+    offset = camera.offset(particles.position, particles.position_rest)
+    view = camera.rotate(offset)
+    x, y, z = view[:, 0], view[:, 1], view[:, 2]
+    finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
+    usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
+    usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
+    eps = jnp.finfo(view.dtype).eps * ROUNDING
+    distance = jnp.abs(offset).max(1)
+    reach = lax.stop_gradient(particles.support * (1 + eps) + eps * distance)
+    live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
+
+    octave, widest = _classes(reach, live, num_classes)
+    scale, size, vanishes = _folded(particles, live)
+    columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size, "quantity": particles.quantity}
+    columns = {name: jnp.where(live, column, 0) for name, column in columns.items()}
+    blurred = unresolved(view, distance, particles.support, camera, depths)
+    word = faults.raised(faults.BAD_PARTICLES, particles.valid & ~usable)
+    word |= faults.raised(faults.UNRESOLVED, live & blurred) | faults.raised(faults.WEAK_PARTICLES, vanishes)
+    seen, still = {name: lax.stop_gradient(columns[name]) for name in "xyz"}, lax.stop_gradient(camera)
+    left, right, top, bottom = pixel_ranges(**seen, reach=reach, live=live, camera=still, between=(depths[0], depths[-1]))
+    front, back = (_part(still, seen["z"] + side) for side in (-reach, reach))
+    return Viewed(
+        **columns,
+        reach=reach,
+        live=live,
+        left=left,
+        right=right,
+        top=top,
+        bottom=bottom,
+        extent=(back - front) * depths.shape[0],
+        key=(octave << DEPTH_BITS) | depth_key(camera, z),
+        widest=widest,
+        faults=jnp.bitwise_or.reduce(word),
+    )
+
+
+def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
+    """Depth as an integer of `DEPTH_BITS` bits, uniform in sample space, clamped at near and far."""
+    return jnp.minimum(_part(camera, z) * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
+
+
+def _part(camera: Camera, z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Where in sample space a depth lies, from 0 at near to 1 at far, in float32."""
+    z = jnp.clip(z, camera.near, camera.far)
+    if camera.is_perspective:
+        part = jnp.log(z / camera.near) / jnp.log(camera.far / camera.near)
+    else:
+        part = (z - camera.near) / (camera.far - camera.near)
+    return jnp.clip(part.astype(jnp.float32), 0, 1)
+
+
+def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
+    """The class of each particle, by octaves below the largest reach, and the largest reach of each class."""
+    largest = jnp.where(live, reach, 0).max(initial=0)
+    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
+    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
+    each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
+    return octave, jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
+
+
+def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
+    """`scale` and `size` of every particle, and which are so weak that they would vanish.
+
+    CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32. What
+    all of them are divided by changes nothing, and carries no gradient; nor does a strength of 0.
+    """
+    support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
+    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
+    mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
+    counts = live & (large > 0)
+    exponent -= jnp.where(counts, exponent, jnp.iinfo(jnp.int32).min).max(initial=jnp.iinfo(jnp.int32).min // 2)
+    strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
+    peak = lax.stop_gradient(strength.max(initial=0))
+    strength = strength / jnp.where(peak > 0, peak, 1)
+    kernel = kernels.by_name(particles.kernel)
+    lift = 2.0 ** (LIFT // kernel.degree)
+    size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
+    weak = (counts & (strength < weakest(kernel.degree, strength.dtype))) | (live & exponents.is_subnormal(volume))
+    return size / support, size, weak
+
+
+jax.tree_util.register_dataclass(Viewed, data_fields=[field.name for field in dataclasses.fields(Viewed)], meta_fields=[])

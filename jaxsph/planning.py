@@ -1,0 +1,170 @@
+"""From a scene to a plan: view it, measure it, and take the plan of an earlier frame where that fits (host side).
+
+Flow: scene, camera, settings -> view_scene -> measure -> [planning] -> frame.
+
+Frames of a sequence differ a little in everything. So a plan that is kept is taken again as long as it has room and is at most
+one class too large. Room changes no bit of an image, and all else in a plan follows from the frame alone: so an image does not
+depend on what was rendered before it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import threading
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsph.access.view import Viewed
+from jaxsph.measures import measure
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.executors import Clock, Executor
+from jaxsph.numerics.programs import light
+from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class
+from jaxsph.viewing import view_scene
+
+MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
+MAX_KEPT = 64
+
+
+def plan(
+    scene: Scene,
+    camera: Camera,
+    settings: Settings | None = None,
+    *,
+    like: Plan | None = None,
+    slab_samples: int | None = None,
+) -> Plan:
+    """Measure the room that a frame needs (host side; values must be concrete).
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`.
+        like: a plan to grow: returned as it is where it has room for this frame, else with more; so that one plan, and
+            what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
+        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
+            support is in samples.
+
+    Raises:
+        ValueError: under a trace; when even a band of one row of tiles exceeds `settings.memory_limit`; where `like` is for
+            another image or kind of error control.
+    """
+    settings = settings or Settings()
+    if is_traced(scene, camera):
+        raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    shape = shape_of(scene.particles, camera, settings)
+    if like is not None:
+        like.check_image(camera, settings)
+        capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
+        shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
+    measures = measure(see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, Clock()).viewed, camera.height)
+    choices = choose(measures, settings, slab_samples) if like is None else like.choices
+    made = fitted(measures, shape, settings, choices)
+    return made if like is None else like.grown(made)
+
+
+class Seen(NamedTuple):
+    """What the camera sees: particles in view space, and the transfer function in the same units."""
+
+    viewed: Viewed
+    transfer: TransferFunction
+
+
+def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: int, run: Executor) -> Seen:
+    """Have the scene viewed, with its particles padded to a capacity."""
+    if scene.particles.capacity < capacity:
+        scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particles,), capacity=capacity))
+    return Seen(*run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes))
+
+
+@light
+@functools.partial(jax.jit, static_argnames="capacity")
+def pad(particles: Particles, *, capacity: int) -> Particles:
+    """`Particles.padded` as a stage."""
+    return particles.padded(capacity)
+
+
+class Plans:
+    """The plans of a process's frames, the least recently used of which goes when there are too many."""
+
+    def __init__(self) -> None:
+        self._kept: list[Plan] = []
+        self._lock = threading.Lock()
+
+    def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
+        """A plan for this frame, kept or new, and the frame as seen with its capacity."""
+        shape = self._similar(shape_of(scene.particles, camera, settings))
+        run.mark("plan")
+        seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
+        measures = measure(seen.viewed, camera.height)
+        choices = choose(measures, settings)
+        needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
+        made = self._recalled(needed, settings) or fitted(measures, shape, settings, choices)
+        self._keep(made)
+        run.mark("plan")
+        return made, seen
+
+    def clear(self) -> None:
+        """Forget all."""
+        with self._lock:
+            self._kept.clear()
+
+    def _similar(self, shape: FrameShape) -> FrameShape:
+        """The same frame with the capacity and the classes of the smallest kept plan that has room for it."""
+        image = shape.width, shape.height, shape.samples
+        capacities = [
+            (kept.num_particles, kept.num_classes)
+            for kept in self._kept
+            if (kept.width, kept.height, kept.samples) == image
+            and shape.num_particles <= kept.num_particles <= next_class(shape.num_particles)
+            and shape.num_classes <= kept.num_classes <= shape.num_classes + 1
+        ]
+        if not capacities:
+            return shape
+        capacity, classes = min(capacities)
+        headroom = shape.headroom * capacity / shape.num_particles
+        return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
+
+    def _recalled(self, needed: Plan, settings: Settings) -> Plan | None:
+        """The smallest kept plan that has room for what is needed, and not much more."""
+        fits = [
+            kept
+            for kept in self._kept
+            if kept.control == needed.control
+            and kept.serves(needed)
+            and kept.is_near(needed)
+            and kept.bytes <= settings.memory_limit
+        ]
+        return min(fits, key=lambda kept: kept.lists.list_capacity, default=None)
+
+    def _keep(self, plan: Plan) -> None:
+        with self._lock:
+            self._kept = [*(kept for kept in self._kept if kept != plan), plan][-MAX_KEPT:]
+
+
+PLANS = Plans()
+
+
+def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameShape:
+    """What is known of a frame before it is measured."""
+    capacity, valid = particles.capacity, np.asarray(particles.valid)
+    headroom = capacity / max(int(valid.sum()), 1)
+    headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
+    number = np.dtype(particles.dtype).itemsize
+    size = camera.width, camera.height, settings.samples
+    return FrameShape(*size, capacity, _num_classes(np.asarray(particles.support)[valid]), headroom, number)
+
+
+def _num_classes(support: Any) -> int:
+    support = support[np.isfinite(support) & (support > 0)]
+    if support.size == 0:
+        return 1
+    octaves = math.log2(float(support.max()) / float(support.min()))
+    return min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)
