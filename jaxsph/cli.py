@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 import jaxsph
-from jaxsph import cli_sweep, scenes
+from jaxsph import cli_cache, cli_sweep, scenes
 from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
 from jaxsph.scenes.view import snug
@@ -29,7 +29,7 @@ IMAGE_SUFFIXES = (".exr", ".png")
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 DEMO_TOLERANCE = 0.004
 DEMO_CHECK = 64
-"""Edge in pixels of the image that `demo` compares with the float64 reference."""
+"""Rows and columns of pixels, about, that `demo` compares with the float64 reference."""
 
 
 class UsageError(Exception):
@@ -37,12 +37,19 @@ class UsageError(Exception):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; the result is the exit code."""
+    """Run the command line; the result is the exit code.
+
+    Args:
+        arguments: those of the process if not given. Only then are compiled programs kept for other processes, as a caller
+            may have set up JAX otherwise.
+    """
     try:
         options = _parser().parse_args(arguments)
     except SystemExit as stop:  # --help, --version and what argparse refuses
         return int(stop.code or DONE)
     try:
+        if arguments is None:
+            cli_cache.begin(keep=not options.no_cache)
         options.run(options)
     except KeyboardInterrupt:
         return _failed(options, "interrupted", INTERRUPTED)
@@ -88,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     common = _Parser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show where an error comes from")
+    common.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next command")
 
     def command(name: str, run: Callable[[argparse.Namespace], None], text: str, more: str) -> argparse.ArgumentParser:
         made = commands.add_parser(name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}. {more}")
@@ -101,7 +109,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_picture(render)
     _add_control(render)
     info = command("info", _info, "say what a particle file holds", "And what `render` would show of it.")
-    _add_source(info)
+    _add_source(info, optional=True)
+    info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
     sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
     _add_source(sweep)
@@ -114,8 +123,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_source(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", metavar="FILE|scene:NAME", help="particle file, or built-in scene")
+def _add_source(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    number: dict[str, Any] = {"nargs": "?"} if optional else {}
+    parser.add_argument("source", metavar="FILE|scene:NAME", help="particle file, or built-in scene", **number)
     add = parser.add_argument_group("particles of a file").add_argument
     add("--quantity", metavar="NAME", help="an attribute, density, speed, x, y, z, or log10:NAME of any of these")
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
@@ -291,6 +301,13 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
 
 
 def _info(options: argparse.Namespace) -> None:
+    if options.cache:
+        for what, text in cli_cache.described():
+            say(what, text)
+        if options.source is None:
+            return
+    if options.source is None:
+        raise UsageError("a particle file or scene:NAME is needed, or --cache")
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
         say("quantity", f"concentration, {span(scene.particles.to_numpy()['quantity'])}")
@@ -333,16 +350,19 @@ def _demo(options: argparse.Namespace) -> None:
     for output in outputs:
         image.save(output)
     exact = dataclasses.replace(settings, tolerance=None)
-    error = largest_difference(image, jaxsph.render(scene, camera, exact))
-    small = dataclasses.replace(camera, width=DEMO_CHECK, height=DEMO_CHECK)
-    truth = jaxsph.reference.render(scene, small, exact)
-    rounding = largest_difference(jaxsph.render(scene, small, exact), truth)
+    full = jaxsph.render(scene, camera, exact)
+    error = largest_difference(image, full)
+    every = max(min(width, height) // DEMO_CHECK, 1)
+    truth = jaxsph.reference.render(scene, camera, exact, every=every)
+    some = slice(every // 2, None, every)
+    seen = dataclasses.replace(full, color=full.color[some, some], transmittance=full.transmittance[some, some])
+    rounding = largest_difference(seen, truth)
     say("scene", f"mixer, {scene.particles.num_particles:,} particles")
     for output in outputs:
         say("image", str(output.resolve()))
     say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {largest(image.error_bound):.2g}")
     say("error", f"{error:.2g}, the largest against full sampling")
-    say("", f"{rounding:.2g} of full sampling against float64 brute force at {DEMO_CHECK} x {DEMO_CHECK} pixels")
+    say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
     say("time", time_line(image, elapsed))
 
 

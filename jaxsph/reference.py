@@ -21,13 +21,15 @@ from jaxsph.model.transfer import TransferFunction
 __all__ = ["field", "render", "sample_depths"]
 
 
-def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cull: bool = True) -> Image:
+def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cull: bool = True, every: int = 1) -> Image:
     """Render `scene` at full rate in float64.
 
     Args:
         scene, camera: as for `jaxsph.render`; their (possibly float32) numbers are taken as exact.
         settings: only `samples` is looked at.
         cull: evaluate a particle only in the box of samples around its support; `False` evaluates it everywhere.
+        every: only every so many rows and columns of pixels, from number `every // 2` on: the image is
+            `[every // 2 :: every, every // 2 :: every]` of the whole.
 
     Returns:
         Image of float64 NumPy arrays; `certified`, with `error_bound` 0, as it is the reference itself.
@@ -37,11 +39,13 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     """
     started = time.perf_counter()
     settings = settings or Settings()
-    numerator, denominator, evaluations = field(scene, camera, settings.samples, cull=cull)
+    if every < 1:
+        raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
+    numerator, denominator, evaluations = field(scene, camera, settings.samples, cull=cull, every=every)
     inside = denominator > 0
     quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
     edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
-    color, transmittance, depth = _composite(quantity, inside, edges, _ray_lengths(camera), scene.transfer)
+    color, transmittance, depth = _composite(quantity, inside, edges, _ray_lengths(camera, every), scene.transfer)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
     counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
@@ -55,21 +59,23 @@ def sample_depths(camera: Camera, samples: int) -> np.ndarray:
     return _depth(camera, np.arange(samples) + 0.5, samples)
 
 
-def field(scene: Scene, camera: Camera, samples: int, *, cull: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of the CSPH field at every sample.
+def field(
+    scene: Scene, camera: Camera, samples: int, *, cull: bool = True, every: int = 1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums of the CSPH field at every sample, of all pixels or of `every` so many as in `render`.
 
     Returns:
         `sum q_j V_j W_j`, `sum V_j W_j` (each up to one common factor) and the number of particles evaluated, all
         (height, width, samples).
     """
-    u, v = _ray_coordinates(camera)
+    u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
     kernel = kernels.by_name(scene.particles.kernel)
     position, support, quantity, volume = _particles(scene, camera)
     strength = volume / support**3
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
-    shape = (camera.height, camera.width, samples)
+    shape = (len(v), len(u), samples)
     numerator, denominator, evaluations = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int32)
     for (x, y, z), h, q, m in zip(position, support, quantity, strength, strict=True):
         rows, columns, depths = _box(x, y, z, h, u, v, s, camera.is_perspective) if cull else (slice(None),) * 3
@@ -92,18 +98,18 @@ def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, ...]:
     return view, support, quantity, volume
 
 
-def _ray_coordinates(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    half = float(camera.half_height)
+def _ray_coordinates(camera: Camera, every: int) -> tuple[np.ndarray, np.ndarray]:
+    half, pixels = float(camera.half_height), slice(every // 2, None, every)
     u = half * camera.width / camera.height * (2 * (np.arange(camera.width) + 0.5) / camera.width - 1)
     v = half * (1 - 2 * (np.arange(camera.height) + 0.5) / camera.height)
-    return u, v
+    return u[pixels], v[pixels]
 
 
-def _ray_lengths(camera: Camera) -> np.ndarray:
+def _ray_lengths(camera: Camera, every: int) -> np.ndarray:
     """|d|: path length a unit of depth, (height, width)."""
-    u, v = _ray_coordinates(camera)
+    u, v = _ray_coordinates(camera, every)
     if not camera.is_perspective:
-        return np.ones((camera.height, camera.width))
+        return np.ones((len(v), len(u)))
     return np.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2)
 
 

@@ -112,15 +112,18 @@ class Forecast:
 
 
 class Traced:
-    """Calls the functions as they are, as part of a larger program."""
+    """Calls the functions that are jitted, as part of a larger program.
+
+    Not as jitted functions: JAX would keep what it traced of them for as long as they live, for every shape.
+    """
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """`function(*arguments, **static)`."""
-        return function(*arguments, **static)
+        return function.__wrapped__(*arguments, **static)
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """One after the other."""
-        return [function(*arguments, **static) for arguments in inputs]
+        return [function.__wrapped__(*arguments, **static) for arguments in inputs]
 
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """A trace knows no values, and has to be ready for either."""

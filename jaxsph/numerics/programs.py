@@ -55,6 +55,11 @@ class Programs:
         self._kept: collections.OrderedDict[Hashable, Program] = collections.OrderedDict()
         self._lock = threading.RLock()
         self._warned = False
+        self._told: Callable[[], None] | None = None
+
+    def on_compile(self, told: Callable[[], None] | None) -> None:
+        """Have `told` called whenever a program is not at hand and begins to be compiled."""
+        self._told = told
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -72,6 +77,8 @@ class Programs:
             while len(self._kept) >= self._most:
                 self._kept.popitem(last=False)
             self.make_room()
+            if self._told is not None:
+                self._told()
             program = self._kept[key] = _made(function, shapes, static)
         program.compiled.add_done_callback(functools.partial(self._forget_failed, key))
         return program

@@ -1,0 +1,65 @@
+"""One process renders any number of shapes: what it holds of memory and of memory maps levels off."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.numerics import memory_maps
+
+FRAMES_PER_SHAPE = 10
+ESTIMATORS = ({}, {"tolerance": 0.01, "estimator": "interval", "super_pixels": False}, {"tolerance": 0.01, "estimator": "pilot"})
+
+
+def resident() -> int:
+    """Bytes of memory that this process holds; 0 where that cannot be known."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * 4096
+
+
+def render_shape(nth: int) -> None:
+    """Frames of one shape by all estimators in turn, and a gradient, each compiled for it."""
+    width, samples = 64 + nth, 32 + nth % 16
+    scene, camera = js.scenes.load("radial", particles=400 + 40 * nth, width=width, height=64)
+    for frame in range(FRAMES_PER_SHAPE - 1):
+        settings = js.Settings(samples=samples, **ESTIMATORS[frame % len(ESTIMATORS)])
+        image = js.render(scene, camera, settings)
+        assert image.faults == 0 and np.isfinite(np.asarray(image.color)).all() and float(image.alpha.max()) > 0.1
+    settings = js.Settings(samples=samples)
+    plan = js.plan(scene, camera, settings)
+
+    def light(extinction: jax.Array) -> jax.Array:
+        transfer = dataclasses.replace(scene.transfer, extinction=extinction)
+        return js.render(js.Scene(particles=scene.particles, transfer=transfer), camera, settings, plan=plan).color.sum()
+
+    slope = jax.jit(jax.grad(light))(scene.transfer.extinction)
+    assert np.isfinite(np.asarray(slope)).all() and np.abs(np.asarray(slope)).max() > 0
+
+
+@pytest.mark.slow
+def test_five_hundred_frames_of_fifty_shapes_in_one_process(capsys):
+    """Three estimators and gradients, which used to end the process after 33 shapes."""
+    maps, memory = [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that JAX is made to forget is what is wanted here
+        for nth in range(50):
+            render_shape(nth)
+            gc.collect()
+            maps.append(memory_maps.in_use() or 0)
+            memory.append(resident())
+            with capsys.disabled():
+                print(f"{nth + 1} shapes: {maps[-1]} memory maps, {memory[-1] / 2**20:.0f} MiB", flush=True)
+    limit = memory_maps.limit() or 1 << 62
+    assert max(maps) < 0.7 * limit
+    assert max(maps[25:]) <= 1.2 * max(maps[:25])
+    assert max(memory[25:]) <= 1.35 * max(memory[:25])
