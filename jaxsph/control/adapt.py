@@ -112,7 +112,7 @@ def adapt(
 def untouched(cells: Cells, slab_samples: int) -> Int[Array, "cells bundles"]:
     """Levels of cells that are all left at full rate."""
     empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL), slab_samples)
-    return jnp.where(empty, EMPTY, 0)
+    return jnp.where(empty, jnp.int32(EMPTY), 0)
 
 
 def _nowhere(cells: Cells, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
