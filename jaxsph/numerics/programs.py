@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from jaxsph.numerics import memory_maps
+from jaxsph.numerics import free_memory, memory_maps
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
@@ -54,6 +54,8 @@ class Programs:
         self._most = most
         self._kept: collections.OrderedDict[Hashable, Program] = collections.OrderedDict()
         self._lock = threading.RLock()
+        self._compiling = 0
+        self._let_go = False
         self._warned = False
         self._told: Callable[[], None] | None = None
 
@@ -76,11 +78,13 @@ class Programs:
                 return self._kept[key]
             while len(self._kept) >= self._most:
                 self._kept.popitem(last=False)
+                self._let_go = True
             self.make_room()
             if self._told is not None:
                 self._told()
             program = self._kept[key] = _made(function, shapes, static)
-        program.compiled.add_done_callback(functools.partial(self._forget_failed, key))
+            self._compiling += 1
+        program.compiled.add_done_callback(functools.partial(self._compiled, key))
         return program
 
     def make_room(self) -> None:
@@ -108,10 +112,15 @@ class Programs:
             self._kept.clear()
         gc.collect()
 
-    def _forget_failed(self, key: Hashable, compiled: Future[Any]) -> None:
-        if compiled.cancelled() or compiled.exception() is not None:
-            with self._lock:
+    def _compiled(self, key: Hashable, compiled: Future[Any]) -> None:
+        with self._lock:
+            self._compiling -= 1
+            if compiled.cancelled() or compiled.exception() is not None:
                 self._kept.pop(key, None)
+            tidy = self._let_go and self._compiling == 0
+            self._let_go &= not tidy
+        if tidy:  # it takes a tenth of a second, which the first frames of a process need not wait for
+            free_memory.give_back()
 
 
 PROGRAMS = Programs()
