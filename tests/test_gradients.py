@@ -1,89 +1,15 @@
 """Gradients of images: those of differences, the same in both modes, finite everywhere, zero for what is not there."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adversary import cameras, scenes
+from derivatives import AGREE, CLOSE, along, anyhow, differ, filled, looked, pulled, towards, valued, weights
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-import jaxsph as js
-from jaxsph.control.adapt import ControlPlan
-from jaxsph.control.pilot import PilotPlan
-
-STEP = 1e-7  # of a difference: so small that hardly a sample meets a kink of the transfer function on the way
-CLOSE = 1e-6  # of the sum of a slope's terms, and of one: the rounding of some thousand pixels over the step, with room
-AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers, some thousands of them, in another order
-QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
-ADAPTIVE = {"super_pixels": False}
-STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this file's even scene
-
-
-def total(inputs, worth, settings, plan):
-    """All layers that have derivatives, each pixel as often as it is worth."""
-    image = js.render(*inputs, settings, plan=plan)
-    return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * worth).sum()
-
-
-@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def looked(inputs, move, worth, settings, plan):
-    """The total, its slope in a direction by forward mode, and its gradient by reverse mode: one program."""
-
-    def of(inputs):
-        return total(inputs, worth, settings, plan)
-
-    return *jax.jvp(of, (inputs,), (move,)), jax.grad(of, allow_int=True)(inputs)
-
-
-def pulled(inputs, worth, settings, plan):
-    return looked(inputs, still(inputs), worth, settings, plan)[2]
-
-
-@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def valued(inputs, worth, settings, plan):
-    """The total and its gradient: a smaller program."""
-    return jax.value_and_grad(total, allow_int=True)(inputs, worth, settings, plan)
-
-
-def still(inputs):
-    """A direction in which nothing moves."""
-    floating = functools.partial(jnp.issubdtype, arg2=jnp.floating)
-    return jax.tree.map(lambda x: jnp.zeros_like(x) if floating(x.dtype) else np.zeros(x.shape, jax.dtypes.float0), inputs)
-
-
-def along(owed, move):
-    """Slope in the direction `move`, and the sum of its terms' sizes."""
-    pairs = zip(jax.tree.leaves(owed), jax.tree.leaves(move), strict=True)
-    terms = [np.asarray(a * b).ravel() for a, b in pairs if a.dtype != jax.dtypes.float0]
-    return float(sum(t.sum() for t in terms)), float(sum(np.abs(t).sum() for t in terms))
-
-
-def stepped(inputs, move, step):
-    return jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + step * d, inputs, move)
-
-
-def differ(inputs, move, worth, settings, plan):
-    """The central difference in the direction `move`, and the slope and gradient there."""
-    ahead, behind = (looked(stepped(inputs, move, by), still(inputs), worth, settings, plan)[0] for by in (STEP, -STEP))
-    _, pushed, owed = looked(inputs, move, worth, settings, plan)
-    return float(ahead - behind) / (2 * STEP), float(pushed), owed
-
-
-def weights(rng, frames):
-    return jnp.asarray(rng.normal(size=(frames.height, frames.width, 4)))
-
-
-def filled(frames, rng, dtype=np.float64):
-    """A frame without empty space, where colours would jump as a support's edge passes a sample."""
-    scene, camera = frames.scene(rng, dtype=dtype), frames.camera(rng, dtype=dtype)
-    particles = scene.particles
-    position, support = particles.position.at[0].set(0), particles.support.at[0].set(20)
-    volume = particles.volume.at[0].set(1e3)
-    particles = dataclasses.replace(particles, position=position, support=support, volume=volume)
-    return dataclasses.replace(scene, particles=particles), camera
 
 
 def leaves_the_image(inputs, rng):
@@ -97,14 +23,6 @@ def turns(inputs, rng):
     """About all three axes: a tangent of rotations."""
     x, y, z = rng.normal(size=3)
     return {"axes": jnp.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ inputs[1].axes}
-
-
-def anyhow(*names):
-    def move(inputs, rng):
-        parts = {**vars(inputs[0].particles), **vars(inputs[0].transfer), **vars(inputs[1])}
-        return {name: jnp.asarray(rng.normal(size=parts[name].shape)) for name in names}
-
-    return move
 
 
 PHENOMENA = {
@@ -125,17 +43,6 @@ PHENOMENA = {
 }
 
 
-def towards(inputs, named):
-    """The direction that moves the parts that are `named`, and nothing else."""
-    zero = still(inputs)
-    scene, camera = zero
-
-    def put(part):
-        return dataclasses.replace(part, **{name: move for name, move in named.items() if name in vars(part)})
-
-    return dataclasses.replace(scene, particles=put(scene.particles), transfer=put(scene.transfer)), put(camera)
-
-
 @pytest.mark.parametrize("phenomenon", PHENOMENA)
 def test_gradients_are_those_of_differences_when(frames, x64, phenomenon):
     rng = np.random.default_rng(list(PHENOMENA).index(phenomenon))
@@ -148,13 +55,20 @@ def test_gradients_are_those_of_differences_when(frames, x64, phenomenon):
     assert pushed == pytest.approx(slope, abs=AGREE * size)
 
 
-@pytest.mark.parametrize(("kernel", "projection"), [("poly6", "perspective"), ("cubic_spline", "orthographic")])
+@pytest.mark.parametrize(("kernel", "projection"), [
+    ("poly6", "perspective"), ("wendland_c2", "orthographic"),
+    pytest.param("cubic_spline", "perspective", marks=pytest.mark.slow),
+])  # fmt: skip
 @settings(max_examples=15)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_both_modes_agree_on_hard_scenes(frames, adversary, kernel, projection, seed):
+@given(data=st.data(), seed=st.integers(0, 2**32 - 1))
+def test_both_modes_agree_on_hard_scenes(frames, kernel, projection, data, seed):
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
-        inputs = adversary.scene(rng, kernel, np.float64), adversary.camera(rng, projection, np.float64)
+        scene = data.draw(scenes(kernel))
+        # off all control points: at a jump or a kink itself there is no slope, and rounding takes either side
+        quantity = scene.particles.quantity + 1e-4 * np.sqrt(2)
+        scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
+        inputs = scene, data.draw(cameras(frames, projection))
         names = ("position", "support", "quantity", "volume", "values", "colors", "extinction", "eye", "axes", "half_height")
         move = towards(inputs, anyhow(*names)(inputs, rng))
         worth, plan = weights(rng, frames), frames.plan()
@@ -223,6 +137,10 @@ def test_gradients_are_finite_with(frames, special, dtype):
             assert part.dtype == jax.dtypes.float0 or (part.dtype == dtype and np.isfinite(part).all())
         if special == "empty space":
             assert not any(np.any(part) for part in jax.tree.leaves(owed) if part.dtype != jax.dtypes.float0)
+        if special == "no volume":
+            particles = owed[0].particles
+            for part in (particles.position, particles.support, particles.quantity, particles.volume):
+                assert not np.any(part[:3]) and np.any(part[3:])
 
 
 def test_single_precision_gives_the_same_gradients_but_for_rounding(frames):
@@ -236,7 +154,9 @@ def test_single_precision_gives_the_same_gradients_but_for_rounding(frames):
             owed[dtype] = jax.tree.map(np.asarray, pulled(*given) if dtype is np.float64 else valued(*given)[1])
     for exact, rounded in zip(*(jax.tree.leaves(found) for found in owed.values()), strict=True):
         if exact.dtype != jax.dtypes.float0:
-            np.testing.assert_allclose(rounded, exact, atol=1e-3 * max(np.abs(exact).max(), 1))
+            # of a camera's few numbers all samples are owed, and nearly cancel
+            share = 1e-4 if exact.size > 9 else 5e-3
+            assert np.linalg.norm(rounded - exact) <= share * max(np.linalg.norm(exact), 1e-3)
 
 
 def test_padding_and_what_is_out_of_view_owe_nothing(frames, x64):
@@ -248,96 +168,3 @@ def test_padding_and_what_is_out_of_view_owe_nothing(frames, x64):
     for part in (owed.position, owed.support, owed.quantity, owed.volume):
         assert not np.any(part[9:]) and not np.any(part[3])
         assert np.any(part[:9])
-
-
-def test_gradients_of_a_batch_are_a_batch_of_gradients(frames, x64):
-    rng = np.random.default_rng(3)
-    scene, worth, plan = frames.scene(rng, dtype=np.float64), weights(rng, frames), frames.plan()
-    cameras = [frames.camera(rng, dtype=np.float64) for _ in range(2)]
-    many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
-
-    def of(quantity, camera):
-        particles = dataclasses.replace(scene.particles, quantity=quantity)
-        return total((dataclasses.replace(scene, particles=particles), camera), worth, frames.settings, plan)
-
-    def of_all(quantity, cameras):
-        return jax.vmap(of, (None, 0))(quantity, cameras).sum()
-
-    by_both = (0, 1)
-    each = jax.jit(jax.vmap(jax.grad(of, by_both), (None, 0)), compiler_options=QUICKLY)(scene.particles.quantity, many)
-    summed = jax.jit(jax.grad(of_all, by_both), compiler_options=QUICKLY)(scene.particles.quantity, many)
-    for i, camera in enumerate(cameras):
-        owed = pulled((scene, camera), worth, frames.settings, plan)
-        np.testing.assert_allclose(each[0][i], owed[0].particles.quantity, rtol=1e-9, atol=1e-12)
-        for batch in (each[1], summed[1]):
-            np.testing.assert_allclose(batch.eye[i], owed[1].eye, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(batch.axes[i], owed[1].axes, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(summed[0], each[0].sum(0), rtol=1e-9, atol=1e-12)
-
-
-def adaptive(frames, tolerance):
-    """Settings and plan of error control by levels alone."""
-    plan = dataclasses.replace(frames.plan(), control=ControlPlan(False, True, "budget"))
-    return dataclasses.replace(frames.settings, tolerance=tolerance, **ADAPTIVE), plan
-
-
-def even(frames, rng):
-    """A frame that is filled, and varies so little that samples can be saved."""
-    scene, camera = filled(frames, rng)
-    particles, transfer = scene.particles, scene.transfer
-    particles = dataclasses.replace(particles, support=4 * particles.support, quantity=0.3 + 0.02 * particles.quantity)
-    values, extinction = jnp.linspace(0.0, 1.0, 5), jnp.linspace(0.1, 2.0, 5)
-    return js.Scene(particles, dataclasses.replace(transfer, values=values, extinction=extinction)), camera
-
-
-def test_the_gradient_of_an_adaptive_image_is_that_of_this_image(frames, x64):
-    rng = np.random.default_rng(4)
-    inputs, worth = even(frames, rng), weights(rng, frames)
-    asked, plan = adaptive(frames, 0.03)
-    names = ("position", "support", "quantity", "values", "extinction", "eye")
-    move = towards(inputs, anyhow(*names)(inputs, rng))
-    ahead, behind = (valued(stepped(inputs, move, by), worth, asked, plan)[0] for by in (STEP, -STEP))
-    coarse, owed = valued(inputs, worth, asked, plan)
-    fine, of_fine = valued(inputs, worth, dataclasses.replace(asked, tolerance=0.0), plan)
-    assert coarse != fine  # samples were saved
-    slope, size = along(owed, move)
-    assert abs(slope - along(of_fine, move)[0]) > 100 * CLOSE * (1 + size)
-    assert slope == pytest.approx(float(ahead - behind) / (2 * STEP), abs=CLOSE * (1 + size))
-
-
-def test_tightening_the_tolerance_moves_gradients_no_more_than_so_much(frames, x64):
-    rng = np.random.default_rng(4)
-    inputs, worth = even(frames, rng), weights(rng, frames)
-    found = {}
-    for tolerance in (0.1, 0.03, 0.01, 0.003, 0.0):
-        asked, plan = adaptive(frames, tolerance)
-        found[tolerance] = valued(inputs, worth, asked, plan)[1][0].particles.quantity
-    exact = found[0.0]
-    off = {tolerance: float(np.linalg.norm(slope - exact) / np.linalg.norm(exact)) for tolerance, slope in found.items()}
-    assert all(off[tolerance] <= STEEPEST * tolerance for tolerance in found)
-
-
-@pytest.mark.parametrize(("how", "control", "asked"), [
-    ("super-pixels", ControlPlan(True, True, "budget", 1), {}), ("pilot", PilotPlan(), {"estimator": "pilot"}),
-])  # fmt: skip
-def test_what_has_no_gradient_says_so(frames, how, control, asked):
-    rng = np.random.default_rng(0)
-    inputs, worth = (frames.scene(rng), frames.camera(rng)), jnp.ones((frames.height, frames.width, 4))
-    asked = dataclasses.replace(frames.settings, tolerance=0.01, **asked)
-    plan = dataclasses.replace(frames.plan(), control=control)
-    with pytest.raises(NotImplementedError, match=f"{how}.*tolerance=None"):
-        jax.eval_shape(
-            lambda inputs, move: jax.jvp(lambda i: total(i, worth, asked, plan), (inputs,), (move,)), inputs, still(inputs)
-        )
-
-
-def test_second_derivatives_say_that_there_are_none(frames):
-    rng = np.random.default_rng(0)
-    scene, camera, worth = frames.scene(rng), frames.camera(rng), jnp.ones((frames.height, frames.width, 4))
-
-    def of(extinction):
-        transfer = dataclasses.replace(scene.transfer, extinction=extinction)
-        return total((dataclasses.replace(scene, transfer=transfer), camera), worth, frames.settings, frames.plan())
-
-    with pytest.raises(NotImplementedError, match="second derivatives"):
-        jax.eval_shape(jax.hessian(of), scene.transfer.extinction)

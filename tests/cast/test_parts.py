@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,11 +25,14 @@ def test_what_is_dealt_is_joined_in_its_place():
     np.testing.assert_array_equal(found.evaluations, rest[:, 0, 0])
 
 
-def test_parts_divide_any_band():
-    assert parts_at_hand(jnp.zeros(1)) in (1, 2, MOST)
+@pytest.mark.parametrize(("cores", "parts"), [(1, 1), (2, 2), (3, 2), (4, 4), (7, 4), (64, MOST)])
+def test_parts_are_as_many_as_cores_but_divide_any_band(monkeypatch, cores, parts):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    assert parts_at_hand(jnp.zeros(1)) == parts
+    assert 4 % parts == 0, "a tile has four bundles"
 
 
-@pytest.mark.parametrize("estimator", [None, "interval", "pilot"])
+@pytest.mark.parametrize("estimator", ["interval", "pilot", pytest.param(None, marks=pytest.mark.slow)])
 def test_any_number_of_parts_makes_the_same_image(monkeypatch, estimator):
     scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
     settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.05, estimator=estimator)

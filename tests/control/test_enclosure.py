@@ -17,7 +17,7 @@ from jaxsph.access.cells import cells_with_borders
 from jaxsph.cast.points import cast_points
 from jaxsph.control.analysis import analyse
 from jaxsph.control.enclosure import bundle_bounds
-from jaxsph.control.errors import SUPER_PIXEL, fits
+from jaxsph.control.errors import SUPER_PIXEL
 from jaxsph.control.levels import bound
 from jaxsph.control.merge import coarse_work, coarser_windows, merged_levels
 from jaxsph.control.ranges import range_tables
@@ -79,11 +79,6 @@ def looked(stages, scene, camera, wished, plan, form):
     return jax.tree.map(np.asarray, look(scene, camera, parts, jnp.asarray(wished), plan=plan, kernel=kernel, form=form))
 
 
-def deep_enough(frames, slab_samples):
-    """Frames of as many cells as the coarsest level merges, and one that is not whole."""
-    return dataclasses.replace(frames, samples=(CELL << COARSEST - fits(slab_samples)) + 3)
-
-
 def wishes(cells, bundles):
     """A level for each bundle, but for a few cells."""
     every, few = st.sampled_from(CANDIDATES), st.dictionaries(st.integers(0, cells - 1), st.sampled_from(CANDIDATES), max_size=3)
@@ -114,7 +109,7 @@ def seen_whole(frames, kernel, projection, dtype):
 def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
     stages, frames, kernel, slab_samples, form, projection, dtype
 ):
-    frames = deep_enough(frames, slab_samples)
+    frames = frames.deep(slab_samples)
     plan = frames.plan(slab_samples)
     cells, bundles, met = -(-frames.samples // CELL), plan.lists.num_bundles, set()
 
@@ -140,7 +135,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
 @pytest.fixture
 def alike(frames, x64):
     """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
-    frames = deep_enough(frames, 4)
+    frames = frames.deep(4)
     scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
     particles = dataclasses.replace(scene.particles, support=jnp.full_like(scene.particles.support, 30))
     transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 15).reshape(5, 3), np.linspace(0.1, 1, 5))

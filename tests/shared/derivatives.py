@@ -1,0 +1,100 @@
+"""Slopes of images: programs that give them in both modes, and the directions and frames that tests take them of."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsph as js
+
+STEP = 1e-7  # of a difference: so small that hardly a sample meets a kink of the transfer function on the way
+CLOSE = 1e-6  # of the sum of a slope's terms, and of one: the rounding of some thousand pixels over the step, with room
+AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers, some thousands of them, in another order
+QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
+
+
+def total(inputs, worth, settings, plan):
+    """All layers that have derivatives, each pixel as often as it is worth."""
+    image = js.render(*inputs, settings, plan=plan)
+    return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * worth).sum()
+
+
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
+def looked(inputs, move, worth, settings, plan):
+    """The total, its slope in a direction by forward mode, and its gradient by reverse mode: one program."""
+
+    def of(inputs):
+        return total(inputs, worth, settings, plan)
+
+    return *jax.jvp(of, (inputs,), (move,)), jax.grad(of, allow_int=True)(inputs)
+
+
+def pulled(inputs, worth, settings, plan):
+    return looked(inputs, still(inputs), worth, settings, plan)[2]
+
+
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
+def valued(inputs, worth, settings, plan):
+    """The total and its gradient: a smaller program."""
+    return jax.value_and_grad(total, allow_int=True)(inputs, worth, settings, plan)
+
+
+def still(inputs):
+    """A direction in which nothing moves."""
+    floating = functools.partial(jnp.issubdtype, arg2=jnp.floating)
+    return jax.tree.map(lambda x: jnp.zeros_like(x) if floating(x.dtype) else np.zeros(x.shape, jax.dtypes.float0), inputs)
+
+
+def along(owed, move):
+    """Slope in the direction `move`, and the sum of its terms' sizes."""
+    pairs = zip(jax.tree.leaves(owed), jax.tree.leaves(move), strict=True)
+    terms = [np.asarray(a * b).ravel() for a, b in pairs if a.dtype != jax.dtypes.float0]
+    return float(sum(t.sum() for t in terms)), float(sum(np.abs(t).sum() for t in terms))
+
+
+def stepped(inputs, move, step):
+    return jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + step * d, inputs, move)
+
+
+def differ(inputs, move, worth, settings, plan):
+    """The central difference in the direction `move`, and the slope and gradient there."""
+    ahead, behind = (looked(stepped(inputs, move, by), still(inputs), worth, settings, plan)[0] for by in (STEP, -STEP))
+    _, pushed, owed = looked(inputs, move, worth, settings, plan)
+    return float(ahead - behind) / (2 * STEP), float(pushed), owed
+
+
+def weights(rng, frames):
+    return jnp.asarray(rng.normal(size=(frames.height, frames.width, 4)))
+
+
+def filled(frames, rng, dtype=np.float64):
+    """A frame without empty space, where colours would jump as a support's edge passes a sample."""
+    scene, camera = frames.scene(rng, dtype=dtype), frames.camera(rng, dtype=dtype)
+    particles = scene.particles
+    position, support = particles.position.at[0].set(0), particles.support.at[0].set(20)
+    volume = particles.volume.at[0].set(1e3)
+    particles = dataclasses.replace(particles, position=position, support=support, volume=volume)
+    return dataclasses.replace(scene, particles=particles), camera
+
+
+def anyhow(*names):
+    def move(inputs, rng):
+        parts = {**vars(inputs[0].particles), **vars(inputs[0].transfer), **vars(inputs[1])}
+        return {name: jnp.asarray(rng.normal(size=parts[name].shape)) for name in names}
+
+    return move
+
+
+def towards(inputs, named):
+    """The direction that moves the parts that are `named`, and nothing else."""
+    zero = still(inputs)
+    scene, camera = zero
+
+    def put(part):
+        return dataclasses.replace(part, **{name: move for name, move in named.items() if name in vars(part)})
+
+    return dataclasses.replace(scene, particles=put(scene.particles), transfer=put(scene.transfer)), put(camera)
