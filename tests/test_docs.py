@@ -1,6 +1,7 @@
 """The README keeps its word: its Python runs as pasted, its commands and files exist."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from jaxsph import cli, io, scenes
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+SHELL = "".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+COMMANDS = re.findall(r"^(jaxsph \w+[^#\n]*)", SHELL, re.MULTILINE) + re.findall(r"`(jaxsph \w+[^`]*)`", README)
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
@@ -39,11 +42,39 @@ def test_pictures_and_files_that_are_named_exist():
     assert (ROOT / "CITATION.cff").exists()
 
 
-def test_commands_that_are_named_exist(capsys):
-    for command in {a or b for a, b in re.findall(r"(?:`jaxsph (\w+)|^jaxsph (\w+) FILE)", README, re.MULTILINE)}:
+def test_commands_and_targets_that_are_named_exist():
+    commands = {line.split()[1] for line in COMMANDS}
+    assert {"render", "info", "sweep"} <= commands
+    for command in commands:
         assert cli.main([command, "--help"]) == 0
-    for target in set(re.findall(r"`make (\w+)`", README)):
-        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    makefile = (ROOT / "Makefile").read_text()
+    pages = README + (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    targets = set(re.findall(r"`make ([a-z-]+)", pages))
+    assert {"demo", "test", "setup"} <= targets
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_options_that_are_named_exist(capsys):
+    for line in COMMANDS:
+        _, command, *arguments = line.split()
+        assert cli.main([command, "--help"]) == 0
+        known = capsys.readouterr().out
+        assert all(argument in known for argument in arguments if argument.startswith("--")), line
+
+
+def test_evaluations_that_the_readme_says_are_saved_were_measured():
+    """Of each scene at 512 x 512 and a tolerance of 0.004."""
+    records = json.loads((ROOT / "benchmarks" / "results" / "pilot.json").read_text())["records"]
+    (sentence,) = re.findall(r"At 512 x 512 and 0.004 that takes (.*?) fewer kernel evaluations", README, re.DOTALL)
+    said = {name.strip(): float(times) for times, name in re.findall(r"([\d.]+)(?: times)? \(([^)]+)\)", sentence)}
+    assert len(said) == 4
+    for name, times in said.items():
+        (record,) = (
+            row for row in records
+            if (row["size"], row["tolerance"], row["variant"]) == (512, 0.004, "pilot") and row["scene"].replace("_", " ") in name
+        )  # fmt: skip
+        assert round(record["evaluations_saved"], 1) == times, name
 
 
 def test_the_page_of_results_is_what_the_results_make_of_it():

@@ -263,18 +263,14 @@ def test_plans_share_grid_and_cast_whatever_controls_the_error():
     assert len({dataclasses.replace(plan, control=None) for plan in plans}) == 1
 
 
-def test_stats_count_what_was_done(frames):
+def test_statistics_and_metadata_say_what_was_done(frames):
+    """What evaluations and pairs are: `test_evaluations`."""
     rng = np.random.default_rng(0)
     image = js.render(frames.scene(rng), frames.camera(rng), frames.settings, plan=frames.plan())
-    assert (
-        image.stats["evaluations"]
-        == image.stats["evaluations_full"]
-        == pytest.approx(float(np.asarray(image.evaluations, np.float64).sum()))
-    )
-    assert image.stats["pairs"] > 0
-    assert image.stats["cells"] > 0
-    assert {"grid", "adapt", "cast", "compile"} <= set(image.stats["seconds"])
+    slabs = -(-frames.samples // 4)
+    bundles = frames.plan().lists.num_bundles
+    assert 0 < image.stats["cells"] <= slabs * bundles
+    assert {"plan", "grid", "adapt", "cast", "compile"} <= set(image.stats["seconds"])
     assert image.certified
     assert image.faults == 0
     assert not np.asarray(image.error_bound).any()
-    assert image.stats["evaluations"] > 0

@@ -85,6 +85,14 @@ def test_tracing_without_a_plan_says_how_to_make_one(frames):
         jax.jit(lambda s: js.plan(s, camera, frames.settings))(scene)
 
 
-def test_importing_and_rendering_leave_x64_alone():
+def test_importing_leaves_x64_alone():
     code = "import jax, jaxsph; assert not jax.config.jax_enable_x64"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_rendering_leaves_x64_alone_and_float64_input_without_it_is_an_image_of_float32(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, dtype=np.float64), frames.camera(rng, dtype=np.float64)
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    assert not jax.config.jax_enable_x64
+    assert {getattr(image, name).dtype for name in ("color", "transmittance", "depth", "error_bound")} == {jnp.dtype("float32")}

@@ -32,17 +32,35 @@ def error_of(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
 
 
-@pytest.mark.parametrize("name", ["mixer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("radial", "checker_board"))])
-def test_work_is_saved_few_pixels_are_over_the_tolerance_and_none_over_twice(name):
+def require_kept(image, truth, tolerance):
+    """Six standard deviations are no bound; but in the frames of these tests no pixel is beyond its own."""
+    error, estimate = error_of(image, truth), np.asarray(image.error_bound, np.float64)
+    assert (error <= estimate).all(), f"{(error > estimate).sum()} pixels, {error.max()}"
+    assert (estimate <= tolerance).all()  # in float64: a tolerance is rounded down
+    assert not error[estimate == 0].any(), "where nothing is estimated, nothing is left out"
+
+
+@pytest.mark.parametrize(("name", "times_fewer"), [
+    ("radial", 1.6), *(pytest.param(*slow, marks=pytest.mark.slow) for slow in (("mixer", 1.7), ("checker_board", 4.5))),
+])  # fmt: skip
+def test_work_is_saved_and_no_pixel_is_over_its_estimate_nor_that_over_the_tolerance(name, times_fewer):
     truth, image = both(name)
-    error = error_of(image, truth)
-    assert (error > PILOT.tolerance).mean() <= 1e-3
-    assert error.max() <= 2 * PILOT.tolerance
-    assert 0 < float(image.error_bound.max()) <= PILOT.tolerance
+    require_kept(image, truth, PILOT.tolerance)
+    assert 0.9 * PILOT.tolerance < float(image.error_bound.max()), "the tolerance is spent"
     assert not image.certified
     assert image.stats["evaluations_full"] == truth.stats["evaluations"]
-    if name != "radial":
-        assert image.stats["evaluations"] < 0.9 * truth.stats["evaluations"]
+    assert times_fewer * image.stats["evaluations"] < truth.stats["evaluations"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "times_fewer"), [("mixer", 5.5), ("checker_board", 9.0), ("radial", 4.4)])
+def test_at_512_as_much_is_saved_as_the_readme_says(name, times_fewer):
+    """To a twentieth."""
+    scene, camera = js.scenes.load(name, width=512, height=512)
+    truth, image = (js.render(scene, camera, dataclasses.replace(asked, samples=256)) for asked in (FULL, PILOT))
+    error = error_of(image, truth)
+    assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.125 * PILOT.tolerance
+    assert truth.stats["evaluations"] / image.stats["evaluations"] == pytest.approx(times_fewer, rel=0.05)
 
 
 def cloud(quantity, support, count=4000, *, extent=1.0):
@@ -134,11 +152,14 @@ def test_a_jump_of_the_transfer_function_is_kept_sharp():
 def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_allows(stages):
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
-    grid, origin = stages(scene.particles, camera, plan=plan)
+    slab_samples, (grid, origin) = plan.cast.slab_samples, stages(scene.particles, camera, plan=plan)
     lattice = sum_part(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
-    found = residuals(grid, lattice, camera, scene.transfer, plan.cast.slab_samples)
-    choose = functools.partial(pilot, grid, lattice, found, camera, origin, slab_samples=plan.cast.slab_samples)
+    found = residuals(grid, lattice, camera, scene.transfer, slab_samples)
+    choose = functools.partial(pilot, grid, lattice, found, camera, origin, slab_samples=slab_samples)
     variance, before = np.asarray(found.variance), 0
+    samples = np.minimum(slab_samples, PILOT.samples - slab_samples * np.arange(len(variance)))[:, None]
+    rows, columns = (np.asarray(side) for side in (grid.row, grid.column))
+    shown = (rows < camera.height) & (columns < camera.width)
     for tolerance in (0.001, 0.01, 0.1):
         work, estimate = choose(tolerance=jnp.float32(tolerance))
         taken, sparse = np.asarray(work.interpolated), np.asarray(work.sparse)
@@ -149,6 +170,12 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
         assert (np.asarray(estimate) <= np.float32(tolerance)).all()
         assert taken.sum() > before
         before = taken.sum()
+        # what is counted: particles at all rays, or at sixteen of sixty-four, and those at nodes
+        count = np.asarray(grid.cells.count) * np.where(taken, 0, np.where(sparse, 0.25, 1)) * samples
+        evaluations = (count.sum(0) + np.asarray(lattice.evaluations))[shown]
+        image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=tolerance), plan=plan)
+        np.testing.assert_allclose(np.asarray(image.evaluations)[rows[shown], columns[shown]], evaluations, rtol=1e-6)
+    assert np.asarray(lattice.evaluations).sum() > 0
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -160,11 +187,13 @@ def test_hardly_any_particles(count):
 
 
 def test_jit_agrees_with_eager():
-    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
-    _, image = both("mixer")
+    scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
+    truth, image = both("radial")
     plan = js.plan(scene, camera, PILOT)
     traced = jax.jit(lambda s: js.render(s, camera, PILOT, plan=plan))(scene)
-    np.testing.assert_allclose(traced.color, image.color, atol=1e-5)
+    away = np.abs(np.asarray(traced.color) - np.asarray(image.color))
+    assert (away <= 1e-5).mean() >= 0.999 and away.max() <= PILOT.tolerance  # rounding may tip a slab from one kind to another
+    require_kept(traced, truth, PILOT.tolerance)
     assert not bool(traced.certified)
 
 
@@ -180,30 +209,43 @@ def test_the_estimate_holds_however_dense_samples_are_along_the_ray(size):
         error = error_of(image, truth)
         off, estimate = error > 1e-6, np.asarray(image.error_bound)
         assert not off.any() or np.percentile(estimate[off] / error[off], 1) >= 1.3
-        assert (error > PILOT.tolerance).sum() <= 2 and error.max() <= 2 * PILOT.tolerance
+        assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.125 * PILOT.tolerance
 
 
 @pytest.mark.slow
 def test_bands_keep_the_tolerance_too():
-    scene, camera = js.scenes.load("mixer", 8_000, width=224, height=217)
+    scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
     low = dataclasses.replace(PILOT, memory_limit=plan.bytes // 2)
     banded = js.plan(scene, camera, low)
     assert banded.bands > 1
-    error = error_of(js.render(scene, camera, low, plan=banded), both("mixer")[0])
-    assert error.max() <= 2 * PILOT.tolerance
+    require_kept(js.render(scene, camera, low, plan=banded), both("radial")[0], PILOT.tolerance)
 
 
+@pytest.mark.slow
 def test_a_plan_with_little_room_for_nodes_saves_less_but_keeps_the_tolerance():
     """As that of another frame may have: what lies beyond is marched."""
     particles, camera = cloud(lambda x: x[:, 0], 0.5)
     scene = js.Scene(particles=particles, transfer=SMOOTH)
     truth, roomy = draw(scene, camera)
-    plan = plan_of(PILOT)
-    little = dataclasses.replace(plan, control=dataclasses.replace(plan.control, room=(5, 6)))
-    image = js.render(scene, camera, PILOT, plan=little)
+    image = js.render(scene, camera, PILOT, plan=changed(room=(5, 6)))
     assert roomy.stats["evaluations"] < image.stats["evaluations"] < truth.stats["evaluations"]
-    assert error_of(image, truth).max() <= PILOT.tolerance
+    require_kept(image, truth, PILOT.tolerance)
+
+
+def test_nodes_eight_pixels_apart_save_where_supports_resolve_them_and_keep_the_tolerance():
+    particles, camera = cloud(lambda x: x[:, 0], 0.7, count=1500)
+    scene = js.Scene(particles=particles, transfer=SMOOTH)
+    truth = draw(scene, camera)[0]
+    image = js.render(scene, camera, PILOT, plan=changed(nodes=Spacing(8, 4)))
+    assert image.stats["evaluations"] < 0.7 * truth.stats["evaluations"]
+    require_kept(image, truth, PILOT.tolerance)
+
+
+def changed(**choices):
+    """The plan of all clouds with other choices of the pilot."""
+    plan = plan_of(PILOT)
+    return dataclasses.replace(plan, control=dataclasses.replace(plan.control, **choices))
 
 
 def test_nodes_are_as_far_apart_as_supports_allow():
