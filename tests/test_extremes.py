@@ -15,10 +15,12 @@ import jaxsph as js
 from jaxsph.control.adapt import ControlPlan
 
 
-def is_right(frames, extreme, seed=0):
+def is_right(frames, extreme, seed=0, most=1.0):
+    """No pixel is further off than rounding moves it, nor by more than `most`."""
     scene, camera = extreme.scene(frames, seed), extreme.camera(frames)
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
     error, allowed = error_and_allowance(image, scene, camera, frames.settings)
+    allowed = np.minimum(allowed, most)
     assert (error <= allowed).all(), f"{(error > allowed).sum()} pixels, worst {error.max():.3g}, allowed {allowed.max():.3g}"
     return scene, image
 
@@ -59,13 +61,14 @@ ALONE = {
 }
 
 
+LARGEST_ERRORS = {"far / near of 1 + 1e-3": 8e-4}
 UNSEEN = ("no extinction", "subnormal extinction", "supports of 1e-6", "supports of 1e-2")
 
 
 @pytest.mark.parametrize("name", ALONE)
 def test_an_extreme_frame_is_right(frames, name):
-    """And shows something, but where there is nothing to be seen."""
-    _, image = is_right(frames, ALONE[name])
+    """To what `docs/accuracy_and_limits.md` says; and shows something, but where there is nothing to be seen."""
+    _, image = is_right(frames, ALONE[name], most=LARGEST_ERRORS.get(name, 1e-5))
     assert float(image.alpha.max()) > 0.5 or name in UNSEEN
 
 
@@ -76,26 +79,39 @@ SOME = [name for name in ALONE if "1e2 " not in name and "1e4" not in name and "
 UNDECIDED = {"extinction of 0 to 1e12", "quantities from 1e5 to 1e5 + 1"}
 
 
+TOO_FAR, NOT_FINITE = "lengths are too far apart for this precision", "`quantity` must be finite"
+REFUSED = {
+    frozenset(("lengths of 1e14", "supports of 1e3")): TOO_FAR,
+    frozenset(("supports 1e9:1, equal volumes", "supports of 1e-6")): TOO_FAR,
+    frozenset(("supports 1e9:1, volumes as supports", "supports of 1e-6")): TOO_FAR,
+    frozenset(("quantities of 3e38", "quantities from 1e3 to 1e3 + 1")): NOT_FINITE,
+    frozenset(("quantities of 3e38", "quantities from 1e5 to 1e5 + 1")): NOT_FINITE,
+}
+
+
+def changed(name):
+    """What of a frame is extreme."""
+    return {key: value for key, value in vars(ALONE[name]).items() if value != getattr(Extreme(), key)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 @pytest.mark.parametrize("name", SOME)
-def test_pairs_of_extremes_are_right_or_refused(frames, name, projection):
+def test_pairs_of_extremes_are_right_or_refused_for_a_reason(frames, name, projection):
     """Of different inputs, each with all that come after it."""
-    default, refused = Extreme(), 0
     for other in SOME[SOME.index(name) + 1 :]:
-        one, two = (
-            {key: value for key, value in vars(ALONE[n]).items() if value != getattr(default, key)} for n in (name, other)
-        )
-        if set(one) & set(two) or {name, other} == UNDECIDED:
+        one, two, pair = changed(name), changed(other), frozenset((name, other))
+        if set(one) & set(two) or pair == UNDECIDED:
             continue
-        try:
-            is_right(frames, Extreme(**one, **two, projection=projection), seed=len(other))
-        except ValueError as error:
-            assert any(word in str(error) for word in ("too far apart", "`values`", "must be", "finite")), f"{other}: {error}"
-            refused += 1
+        extreme = Extreme(**one, **two, projection=projection)
+        if pair in REFUSED:
+            with np.errstate(over="ignore"), pytest.raises(ValueError, match=REFUSED[pair]):
+                js.render(extreme.scene(frames), extreme.camera(frames), frames.settings, plan=frames.plan())
+            continue
+        try:  # the least quantities leave no room for a draw without a large one
+            is_right(frames, extreme, seed=0 if "quantities of 1e-33" in pair else len(other))
         except AssertionError as error:
             raise AssertionError(f"{name} and {other}: {error}") from error
-    assert refused < len(SOME)
 
 
 @pytest.mark.slow

@@ -1,0 +1,47 @@
+"""Errors of single cells: relaxed only in cells that are nowhere partly empty, and they grow with the level."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.control.bounds import SampleBounds
+from jaxsph.control.errors import SUPER_PIXEL, cell_errors
+from jaxsph.control.worklist import CELL
+
+BUNDLES = 64
+errors_of = jax.jit(functools.partial(cell_errors, fitting=2), compiler_options={"xla_backend_optimization_level": 0})
+
+
+def found(relax):
+    """Cells whose samples are all touched and covered, some in part empty, some with slabs that nothing touches."""
+    rng = np.random.default_rng(0)
+    shape = (CELL, BUNDLES)
+    touched = rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 3, 0.8, 1)
+    covered = touched & (rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 1, 0.8, 1))
+    low = [rng.uniform(0, 0.5, shape) for _ in range(4)]
+    high = [value + rng.uniform(0, 0.3, shape) for value in low]
+    low, high = ([jnp.asarray(value, jnp.float32) for value in side] for side in (low, high))
+    bounds = SampleBounds(jnp.asarray(touched), jnp.asarray(covered), low, high)
+    borders = jnp.broadcast_to(jnp.linspace(1, 2, CELL + 1, dtype=jnp.float32)[:, None], (CELL + 1, BUNDLES))
+    path, none = jnp.ones(BUNDLES, jnp.float32), jnp.zeros(BUNDLES, jnp.float32)
+    errors = errors_of(bounds, borders, path, path, (none, none), jnp.float32(relax))
+    return np.asarray(errors.error), np.asarray(errors.strict), (covered | ~touched).all(0)
+
+
+def test_cells_that_may_be_partly_empty_are_never_relaxed():
+    error, strict, whole = found(1.0)
+    assert 0 < whole.sum() < BUNDLES
+    np.testing.assert_array_equal(error[:, ~whole], strict[:, ~whole])
+    levels = slice(1, SUPER_PIXEL)
+    assert (error[levels] <= strict[levels]).all() and (error[levels][:, whole] < strict[levels][:, whole]).any()
+    np.testing.assert_array_equal(error[SUPER_PIXEL], strict[SUPER_PIXEL])
+
+
+def test_without_relaxation_errors_are_strict_and_grow_with_the_level():
+    error, strict, _ = found(0.0)
+    np.testing.assert_array_equal(error, strict)
+    assert not error[0].any() and (np.diff(error[:SUPER_PIXEL], axis=0) >= 0).all()
