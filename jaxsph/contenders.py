@@ -11,8 +11,8 @@ from collections.abc import Hashable, Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.ndimage import map_coordinates
 
 from jaxsph.model import Camera, Settings
 
@@ -86,4 +86,6 @@ def scaled_up(layers: Float[np.ndarray, "rows columns 4"], camera: Camera) -> Fl
     down = (np.arange(camera.height) + 0.5) / camera.height * 2 - 1
     across = ((np.arange(camera.width) + 0.5) / camera.width * 2 - 1) * (camera.width / camera.height) / (columns / rows)
     place = np.meshgrid((down + 1) / 2 * rows - 0.5, (across + 1) / 2 * columns - 0.5, indexing="ij")
-    return np.stack([map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(layers, -1, 0)], -1)
+    return np.stack(
+        [scipy.ndimage.map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(layers, -1, 0)], -1
+    )

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from jaxsph.model import kernels
 
@@ -64,7 +64,7 @@ def nearest_neighbour_supports(
     if len(places) == 1:
         return np.ones(count)
     points, multiplicity = position[places], np.bincount(place_of)
-    tree = KDTree(points)
+    tree = scipy.spatial.KDTree(points)
     reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
     support = np.empty(len(places))
     for rows in _slices(np.full(len(places), nearest), progress, "supports"):
@@ -111,7 +111,7 @@ def kernel_sum(
     places, place_of = _distinct(position)
     askers, asker_of = _distinct(np.column_stack([position, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
-    tree, points, radii = KDTree(position[places]), position[askers], support[askers]
+    tree, points, radii = scipy.spatial.KDTree(position[places]), position[askers], support[askers]
     _refuse_too_many_pairs(tree, points, radii)
     total = np.empty(len(askers))
     reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
@@ -143,7 +143,7 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order[is_first], group
 
 
-def _refuse_too_many_pairs(tree: KDTree, points: np.ndarray, radii: np.ndarray) -> None:
+def _refuse_too_many_pairs(tree: scipy.spatial.KDTree, points: np.ndarray, radii: np.ndarray) -> None:
     """Refuse supports that a sample of the particles shows to reach too far."""
     some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
     reached = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.special import erf
 
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
@@ -68,7 +68,7 @@ def concentration(position: Float[np.ndarray, "particles 3"], frame: float) -> F
     shares = []
     for x in position.T:
         mirrored = [x, -x, 2.0 - x, x + 2.0, x - 2.0]
-        steps = np.sum([[erf((image - edge) / width) for edge in edges] for image in mirrored], axis=0)
+        steps = np.sum([[scipy.special.erf((image - edge) / width) for edge in edges] for image in mirrored], axis=0)
         shares.append(0.5 * (steps[:-1] - steps[1:]))
     column, row, depth = np.indices((CUBES,) * 3)
     increasing = 0.1 + 0.9 * (column + (CUBES - 1 - depth)) / (2 * (CUBES - 1))  # the camera stands on the +z side

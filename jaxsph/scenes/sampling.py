@@ -9,9 +9,8 @@ $\frac{4}{3} \pi 2^3 \approx 33$ particles: what SPH codes use in three dimensio
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Shaped
-from scipy import ndimage
-from scipy.spatial import cKDTree
 
 SUPPORT_IN_SPACINGS = 2.0
 """Support radius over particle spacing."""
@@ -62,7 +61,7 @@ def refill(
     """
     spacing_new = spacing * (len(position) / count) ** (1 / 3)
     candidates = _around(position, spacing, spacing_new, count, seed)
-    tree = cKDTree(position)
+    tree = scipy.spatial.cKDTree(position)
     nearest, _ = tree.query(candidates, workers=-1)
     kept = candidates[np.sort(np.argsort(nearest, kind="stable")[:count])]
     distance, neighbour = tree.query(kept, k=np.arange(1, min(MIXED, len(position)) + 1), workers=-1)
@@ -78,7 +77,7 @@ def _around(position: np.ndarray, spacing: float, spacing_new: float, count: int
     shape = np.ceil((position.max(0) + 1.5 * cell - lower) / cell).astype(int)
     occupied = np.zeros(shape, bool)
     occupied[tuple(((position - lower) / cell).astype(int).T)] = True
-    occupied = ndimage.binary_dilation(occupied, np.ones((3, 3, 3), bool))
+    occupied = scipy.ndimage.binary_dilation(occupied, np.ones((3, 3, 3), bool))
     upper = lower + shape * cell
     points = scatter(lower, upper, round((upper - lower).prod() / spacing_new**3), seed)
     index = np.minimum(((points - lower) / cell).astype(int), shape - 1)

@@ -1,0 +1,82 @@
+"""Claim: on two cores the first frame of a process takes 5 s at full rate and 8 s with an estimator, where another process
+compiled it 2.5 s.
+
+Mixer, 512 x 512, 256 samples. Every frame is the first of a process of its own; a frame is `jaxsph.render`, the process adds
+what importing and making the scene take. Writes `results/first_frames.json`; ends in asserts on the medians.
+
+    python benchmarks/first_frames.py [--repeats 5] [--check]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+from jaxsph.provenance import of_this_run
+
+SETTINGS = {
+    "full rate": {},
+    "interval": {"tolerance": 0.004},
+    "pilot": {"tolerance": 0.004, "estimator": "pilot"},
+}
+LIMITS = {"full rate": 5.0, "interval": 8.0, "pilot": 8.0}
+LIMIT_WHERE_COMPILED = 2.5
+RESULTS = pathlib.Path(__file__).parent / "results" / "first_frames.json"
+FRAME = """
+import json, sys, time
+started = time.perf_counter()
+import jaxsph as js
+scene, camera = js.scenes.load("mixer")
+settings = js.Settings(**json.loads(sys.argv[1]))
+ready = time.perf_counter()
+image = js.render(scene, camera, settings)
+done = time.perf_counter()
+image = js.render(scene, camera, settings)
+print(json.dumps({"before": ready - started, "frame": done - ready, "next": time.perf_counter() - done}))
+"""
+
+
+def first_frame(settings: dict, folder: str | None) -> dict[str, float]:
+    """Seconds before, of and after the first frame of a process, and of the process as a whole."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    if folder is not None:
+        environment |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    started = time.perf_counter()
+    command = [sys.executable, "-c", FRAME, json.dumps(settings)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return {**json.loads(done.stdout), "process": time.perf_counter() - started}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--check", action="store_true", help="fail where a median is over its limit")
+    arguments = parser.parse_args()
+    found: dict[str, list[dict[str, float]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for settings in SETTINGS.values():
+            first_frame(settings, folder)
+        for _ in range(arguments.repeats):
+            for name, settings in SETTINGS.items():
+                found.setdefault(name, []).append(first_frame(settings, None))
+                found.setdefault(f"{name}, compiled before", []).append(first_frame(settings, folder))
+    medians = {name: {key: statistics.median(run[key] for run in runs) for key in runs[0]} for name, runs in found.items()}
+    for name, row in medians.items():
+        print(f"{name:26s} " + "  ".join(f"{key} {seconds:5.2f} s" for key, seconds in row.items()))
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps({"run": of_this_run(), "medians": medians, "repeats": arguments.repeats}, indent=1) + "\n")
+    if arguments.check:
+        for name, limit in LIMITS.items():
+            assert medians[name]["frame"] <= limit, (name, medians[name])
+            assert medians[f"{name}, compiled before"]["frame"] <= LIMIT_WHERE_COMPILED, (name, medians)
+
+
+if __name__ == "__main__":
+    main()
