@@ -20,6 +20,7 @@ from jaxsph.access.view import view_particles
 from jaxsph.cast.stretches import CastPlan
 from jaxsph.control.errors import fits
 from jaxsph.control.worklist import CELL, COARSEST, origins
+from jaxsph.numerics import memory_maps
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
 
@@ -28,7 +29,7 @@ pytest_plugins = ["share"]
 hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
 hypothesis.settings.load_profile("jaxsph")
 
-MOST_MAPS = 20_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
+MAX_MAPS = 15_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
 CAPACITY = 24
 WIDTH, HEIGHT, SAMPLES = 21, 18, 37
 
@@ -139,20 +140,11 @@ def pytest_configure(config: pytest.Config) -> None:
         os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
 
-def memory_maps() -> int:
-    """How many this process has; where that cannot be known, too many."""
-    try:
-        with open("/proc/self/maps") as maps:
-            return sum(1 for _ in maps)
-    except OSError:
-        return MOST_MAPS + 1
-
-
 @pytest.fixture(scope="module", autouse=True)
 def few_programs() -> Iterator[None]:
     """Compiled programs hold memory maps, of which a process may have only so many."""
     yield
-    if memory_maps() > MOST_MAPS:
+    if (memory_maps.in_use() or 0) > MAX_MAPS:
         jax.clear_caches()
 
 

@@ -12,7 +12,6 @@ import pytest
 from extreme import FORWARD, Extreme, error_and_allowance, layers
 
 import jaxsph as js
-from jaxsph.control.adapt import ControlPlan
 
 
 def is_right(frames, extreme, seed=0, most=1.0):
@@ -167,17 +166,6 @@ def test_the_outermost_shell_of_a_support_is_seen(frames):
         assert float(image.alpha.min()) > 0.999
         error, allowed = error_and_allowance(image, scene, camera, frames.settings)
         assert (error <= allowed).all()
-
-
-def test_any_tolerance_is_kept(frames):
-    scene, camera, full = Extreme().scene(frames), Extreme().camera(frames), frames.settings
-    reference = layers(js.render(scene, camera, full, plan=frames.plan()))
-    for tolerance in (0.0, 1e-46, 1e-12, 1.0):
-        settings = js.Settings(samples=frames.samples, tolerance=tolerance)
-        plan = dataclasses.replace(frames.plan(), control=ControlPlan(True, True, "budget"))
-        image = js.render(scene, camera, settings, plan=plan)
-        assert np.abs(layers(image) - reference).max() <= tolerance
-        assert float(image.error_bound.max()) <= tolerance  # in float64: the tolerance is rounded down, not to nearest
 
 
 @pytest.mark.parametrize(("width", "height", "samples"), [(1, 1, 1), pytest.param(8191, 3, 2, marks=pytest.mark.slow)])

@@ -88,7 +88,7 @@ scenes = {
 
 @given(**scenes)
 @example(seed=0, decades=4.0, distance=0.0001, projection="perspective", slab_samples=4)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
     frames, dtype, seed, decades, distance, projection, slab_samples
 ):

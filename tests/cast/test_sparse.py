@@ -32,7 +32,7 @@ CAMERAS = {
 }
 
 
-@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("kind", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x64, stages, kind):
     rng, camera = np.random.default_rng(4), CAMERAS[kind]()
     position = rng.uniform(0, 1, (2000, 3))

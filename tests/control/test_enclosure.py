@@ -127,7 +127,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
             np.broadcast_to(np.minimum(np.arange(bundles) % 7, SUPER_PIXEL), (cells, bundles)).astype(np.int32),
         )
         assert met == set(CANDIDATES), "every level occurs, and super-pixels"
-        hypothesis.settings(max_examples=25)(
+        hypothesis.settings(max_examples=15)(
             given(scenes(kernel, dtype), cameras(frames, projection, dtype), wishes(cells, bundles))(holds)
         )()
 
