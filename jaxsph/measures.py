@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxsph.access.lists import BUNDLE, TILE
 from jaxsph.access.view import Viewed
+from jaxsph.model.camera import Camera
 
 MAX_MEDIAN_OF = 1 << 16  # particles that a median is taken of: it only has to tell sizes that differ by a half
 
@@ -35,25 +36,30 @@ class Measures:
     diameter: float
 
 
-def measure(viewed: Viewed, height: int) -> Measures:
-    """Measure particles in view of an image that has `height` rows of pixels."""
-    sides = (np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom))
-    left, right, top, bottom = sides
+def measure(viewed: Viewed, camera: Camera, samples: int) -> Measures:
+    """Measure particles in the view of a camera with `samples` along each ray."""
+    left, right, top, bottom = (np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom))
     seen = np.flatnonzero((right >= left) & (bottom >= top))
-    left, right, top, bottom = (side[seen] for side in (left, right, top, bottom))
-    tile_rows = -(-height // TILE)
-    pairs = [_pairs_in_rows((left, right, top, bottom), size, -(-height // size)) for size in (TILE, BUNDLE)]
-    of_bundles = np.pad(pairs[1], (0, 2 * tile_rows - len(pairs[1]))).reshape(-1, 2).sum(1)
-    reach = [
-        int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1)
-        for first, last in ((top, bottom), (left, right))
-    ]
-    some = slice(None, None, max(1, len(seen) // MAX_MEDIAN_OF))
-    medians = [
-        float(np.median(values)) if len(values) else float("nan")
-        for values in (np.asarray(viewed.extent)[seen[some]], (right - left)[some] + 1)
-    ]
-    return Measures(pairs[0], of_bundles, *(max(number, 1) for number in reach), *medians)
+    some = seen[:: max(1, len(seen) // MAX_MEDIAN_OF)]
+    diameters = right[some] - left[some] + 1
+    extents = _extents(np.asarray(viewed.z)[some], np.asarray(viewed.reach)[some], camera, samples)
+    sides = left, right, top, bottom = left[seen], right[seen], top[seen], bottom[seen]
+    tile_rows = -(-camera.height // TILE)
+    of_tiles = _pairs_in_rows(sides, TILE, tile_rows)
+    of_bundles = _pairs_in_rows(sides, BUNDLE, 2 * tile_rows).reshape(-1, 2).sum(1)
+    ends = (top, bottom), (left, right)
+    reached = [int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1) for first, last in ends]
+    medians = [float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters)]
+    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians)
+
+
+def _extents(z: np.ndarray, reach: np.ndarray, camera: Camera, samples: int) -> np.ndarray:
+    """Diameters along depth, in samples, as far as they lie between near and far."""
+    near, far = float(camera.near), float(camera.far)
+    front, back = (np.clip(np.asarray(z + side, np.float64), near, far) for side in (-reach, reach))
+    if camera.is_perspective:
+        return samples * np.log(back / front) / np.log(far / near)
+    return samples * (back - front) / (far - near)
 
 
 def _pairs_in_rows(sides: tuple[np.ndarray, ...], size: int, rows: int) -> np.ndarray:

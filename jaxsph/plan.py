@@ -9,7 +9,6 @@ a reused plan raises a fault.
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import numpy as np
 
@@ -31,7 +30,9 @@ SLAB_SAMPLES = (4, 8, 16)
 SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
 SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
 MAX_RUNS = 16  # sorts side by side
-PAIRS_PER_RUN = 1 << 14  # below that, a sort takes less than it costs to have one more
+PAIRS_PER_RUN = (
+    1 << 15
+)  # below that, a sort takes less than it costs to have one more; 16 sorts of 5 M pairs in all took 0.8 of 4
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 NODES_REACHED = 2.5, 3  # by a support to every side, across and in depth: with fewer, wider nodes save less than they cost less
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
@@ -287,10 +288,8 @@ def _choose_slab_samples(depth_extent: float) -> int:
 
 
 def _choose_runs(pairs: int) -> int:
-    """Twice as many sorts as there are cores, of not too few pairs each: every sort is a few kernels more to compile."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    most = min(MAX_RUNS, 2 * cores, max(pairs // PAIRS_PER_RUN, 1))
-    return 1 << (most.bit_length() - 1)
+    """Short sorts, that stay in the caches, but not more than that takes: every one is a few kernels more to compile."""
+    return 1 << (min(MAX_RUNS, max(pairs // PAIRS_PER_RUN, 1)).bit_length() - 1)
 
 
 def _cast_plan(bundles: int, samples: int, slab_samples: int) -> CastPlan:

@@ -59,12 +59,13 @@ def plan(
     settings = settings or Settings()
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
-    shape = shape_of(scene.particles, camera, settings)
+    shape = dataclasses.replace(shape_of(scene.particles, camera, settings), headroom=1.0)
     if like is not None:
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    measures = measure(see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, Clock()).viewed, camera.height)
+    seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, Clock())
+    measures = measure(seen.viewed, camera, shape.samples)
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     return made if like is None else like.grown(made)
@@ -103,7 +104,7 @@ class Plans:
         shape = self._similar(shape_of(scene.particles, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
-        measures = measure(seen.viewed, camera.height)
+        measures = measure(seen.viewed, camera, shape.samples)
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
         made = self._recalled(needed, settings) or fitted(measures, shape, settings, choices)

@@ -38,7 +38,6 @@ class Viewed:
         live: whether any sample can meet the particle.
         left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
             `left > right` or `top > bottom`.
-        extent: diameter in samples along depth.
         key: class of support above depth, what they are ranked by.
         widest: largest reach of each class.
         faults: fault word.
@@ -56,7 +55,6 @@ class Viewed:
     right: Int[Array, " particles"]
     top: Int[Array, " particles"]
     bottom: Int[Array, " particles"]
-    extent: Float[Array, " particles"]
     key: Int[Array, " particles"]
     widest: Float[Array, " classes"]
     faults: Int[Array, ""]
@@ -88,7 +86,6 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
     word |= faults.raised(faults.UNRESOLVED, live & blurred) | faults.raised(faults.WEAK_PARTICLES, vanishes)
     seen, still = {name: lax.stop_gradient(columns[name]) for name in "xyz"}, lax.stop_gradient(camera)
     left, right, top, bottom = pixel_ranges(**seen, reach=reach, live=live, camera=still, between=(depths[0], depths[-1]))
-    front, back = (_part(still, seen["z"] + side) for side in (-reach, reach))
     return Viewed(
         **columns,
         reach=reach,
@@ -97,7 +94,6 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
         right=right,
         top=top,
         bottom=bottom,
-        extent=(back - front) * depths.shape[0],
         key=(octave << DEPTH_BITS) | depth_key(camera, z),
         widest=widest,
         faults=jnp.bitwise_or.reduce(word),
@@ -106,17 +102,13 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
 
 def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
     """Depth as an integer of `DEPTH_BITS` bits, uniform in sample space, clamped at near and far."""
-    return jnp.minimum(_part(camera, z) * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
-
-
-def _part(camera: Camera, z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Where in sample space a depth lies, from 0 at near to 1 at far, in float32."""
     z = jnp.clip(z, camera.near, camera.far)
     if camera.is_perspective:
         part = jnp.log(z / camera.near) / jnp.log(camera.far / camera.near)
     else:
         part = (z - camera.near) / (camera.far - camera.near)
-    return jnp.clip(part.astype(jnp.float32), 0, 1)
+    part = jnp.clip(part.astype(jnp.float32), 0, 1)
+    return jnp.minimum(part * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
 
 
 def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
