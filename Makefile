@@ -11,7 +11,7 @@ PYTEST_ARGS ?=
 SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.1 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
-.PHONY: setup test test-slow test-slow-share notebooks lint format demo results clean
+.PHONY: setup test test-slow test-slow-share test-endurance notebooks lint format demo results clean
 
 setup: $(VENV)/.installed-all
 
@@ -42,7 +42,7 @@ test: lint
 	@$(SUITE) $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
-	@$(SUITE) -m '' $(PYTEST_ARGS)
+	@$(SUITE) -m 'not endurance' $(PYTEST_ARGS)
 
 # Of the tests marked slow, a part that changes with the week, so that all have their turn in as many weeks as there are parts.
 SLOW_PARTS ?= 8
@@ -51,6 +51,9 @@ SLOW_SECONDS ?= 300
 test-slow-share: $(VENV)/.installed-test
 	@echo "week $$(date -u +%G-W%V): share $(SLOW_SHARE) of the tests marked slow, none begun after $(SLOW_SECONDS) s"
 	@$(SUITE) -m slow --share=$(SLOW_SHARE) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
+
+test-endurance: $(VENV)/.installed-test
+	@$(VENV)/bin/python -m pytest -q -m endurance $(PYTEST_ARGS) tests/test_endurance.py
 
 notebooks: $(VENV)/.installed-test
 	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py
