@@ -54,6 +54,7 @@ class Programs:
         self._most = most
         self._kept: collections.OrderedDict[Hashable, Program] = collections.OrderedDict()
         self._lock = threading.RLock()
+        self._counting = threading.Lock()  # of its own, as who has compiled a program is not to wait for who traces the next
         self._compiling = 0
         self._let_go = False
         self._warned = False
@@ -83,7 +84,8 @@ class Programs:
             if self._told is not None:
                 self._told()
             program = self._kept[key] = _made(function, shapes, static)
-            self._compiling += 1
+            with self._counting:
+                self._compiling += 1
         program.compiled.add_done_callback(functools.partial(self._compiled, key))
         return program
 
@@ -113,10 +115,11 @@ class Programs:
         gc.collect()
 
     def _compiled(self, key: Hashable, compiled: Future[Any]) -> None:
-        with self._lock:
-            self._compiling -= 1
-            if compiled.cancelled() or compiled.exception() is not None:
+        if compiled.cancelled() or compiled.exception() is not None:
+            with self._lock:
                 self._kept.pop(key, None)
+        with self._counting:
+            self._compiling -= 1
             tidy = self._let_go and self._compiling == 0
             self._let_go &= not tidy
         if tidy:  # it takes a tenth of a second, which the first frames of a process need not wait for
