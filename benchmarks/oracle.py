@@ -29,12 +29,12 @@ import peers
 import workloads
 
 import jaxsph as js
-from jaxsph.access.cells import Cells, cells_with_borders
+from jaxsph.access.slab_windows import SlabWindows, slab_windows_with_borders
 from jaxsph.access.grid import Grid
 from jaxsph.access.ordering import rank_particles
 from jaxsph.access.view import view_particles
-from jaxsph.cast.points import gather_field
-from jaxsph.control.worklist import CELL, full_rate, origins
+from jaxsph.cast.march import gather
+from jaxsph.field.schedule import CELL_SAMPLES, full_rate, reference_quantities
 from jaxsph.model.transfer import Segments, look_up
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
@@ -66,7 +66,7 @@ class Candidate:
     @property
     def share(self) -> float:
         """Of the evaluations at full rate."""
-        along = len(self.depths) / CELL if self.depths else 0.5**self.level
+        along = len(self.depths) / CELL_SAMPLES if self.depths else 0.5**self.level
         return along * (len(self.nodes) / 8) ** 2 if self.nodes else along
 
 
@@ -113,24 +113,24 @@ def from_lattice(nodes: tuple[int, ...]) -> np.ndarray:
 
 def from_depths(nodes: tuple[int, ...]) -> np.ndarray:
     """(16, nodes): the cubic through the nearest four."""
-    one = np.zeros((CELL, len(nodes)), np.float32)
-    for sample in range(CELL):
+    one = np.zeros((CELL_SAMPLES, len(nodes)), np.float32)
+    for sample in range(CELL_SAMPLES):
         near = sorted(np.argsort(np.abs(np.asarray(nodes) - sample), kind="stable")[:4])
         one[sample, near] = lagrange(tuple(np.asarray(nodes)[near]), np.asarray(float(sample)))
     return one
 
 
 @functools.partial(jax.jit, static_argnames="kernel")
-def light_of_candidates(grid: Grid, beside: Cells, scene: js.Scene, camera: js.Camera, at: Array, *, kernel: str) -> Array:
+def light_of_candidates(grid: Grid, beside: SlabWindows, scene: js.Scene, camera: js.Camera, at: Array, *, kernel: str) -> Array:
     """What cells emit and let through, (candidates, 4, cells, 64): red, green, blue, transmittance."""
-    bundles = grid.cells.count.shape[1]
+    bundles = grid.windows.count.shape[1]
     cell, bundle = at // bundles, at % bundles
     u, v = (rays.T for rays in grid.rays(camera, bundle))
-    half = jnp.minimum(2 * CELL * cell[:, None] + jnp.arange(2 * CELL + 1), grid.half_steps.shape[0] - 1)
+    half = jnp.minimum(2 * CELL_SAMPLES * cell[:, None] + jnp.arange(2 * CELL_SAMPLES + 1), grid.half_steps.shape[0] - 1)
     depth = grid.half_steps[half]
-    work = full_rate(beside, origins(grid.cells, grid.lists.rank, grid.ordered.quantity))
+    work = full_rate(beside, reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity))
     item = jax.tree.map(lambda leaf: leaf[..., cell, bundle], work)
-    sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, depth[:, 1:-1]), camera.is_perspective, kernel)
+    sums = gather(grid.ordered, grid.lists.rank, item, (u, v, depth[:, 1:-1]), camera.is_perspective, kernel)
     weight, weighted = (value.reshape(*value.shape[:2], 64) for value in (sums.real, sums.imag))
     slant = jnp.ones((at.shape[0], 1, 64), depth.dtype)
     if camera.is_perspective:
@@ -177,14 +177,14 @@ class Cut:
 def cut(scene: js.Scene, camera: js.Camera) -> Cut:
     """All candidates of all cells of a frame."""
     usual = js.plan(scene, camera, js.Settings())
-    deep = js.plan(scene, camera, js.Settings(), slab_samples=CELL)
+    deep = js.plan(scene, camera, js.Settings(), slab_samples=CELL_SAMPLES)
     assert usual.bands == deep.bands == 1, "the image is too large to be compared in one piece"
     slabs = np.asarray(grid_of(scene, camera, usual).cells.count)
-    per_cell = CELL // usual.cast.slab_samples
+    per_cell = CELL_SAMPLES // usual.cast.slab_samples
     slabs = np.pad(slabs, ((0, -len(slabs) % per_cell), (0, 0))).reshape(-1, per_cell, slabs.shape[1])
     work = slabs.sum(1) * usual.cast.slab_samples
     grid = grid_of(scene, camera, deep)
-    beside = cells_with_borders(grid.ordered, grid.lists)
+    beside = slab_windows_with_borders(grid.ordered, grid.lists)
     filled = np.flatnonzero(work.ravel())
     filled = filled[np.argsort(-np.asarray(beside.count).ravel()[filled], kind="stable")]
     light = np.empty((len(CANDIDATES), 4, len(filled), 64), np.float32)

@@ -42,7 +42,7 @@ def machine(found: dict) -> str:
 
 
 def trade(found: dict) -> str:
-    """Error against tolerance, and against time; what beats coarser sampling; the first paper's numbers."""
+    """Error against tolerance, and against time; what beats coarser sampling; the numbers of Hochstetter et al. 2016."""
     rows, promised = [], []
     for record in found["records"]:
         saved = record["evaluations_full"] / record["evaluations"] if record["evaluations"] else None
@@ -97,7 +97,7 @@ smaller image scaled up (`size/K`):
 sample is shaded whatever the tolerance, and slabs at a silhouette are marched at full rate. Small images have much of both;
 larger ones save more (see the pilot estimator below).
 
-### Beside the first paper
+### Beside Hochstetter et al. 2016
 Its tables 2 and 3 (GTX Titan, up to 10 M particles, relaxed). Data are of the same kind, not the same:
 compare shapes, not digits.
 
@@ -121,7 +121,7 @@ def sequences(found: dict) -> str:
     return f"""## Over sequences
 Frames {", ".join(f"{frame:g}" for frame in sorted({record["frame"] for record in found["records"]}))} of each scene,
 {found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {machine(found)}. `interval` is certified: no
-frame may be over its tolerance. "Rays over" is of the frame with most. The first paper has up to 0.0125 % of rays over it, in 1
+frame may be over its tolerance. "Rays over" is of the frame with most. Hochstetter et al. 2016 have up to 0.0125 % of rays over it, in 1
 frame of 1200 (its table 3, relaxed).
 
 {table(header, rows)}

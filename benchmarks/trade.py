@@ -1,7 +1,7 @@
 """Claim: what is certified is never over its tolerance, and what the pilot estimates hardly ever.
 
 `jaxsph.sweep` measures every estimator at every tolerance, coarser sampling and smaller images for five scenes, those of the
-first paper's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is measured on where
+Hochstetter et al. 2016's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is measured on where
 an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are for reading. Most of
 the time is compiling: some three minutes a scene on two busy cores.
 

@@ -165,7 +165,7 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("error control").add_argument
     add("--tolerance", type=float, metavar="T", help="largest error of any channel of any pixel (default: none)")
     add("--estimator", choices=("interval", "pilot"), help="how the error is known")
-    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
+    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for correlation_length")
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,23 +1,24 @@
 """A frame, as the calls of its stages: written once for eager rendering, for the forecast of its programs, and for traces.
 
-Flow: viewing, plan -> [frame: order -> make_grid -> decide -> cast_part] -> layers.
+Flow: viewing, plan -> [frame: order -> make_grid -> decide -> cast_shard] -> layers.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.pilot import PilotPlan
-from jaxsph.layers import OfParts
+from jaxsph.field.lattice import Lattice
+from jaxsph.layers import OfShards
+from jaxsph.model import registry
 from jaxsph.model.camera import Camera
+from jaxsph.model.medium import Medium
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Executor
 from jaxsph.plan import Plan
@@ -25,27 +26,29 @@ from jaxsph.stages import (
     Decided,
     Limits,
     add_lattices,
-    cast_part,
+    cast_shard,
     decide_by_bounds,
     decide_by_pilot,
     decide_full_rate,
-    look_part,
     make_grid,
-    sum_part,
+    order,
+    probe_shard,
+    sum_shard,
     wanted_cells,
 )
+from jaxsph.viewing import Seen
 
 
 class Band(NamedTuple):
     """What is known of a band.
 
     Attributes:
-        of_parts: what its rays met and what was decided, part by part.
+        of_shards: what its rays met and what was decided, shard by shard.
         faults: fault word of its lists.
         filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
     """
 
-    of_parts: OfParts
+    of_shards: OfShards
     faults: Int[Array, ""]
     filled: Int[Array, ""]
     pairs: Int[Array, ""]
@@ -53,60 +56,83 @@ class Band(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What all bands of a frame have in common; `plan` is that of the frame, and `parts` are cast side by side."""
+    """What all bands of a frame have in common; `shards` of each are cast side by side."""
 
     ordered: Ordered
     camera: Camera
     transfer: TransferFunction
+    media: tuple[Medium, ...]
     limits: Limits | None
     plan: Plan
     kernel: str
-    parts: int
+    shards: int
 
-    @property
-    def shapes(self) -> Plan:
-        """What the grid and the cast are compiled for, with any error control."""
-        return dataclasses.replace(self.plan, control=None)
+    @classmethod
+    def begun(
+        cls, seen: Seen, camera: Camera, limits: Limits | None, plan: Plan, kernel: str, shards: int, run: Executor
+    ) -> Frame:
+        """With the particles ranked, which is done once for all bands."""
+        static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
+        ordered = run.one("grid", order, (seen.viewed, camera), **static)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
-        made = run.one("grid", make_grid, (self.ordered, self.camera, first_row), plan=self.shapes)
+        plan = self.plan
+        sizes = {"lists": plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
+        made = run.one("grid", make_grid, (self.ordered, self.camera, first_row), **sizes)
         grid = made.of(self.ordered)
         decided, lattice = self._decide(grid, run)
-        works = [part.work for part in decided] if lattice is None else [decided[0].work] * self.parts
-        inputs = [(grid, self.camera, self.transfer, work, lattice, nth) for work, nth in zip(works, self._each, strict=True)]
-        rays = run.each("cast", cast_part, inputs, parts=self.parts, plan=self.shapes, kernel=self.kernel)
-        return Band((tuple(rays), tuple(part.layers for part in decided)), made.lists.faults, made.filled, made.pairs)
+        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
+        scene = (grid, self.camera, self.transfer, self.media)
+        inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
+        method = {"cast_plan": plan.cast, "integrator": plan.integrator, "screen": plan.screen, "kernel": self.kernel}
+        rays = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        of_shards = OfShards(tuple(rays), tuple(one.verdict for one in decided))
+        return Band(of_shards, made.lists.faults, made.filled, made.pairs)
 
     @property
     def _each(self) -> list[Int[Array, ""]]:
-        return [jnp.int32(nth) for nth in range(self.parts)]
+        return [jnp.int32(nth) for nth in range(self.shards)]
+
+    @property
+    def _halo(self) -> int:
+        return int(registry.integrator(self.plan.integrator).halo)
+
+    @property
+    def _cast(self) -> dict[str, Any]:
+        """What most stages are compiled for."""
+        return {"cast": self.plan.cast, "tuning": self.plan.cast.tuning}
 
     def _decide(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice | None]:
-        """What is to be marched, part by part; and the lattice, of which there is one decision for all parts."""
+        """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
         if self.limits is None or self.plan.control is None:
             return self._leave(grid, run, with_levels=False), None
         if isinstance(self.plan.control, PilotPlan):
-            return self._ask_pilot(grid, run)
+            return self._ask_pilot(grid, self.plan.control, run)
         return self._bound(grid, run), None
 
     def _leave(self, grid: Grid, run: Executor, *, with_levels: bool) -> list[Decided]:
-        inputs = [(grid, self.transfer, nth) for nth in self._each]
-        return run.each("adapt", decide_full_rate, inputs, parts=self.parts, plan=self.shapes, with_levels=with_levels)
+        inputs = [(grid, self.camera, self.transfer, self.media, nth) for nth in self._each]
+        static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
+        return run.each("adapt", decide_full_rate, inputs, **static)
 
-    def _ask_pilot(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice]:
+    def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
         view = (grid, self.camera, self.transfer)
         inputs = [(*view, nth) for nth in self._each]
-        lattices = run.each("adapt", sum_part, inputs, parts=self.parts, plan=self.plan, kernel=self.kernel)
-        lattice = run.one("adapt", add_lattices, (tuple(lattices),)) if self.parts > 1 else lattices[0]
-        # slab by slab what is at hand stays in the cache: one program is faster than parts side by side
-        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice), plan=self.plan)], lattice
+        static = {"shards": self.shards, "lists": self.plan.lists, "control": control, "kernel": self.kernel, **self._cast}
+        lattices = run.each("adapt", sum_shard, inputs, **static)
+        several, tuning = self.shards > 1, self.plan.cast.tuning
+        lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
+        # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
+        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice), **self._cast)], lattice
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
-        look = functools.partial(run.each, "adapt", parts=self.parts, plan=self.plan)
-        probes = look(look_part, [(grid, self.transfer, self.limits, nth) for nth in self._each])
-        pays, wanted = run.one("adapt", wanted_cells, (tuple(probes),))
+        static = {"shards": self.shards, "control": self.plan.control, **self._cast}
+        probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in self._each], **static)
+        pays, wanted = run.one("adapt", wanted_cells, (tuple(probes),), tuning=self.plan.cast.tuning)
         if not run.may_hold(pays):
             return self._leave(grid, run, with_levels=True)
         view = (grid, self.camera, self.transfer, self.limits)
-        return look(decide_by_bounds, [(*view, of_part, nth) for of_part, nth in zip(wanted, self._each, strict=True)])
+        inputs = [(*view, of_shard, nth) for of_shard, nth in zip(wanted, self._each, strict=True)]
+        return run.each("adapt", decide_by_bounds, inputs, **static)

@@ -7,63 +7,85 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.lists import BUNDLE
-from jaxsph.access.parts import gathered
-from jaxsph.cast.parts import joined
-from jaxsph.cast.points import Rays
+from jaxsph.access.shards import unshard
+from jaxsph.cast.march import RayResult
+from jaxsph.model import registry
 from jaxsph.model.image import Image
 from jaxsph.numerics.programs import light
 from jaxsph.plan import Plan
+from jaxsph.stages import Cast, Verdict
 
-OfParts = tuple[tuple[Rays, ...], tuple[tuple[Array, ...], ...]]
-"""Of all parts of a band: what their rays met; and error bound, full evaluations, and levels if there are any."""
+
+class OfShards(NamedTuple):
+    """What the rays of a band met, and what was decided for them, shard by shard; where one decided for all, of one."""
+
+    cast: tuple[Cast, ...]
+    verdicts: tuple[Verdict, ...]
+
+
+class Layers(NamedTuple):
+    """Of a band, or of an image.
+
+    Attributes:
+        full: evaluations that full rate takes.
+        levels: what error control gave each cell, if there is any that gives levels.
+    """
+
+    color: Float[Array, "rows columns 3"]
+    transmittance: Float[Array, "rows columns"]
+    depth: Float[Array, "rows columns"]
+    evaluations: Float[Array, "rows columns"]
+    bound: Float[Array, "rows columns"]
+    full: Float[Array, "rows columns"]
+    levels: Int[Array, "bundle_rows bundle_columns cells"] | None
 
 
 @light
 @functools.partial(jax.jit, static_argnames="plan")
-def develop(bands: tuple[OfParts, ...], *, plan: Plan) -> tuple[Array, ...]:
-    """Layers of the image, see `crop`, of all of its bands."""
-    layers = [unbundle(*band, plan=plan) for band in bands]
-    return crop(tuple(jnp.stack(layer) for layer in zip(*layers, strict=True)), plan)
+def develop(bands: tuple[OfShards, ...], *, plan: Plan) -> Layers:
+    """The image, of all of its bands."""
+    layers = [of_band(band, plan=plan) for band in bands]
+    return crop(jax.tree.map(lambda *values: jnp.stack(values), *layers), plan)
 
 
-def unbundle(cast: tuple[Rays, ...], decided: tuple[tuple[Array, ...], ...], *, plan: Plan) -> tuple[Array, ...]:
-    """Layers of a band as images: color (h, w, 3), transmittance, depth, evaluations, error bound and full evaluations (h, w);
-    and levels of bundles.
-    """
-    (bound, full, *levels), rays = gathered(decided), joined(cast)
-    rows, columns = plan.lists.tile_rows, plan.lists.tile_columns
+def of_band(band: OfShards, *, plan: Plan) -> Layers:
+    """The layers of a band."""
+    lists, verdict = plan.lists, unshard(band.verdicts)
+    spent = unshard(tuple(shard.evaluations for shard in band.cast))
+    color = unshard(tuple(shard.rays.color for shard in band.cast), 1)
+    transmittance = unshard(tuple(shard.rays.transmittance for shard in band.cast), 0)
+    depth = unshard(tuple(shard.rays.depth for shard in band.cast), 0)
+    pixels = registry.screen(plan.screen).resolve(RayResult(color, transmittance, depth), lists)
 
-    def lay_out(value: Array) -> Array:
-        """(bundles, 8, 8, ...) or (bundles, 1, 1, ...) to rows and columns."""
-        down, across = value.shape[1:3]
-        value = value.reshape(rows, columns, 2, 2, *value.shape[1:])
-        value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
-        return value.reshape(rows * 2 * down, columns * 2 * across, *value.shape[6:])
+    def over_pixels(value: Float[Array, " bundles"]) -> Float[Array, "rows columns"]:
+        return lists.as_image(jnp.broadcast_to(value[:, None, None], (lists.num_bundles, BUNDLE, BUNDLE)))
 
-    of_bundles = (rays.evaluations, bound, full)
-    of_rays = [jnp.broadcast_to(value[:, None, None], rays.transmittance.shape) for value in of_bundles]
-    layers = [lay_out(v) for v in (jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, *of_rays)]
-    return (*layers, *(lay_out(jnp.moveaxis(v, 0, -1)[:, None, None]) for v in levels))
+    levels = None if verdict.levels is None else lists.as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
+    color, transmittance, depth = pixels
+    return Layers(color, transmittance, depth, over_pixels(spent), over_pixels(verdict.bound), over_pixels(verdict.full), levels)
 
 
-def crop(layers: tuple[Array, ...], plan: Plan) -> tuple[Array, ...]:
-    """Join the layers of all bands, and cut off what lies beyond the image."""
-    joined = [layer.reshape(-1, *layer.shape[2:]) for layer in layers]
-    images = [layer[: plan.height, : plan.width] for layer in joined[:6]]
+def crop(bands: Layers, plan: Plan) -> Layers:
+    """Join the layers of all bands, stacked, and cut off what lies beyond the image; levels of cells come first."""
+    joined = jax.tree.map(lambda layer: layer.reshape(-1, *layer.shape[2:]), bands)
+    levels, joined = joined.levels, joined._replace(levels=None)
+    image: Layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], joined)
+    if levels is None:
+        return image
     rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
-    return *images, *(jnp.moveaxis(levels[:rows, :columns], -1, 0) for levels in joined[6:])
+    return image._replace(levels=jnp.moveaxis(levels[:rows, :columns], -1, 0))
 
 
-def assemble(layers: tuple[Array, ...], word: Array | int) -> tuple[Image, Array]:
-    """The image of those layers, and the evaluations that full rate takes."""
-    color, transmittance, depth, spent, bound, full, *levels = layers
-    return Image(color, transmittance, depth, bound, spent, True, word, {}, levels=levels[0] if levels else None), full
+def assemble(layers: Layers, word: Array | int) -> Image:
+    """The image of those layers."""
+    return Image(*layers[:3], layers.bound, layers.evaluations, True, word, {}, levels=layers.levels)
 
 
 def blank_if(unusable: Bool[Array, ""], image: Image) -> Image:

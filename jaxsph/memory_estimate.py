@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from jaxsph.access.lists import BUNDLE, ListPlan
-from jaxsph.cast.stretches import CastPlan
+from jaxsph.cast.batches import CastPlan
 from jaxsph.control.adapt import ControlPlan
 from jaxsph.control.pilot import PilotPlan
 
@@ -42,7 +42,7 @@ def frame_bytes(
         + lists.list_capacity * 8
         + num_classes * slabs * lists.num_bundles * 40
         + lists.num_bundles * RAYS * 5 * number * 2
-        + (16 * cast.chunk + 3 * cast.held) * cast.slab_samples * RAYS * number
+        + (16 * cast.chunk + 3 * cast.batch_slabs) * cast.slab_samples * RAYS * number
         + slabs * lists.num_bundles * 8
         + width * height * 8 * number
         + _of_control(control, lists, slabs, cast.slab_samples, num_classes, number)

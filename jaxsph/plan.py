@@ -12,27 +12,22 @@ import dataclasses
 
 import numpy as np
 
-from jaxsph.access.lattice import FINEST, Spacing
 from jaxsph.access.lists import TILE, ListPlan
-from jaxsph.cast.stretches import CastPlan
+from jaxsph.cast.batches import CastPlan
 from jaxsph.control.adapt import ControlPlan
 from jaxsph.control.pilot import PilotPlan
+from jaxsph.field.lattice import FINEST, Spacing
 from jaxsph.measures import Measures
 from jaxsph.memory_estimate import frame_bytes
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.tuning import CPU, Tuning
 
 LARGEST_CAPACITY = 1 << 30
 MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
-SAMPLES_AT_ONCE = 1024  # along depth, times 64 rays: accumulators and operands of a chunk stay in the second-level cache
-SAMPLES_HELD = 1 << 15  # of light, along depth, times 64 rays: it stays in the third-level cache
-MAX_RUNS = 16  # sorts side by side
-PAIRS_PER_RUN = (
-    1 << 15
-)  # below that, a sort takes less than it costs to have one more; 16 sorts of 5 M pairs in all took 0.8 of 4
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 NODES_REACHED = 2.5, 3  # by a support to every side, across and in depth: with fewer, wider nodes save less than they cost less
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
@@ -52,6 +47,7 @@ class Plan:
         cast: sizes of the march.
         bytes: estimate of the working memory, in bytes; of no matter to what is compiled, so plans are equal whatever it is.
         control: static choices of error control; None renders at full rate.
+        integrator, screen: names of how samples become light, and of which rays are cast.
     """
 
     width: int
@@ -64,6 +60,8 @@ class Plan:
     cast: CastPlan
     bytes: int = dataclasses.field(compare=False)
     control: ControlPlan | PilotPlan | None = None
+    integrator: str = "samples"
+    screen: str = "pixels"
 
     @property
     def band_height(self) -> int:
@@ -76,11 +74,12 @@ class Plan:
         return Choices(
             self.cast.slab_samples,
             self.control.nodes if isinstance(self.control, PilotPlan) else None,
-            self.control.parts if isinstance(self.control, ControlPlan) else None,
+            self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
         )
 
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
-        """Raise `ValueError` where the plan is for other shapes than those given."""
+        """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
+        require_controllable(scene, settings)
         self.check_image(camera, settings)
         if scene.particles.capacity > self.num_particles:
             raise ValueError(
@@ -94,6 +93,8 @@ class Plan:
             "camera.width": (camera.width, self.width),
             "camera.height": (camera.height, self.height),
             "settings.samples": (settings.samples, self.samples),
+            "settings.integrator": (settings.integrator, self.integrator),
+            "settings.screen": (settings.screen, self.screen),
         }
         for name, (have, planned) in given.items():
             if have != planned:
@@ -144,12 +145,12 @@ class Choices:
     Attributes:
         slab_samples: samples of a cell that share a window of particles.
         nodes: of the pilot's lattice; None without.
-        parts: sub-rectangles on each side of a footprint, for error bounds; None without.
+        coverage_subdivisions: sub-rectangles on each side of a footprint, for error bounds; None without.
     """
 
     slab_samples: int
     nodes: Spacing | None
-    parts: int | None
+    coverage_subdivisions: int | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,6 +162,7 @@ class FrameShape:
         num_classes: classes of support.
         headroom: factor that the number of particles may yet grow by within those entries, and pairs with it.
         number: bytes of a number.
+        tuning: for the device that holds the particles.
     """
 
     width: int
@@ -170,6 +172,7 @@ class FrameShape:
     num_classes: int
     headroom: float
     number: int
+    tuning: Tuning = CPU
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
@@ -177,7 +180,7 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     slab_samples = slab_samples or _choose_slab_samples(measures.depth_extent)
     kind = _kind(settings)
     nodes = _choose_nodes(measures.depth_extent, measures.diameter, slab_samples) if kind is PilotPlan else None
-    return Choices(slab_samples, nodes, _choose_parts(measures.diameter) if isinstance(kind, ControlPlan) else None)
+    return Choices(slab_samples, nodes, _choose_subdivisions(measures.diameter) if isinstance(kind, ControlPlan) else None)
 
 
 def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices) -> Plan:
@@ -208,13 +211,13 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     bands = -(-tile_rows // rows)
     pairs = [_fullest_band(counts, rows, bands) for counts in (measures.tile_pairs, measures.bundle_pairs)]
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
-    lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled))
-    cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples)
+    lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
+    cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
     room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
     needed = frame_bytes(size, shape.num_classes, lists, cast, control, shape.number)
-    return Plan(*size, shape.num_classes, bands, lists, cast, needed, control)
+    return Plan(*size, shape.num_classes, bands, lists, cast, needed, control, settings.integrator, settings.screen)
 
 
 def _fullest_band(counts: np.ndarray, rows: int, bands: int) -> int:
@@ -230,8 +233,8 @@ def _control_plan(settings: Settings, choices: Choices, room: tuple[int, int]) -
     """What of `settings` and of the frame's measures is fixed when a program is compiled; None without a tolerance."""
     if choices.nodes is not None:
         return PilotPlan(choices.nodes, room)
-    if choices.parts is not None:
-        return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, choices.parts)
+    if choices.coverage_subdivisions is not None:
+        return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, choices.coverage_subdivisions)
     return None
 
 
@@ -267,7 +270,7 @@ def _roomless(control: ControlPlan | PilotPlan | None) -> ControlPlan | PilotPla
     return dataclasses.replace(control, room=None) if isinstance(control, PilotPlan) else control
 
 
-def _choose_parts(diameter: float) -> int:
+def _choose_subdivisions(diameter: float) -> int:
     """A sub-rectangle is covered only by a support a few times as wide as itself."""
     return 2 if diameter >= FINE_DIAMETER else 4
 
@@ -287,13 +290,27 @@ def _choose_slab_samples(depth_extent: float) -> int:
     return SLAB_SAMPLES[-1]
 
 
-def _choose_runs(pairs: int) -> int:
-    """Short sorts, that stay in the caches, but not more than that takes: every one is a few kernels more to compile."""
-    return 1 << (min(MAX_RUNS, max(pairs // PAIRS_PER_RUN, 1)).bit_length() - 1)
+def _choose_runs(pairs: int, tuning: Tuning) -> int:
+    """As many sorts as run side by side, but not more than pays: every one is a few kernels more to compile."""
+    return 1 << (min(tuning.max_sorts, max(pairs // tuning.pairs_per_sort, 1)).bit_length() - 1)
 
 
-def _cast_plan(bundles: int, samples: int, slab_samples: int) -> CastPlan:
-    """As many slabs as the caches hold, but not many more than a small image has."""
+def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) -> CastPlan:
+    """As many slabs as suit the machine, but not many more than a small image has."""
     most = bundles * -(-samples // slab_samples)
-    chunk = 1 << (min(SAMPLES_AT_ONCE // slab_samples, most) - 1).bit_length()
-    return CastPlan(chunk, slab_samples, min(SAMPLES_HELD // slab_samples, -(-most // chunk) * chunk))
+    chunk = 1 << (min(tuning.samples_at_once // slab_samples, most) - 1).bit_length()
+    return CastPlan(chunk, slab_samples, min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk), tuning)
+
+
+def require_controllable(scene: Scene, settings: Settings) -> None:
+    """Raise `ValueError` where a tolerance is asked for that no estimator can keep."""
+    if settings.tolerance is None:
+        return
+    beyond = {
+        f"`integrator={settings.integrator!r}`": settings.integrator != "samples",
+        f"`screen={settings.screen!r}`": settings.screen != "pixels",
+        "`Scene(media=...)`": bool(scene.media),
+    }
+    for what, asked in beyond.items():
+        if asked:
+            raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")

@@ -13,23 +13,22 @@ import dataclasses
 import functools
 import math
 import threading
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.access.view import Viewed
 from jaxsph.measures import measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import light
-from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class
-from jaxsph.viewing import view_scene
+from jaxsph.numerics.tuning import tuning_for
+from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class, require_controllable
+from jaxsph.viewing import Seen, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 MAX_KEPT = 64
@@ -59,6 +58,7 @@ def plan(
     settings = settings or Settings()
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    require_controllable(scene, settings)
     shape = dataclasses.replace(shape_of(scene.particles, camera, settings), headroom=1.0)
     if like is not None:
         like.check_image(camera, settings)
@@ -71,18 +71,12 @@ def plan(
     return made if like is None else like.grown(made)
 
 
-class Seen(NamedTuple):
-    """What the camera sees: particles in view space, and the transfer function in the same units."""
-
-    viewed: Viewed
-    transfer: TransferFunction
-
-
 def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: int, run: Executor) -> Seen:
     """Have the scene viewed, with its particles padded to a capacity."""
     if scene.particles.capacity < capacity:
         scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particles,), capacity=capacity))
-    return Seen(*run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes))
+    seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes)
+    return seen
 
 
 @light
@@ -101,6 +95,7 @@ class Plans:
 
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
+        require_controllable(scene, settings)
         shape = self._similar(shape_of(scene.particles, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
@@ -160,7 +155,8 @@ def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameS
     headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
     number = np.dtype(particles.dtype).itemsize
     size = camera.width, camera.height, settings.samples
-    return FrameShape(*size, capacity, _num_classes(np.asarray(particles.support)[valid]), headroom, number)
+    classes = _num_classes(np.asarray(particles.support)[valid])
+    return FrameShape(*size, capacity, classes, headroom, number, tuning_for(particles.support))
 
 
 def _num_classes(support: Any) -> int:

@@ -1,6 +1,6 @@
 """The oracle: the same image in float64 NumPy, particle by particle, with no grid and no cleverness.
 
-It follows the first paper's sections 2.1 and 2.2 line by line and is what every other renderer here is judged by. Slow:
+It follows Hochstetter et al. 2016, sections 2.1 and 2.2, line by line and is what every other renderer here is judged by. Slow:
 about 50 M particle-sample evaluations a second, and two float64 numbers of memory a sample.
 """
 

@@ -17,10 +17,9 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.cast.adjoint import KEPT
-from jaxsph.cast.parts import parts_at_hand
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.frame import Band, Frame
-from jaxsph.layers import assemble, blank_if, crop, develop, unbundle
+from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -29,10 +28,12 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor, Forecast, Traced
 from jaxsph.numerics.programs import PROGRAMS
+from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.plan import Plan
-from jaxsph.planning import PLANS, Seen, see
-from jaxsph.stages import limits_of, order
+from jaxsph.planning import PLANS, see
+from jaxsph.stages import limits_of
 from jaxsph.version import __version__
+from jaxsph.viewing import Seen
 
 Progress = Callable[[int, int], None]
 
@@ -99,15 +100,15 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         plan.check(scene, camera, settings)
         clock.mark("plan")
         seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, clock)
-    draw = functools.partial(_draw, seen, camera, settings, plan, scene.particles.kernel, parts_at_hand(seen.viewed.x))
+    draw = functools.partial(_draw, seen, camera, settings, plan, scene.particles.kernel)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
     word = functools.reduce(lambda a, b: a | b, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
     _raise(word, planned)
-    image, full = assemble(layers, word)
+    image = assemble(layers, word)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
-        "evaluations_full": int(np.asarray(full, np.float64).sum()),
+        "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
         "cells": sum(int(band.filled) for band in bands),
         "pairs": sum(int(band.pairs) for band in bands),
         "seconds": clock.seconds,
@@ -124,32 +125,30 @@ def _draw(
     settings: Settings,
     plan: Plan,
     kernel: str,
-    parts: int,
     run: Executor,
     progress: Progress | None,
-) -> tuple[list[Band], tuple[Array, ...]]:
+) -> tuple[list[Band], Layers]:
     """All bands one by one, and the layers of the image."""
-    shapes = dataclasses.replace(plan, control=None)
-    ordered = run.one("grid", order, (seen.viewed, camera), plan=shapes)
-    limits = limits_of(settings, ordered.x.dtype)
-    frame, bands = Frame(ordered, camera, seen.transfer, limits, plan, kernel, parts), []
+    limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
+    frame, bands = Frame.begun(seen, camera, limits, plan, kernel, shards, run), []
     for band in range(plan.bands):
         bands.append(frame.band(jnp.int32(band * plan.band_height), run))
         if progress is not None:
             progress(band + 1, plan.bands)
-    return bands, run.one("image", develop, (tuple(band.of_parts for band in bands),), plan=shapes)
+    return bands, run.one(
+        "image", develop, (tuple(band.of_shards for band in bands),), plan=dataclasses.replace(plan, control=None)
+    )
 
 
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
     run = Traced()
     seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
-    ordered = run.one("grid", order, (seen.viewed, camera), plan=plan)
-    limits = limits_of(settings, ordered.x.dtype)
-    frame = Frame(ordered, camera, seen.transfer, limits, plan, scene.particles.kernel, 1)
+    limits = limits_of(settings, seen.viewed.x.dtype)
+    frame = Frame.begun(seen, camera, limits, plan, scene.particles.kernel, 1, run)
 
     def one_band(band: Int[Array, ""]) -> Any:
         found = frame.band(band * plan.band_height, run)
-        return unbundle(*found.of_parts, plan=plan), found.faults, (found.filled, found.pairs)
+        return of_band(found.of_shards, plan=plan), found.faults, (found.filled, found.pairs)
 
     bands = jnp.arange(plan.bands, dtype=jnp.int32)
     if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
@@ -159,11 +158,11 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
         results = jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)]) | seen.viewed.faults
-    image, full = assemble(crop(layers, plan), word)
-    image = blank_if(word & faults.UNUSABLE != 0, image)
+    layers = crop(layers, plan)
+    image = blank_if(word & faults.UNUSABLE != 0, assemble(layers, word))
     filled, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
-    stats = {"evaluations": spent, "evaluations_full": full.sum(), "cells": filled, "pairs": pairs}
+    stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": filled, "pairs": pairs}
     certified = _certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, stats=stats)
 

@@ -1,12 +1,13 @@
 """The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
 
-Flow: viewing -> order -> make_grid -> (sum_part or look_part) -> decide_... -> cast_part -> layers.
+Flow: viewing -> order -> make_grid -> (sum_shard or probe_shard) -> decide_... -> cast_shard -> layers.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,31 +16,55 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import Cells, find_cells
+from jaxsph.access.extents import slab_extents
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice, added, region_of
-from jaxsph.access.lists import BundleLists, build_lists, bundle_origins
+from jaxsph.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, rank_particles
-from jaxsph.access.parts import dealt, part_of
+from jaxsph.access.shards import shard, shard_of_grid
+from jaxsph.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders
 from jaxsph.access.view import Viewed
-from jaxsph.cast.adjoint import cast
-from jaxsph.cast.nodes import sum_at_nodes
-from jaxsph.cast.parts import plan_of_part
-from jaxsph.cast.points import Rays, evaluations
-from jaxsph.control.adapt import ControlPlan, adapt, look, untouched
+from jaxsph.cast.adjoint import CastMethod, cast
+from jaxsph.cast.batches import CastPlan
+from jaxsph.cast.march import RayResult
+from jaxsph.control.adapt import ControlPlan, adapt, screen_cells, untouched
+from jaxsph.control.interpolation_error import interpolation_error
 from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.control.probe import Probe, worthwhile
-from jaxsph.control.residuals import residuals
-from jaxsph.control.worklist import Worklist, full_rate, origins
+from jaxsph.field.lattice import Lattice, region_of, sum_shards
+from jaxsph.field.nodes import sum_at_nodes
+from jaxsph.field.schedule import SlabSchedule, evaluations, full_rate, reference_quantities
+from jaxsph.model import registry
 from jaxsph.model.camera import Camera
+from jaxsph.model.medium import Medium
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.programs import light
-from jaxsph.plan import Plan
+from jaxsph.numerics.tuning import Tuning
 from jaxsph.viewing import half_steps
 
-Limits = tuple[Array, Array]  # tolerance and relaxation
+
+def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Jit a function as a stage, tuned by its keyword `tuning`; `quickly` where it takes longer to compile than to run."""
+
+    def made(function: Callable[..., Any]) -> Any:
+        @functools.wraps(function)
+        def tuned(*arguments: Any, tuning: Tuning, **static: Any) -> Any:
+            with barriers(tuning.fusion_barriers):
+                return function(*arguments, tuning=tuning, **static)
+
+        jitted = jax.jit(tuned, static_argnames=(*static, "tuning"))
+        return light(jitted) if quickly else jitted
+
+    return made
+
+
+class Limits(NamedTuple):
+    """What an error is held against: tolerance and relaxation."""
+
+    tolerance: Float[Array, ""]
+    relax: Float[Array, ""]
 
 
 def limits_of(settings: Settings, dtype: Any) -> Limits | None:
@@ -50,10 +75,10 @@ def limits_of(settings: Settings, dtype: Any) -> Limits | None:
     if not is_traced(tolerance):
         rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
         tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
-    return jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype)
+    return Limits(jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype))
 
 
-class GridParts(NamedTuple):
+class BandGrid(NamedTuple):
     """What a `Grid` holds besides the particles, which are the same for all bands; and how much that is.
 
     Attributes:
@@ -61,7 +86,7 @@ class GridParts(NamedTuple):
     """
 
     lists: BundleLists
-    cells: Cells
+    windows: SlabWindows
     row: Int[Array, " bundles"]
     column: Int[Array, " bundles"]
     half_steps: Float[Array, " two_samples_and_one"]
@@ -70,111 +95,145 @@ class GridParts(NamedTuple):
 
     def of(self, ordered: Ordered) -> Grid:
         """The grid of those particles."""
-        return Grid(ordered, self.lists, self.cells, self.row, self.column, self.half_steps)
+        return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
 
 
-@dataclasses.dataclass(frozen=True)
-class Decided:
-    """What is to be marched, what would be at full rate, how wrong each bundle's pixels can be, what each cell was given."""
+class Verdict(NamedTuple):
+    """What an image tells of a decision.
 
-    work: Worklist
-    full: Float[Array, " bundles"]
+    Attributes:
+        bound: how wrong each bundle's pixels can be.
+        full: evaluations at full rate.
+        levels: what each cell was given; None where there are no levels.
+    """
+
     bound: Float[Array, " bundles"]
+    full: Float[Array, " bundles"]
     levels: Int[Array, "cells bundles"] | None
 
-    @property
-    def layers(self) -> tuple[Array, ...]:
-        """What the image shows of it: error bound, evaluations at full rate, and levels if there are any."""
-        return (self.bound, self.full) if self.levels is None else (self.bound, self.full, self.levels)
+
+class Decided(NamedTuple):
+    """What is to be marched, and what the image tells of it."""
+
+    schedule: SlabSchedule
+    verdict: Verdict
 
 
-jax.tree_util.register_dataclass(Decided, data_fields=["work", "full", "bound", "levels"], meta_fields=[])
-
-
-@light
-@functools.partial(jax.jit, static_argnames="plan")
-def order(viewed: Viewed, camera: Camera, *, plan: Plan) -> Ordered:
+@stage("samples", "slab_samples", quickly=True)
+def order(viewed: Viewed, camera: Camera, *, samples: int, slab_samples: int, tuning: Tuning) -> Ordered:
     """The particles that can be seen, by rank."""
-    depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
-    return rank_particles(viewed, camera, depths, plan.cast.slab_samples)
+    depths = half_steps(camera, viewed.x.dtype, samples)[1::2]
+    return rank_particles(viewed, camera, depths, slab_samples)
 
 
-@functools.partial(jax.jit, static_argnames="plan")
-def make_grid(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, plan: Plan) -> GridParts:
-    """The grid of the band that begins at a row of pixels."""
-    depths = half_steps(camera, ordered.x.dtype, plan.samples)
+@stage("lists", "samples", "halo")
+def make_grid(
+    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, halo: int, tuning: Tuning
+) -> BandGrid:
+    """The grid of the band that begins at a row of pixels; `halo` is that of the integrator."""
+    depths = half_steps(camera, ordered.x.dtype, samples)
     ordered, camera = jax.tree.map(lax.stop_gradient, (ordered, camera))
-    lists = build_lists(ordered, camera, plan.lists, first_row)
-    cells = find_cells(ordered, lists)
-    return GridParts(lists, cells, *bundle_origins(plan.lists, first_row), depths, (cells.count > 0).sum(), lists.end[-1])
+    made = build_lists(ordered, camera, lists, first_row)
+    windows = (slab_windows_with_borders if halo else find_slab_windows)(ordered, made)
+    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), made.end[-1])
 
 
-@functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
-def sum_part(
-    grid: Grid, camera: Camera, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan, kernel: str
+@stage("shards", "lists", "cast", "control", "kernel")
+def sum_shard(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    lists: ListPlan,
+    cast: CastPlan,
+    control: PilotPlan,
+    kernel: str,
+    tuning: Tuning,
 ) -> Lattice:
-    """The lattice of the `nth` of `parts` of a band, for the pilot estimator."""
-    assert isinstance(plan.control, PilotPlan)
-    nodes = plan.control.nodes
+    """The lattice of the `nth` of `shards` of a band, for the pilot estimator."""
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    slab_samples, room = plan.cast.slab_samples, plan.control.room or plan.lists.bundles
-    wanted = worth_a_lattice(grid, camera, slab_samples, nodes)
+    slab_samples, room = cast.slab_samples, control.room or lists.bundles
+    wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
     amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
     amid = amid.astype(grid.half_steps.dtype)
-    region = region_of(grid, *room, nodes)
-    return sum_at_nodes(part_of(grid, nth, parts), camera, kernel, slab_samples, region, amid, wanted)
+    region = region_of(grid, *room, control.nodes)
+    of_shard = shard_of_grid(grid, nth, shards)
+    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, amid, tuning.cells_of_nodes, wanted)
 
 
-add_lattices = light(jax.jit(added))
+@stage(quickly=True)
+def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
+    """That of a band, of those of its shards."""
+    return sum_shards(lattices)
 
 
-@light
-@functools.partial(jax.jit, static_argnames=("parts", "plan"))
-def look_part(grid: Grid, transfer: TransferFunction, limits: Limits, nth: Int[Array, ""], *, parts: int, plan: Plan) -> Probe:
-    """What may be worth bounding, in the `nth` of `parts` of a band."""
+@stage("shards", "cast", "control", quickly=True)
+def probe_shard(
+    grid: Grid,
+    transfer: TransferFunction,
+    limits: Limits,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    cast: CastPlan,
+    control: ControlPlan,
+    tuning: Tuning,
+) -> Probe:
+    """What may be worth bounding, in the `nth` of `shards` of a band."""
     grid, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, transfer, limits))
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    assert isinstance(plan.control, ControlPlan)
-    tolerance, relax = limits
-    return look(part_of(grid, nth, parts), transfer, tolerance, relax, plan.cast.slab_samples, plan.control)
+    return screen_cells(shard_of_grid(grid, nth, shards), transfer, *limits, cast.slab_samples, control, tuning)
 
 
-@light
-@jax.jit
-def wanted_cells(probes: tuple[Probe, ...]) -> tuple[Bool[Array, ""], tuple[Bool[Array, "cells bundles"], ...]]:
-    """Whether any cell is to be analysed; and which, of each part."""
+@stage(quickly=True)
+def wanted_cells(
+    probes: tuple[Probe, ...], *, tuning: Tuning
+) -> tuple[Bool[Array, ""], tuple[Bool[Array, "cells bundles"], ...]]:
+    """Whether any cell is to be analysed; and which, of each shard."""
     pays = worthwhile([(probe.held, probe.all_held) for probe in probes])
     return pays & jnp.stack([probe.promising.any() for probe in probes]).any(), tuple(probe.promising & pays for probe in probes)
 
 
-@light
-@functools.partial(jax.jit, static_argnames=("parts", "plan", "with_levels"))
+@stage("shards", "cast", "halo", "with_levels", quickly=True)
 def decide_full_rate(
-    grid: Grid, transfer: TransferFunction, nth: Int[Array, ""], *, parts: int, plan: Plan, with_levels: bool
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    media: tuple[Medium, ...],
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    cast: CastPlan,
+    halo: int,
+    with_levels: bool,
+    tuning: Tuning,
 ) -> Decided:
-    """Every cell of the `nth` of `parts` of a band at full rate: without error control, or where none of it would pay."""
-    grid, transfer = jax.tree.map(lax.stop_gradient, (part_of(grid, nth, parts), transfer))
-    work, full = _at_full_rate(grid, transfer, plan)
-    levels = untouched(grid.cells, plan.cast.slab_samples) if with_levels else None
-    return Decided(work, full, jnp.zeros(full.shape, grid.half_steps.dtype), levels)
+    """Every cell of the `nth` of `shards` of a band at full rate: without error control, or where none of it would pay."""
+    grid, camera, transfer, media = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), camera, transfer, media))
+    schedule, full = _at_full_rate(grid, transfer, cast, halo)
+    extents = slab_extents(grid, camera, cast.slab_samples) if media else None
+    filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
+    levels = untouched(grid.windows, cast.slab_samples) if with_levels else None
+    nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
+    return Decided(dataclasses.replace(schedule, filled=filled), Verdict(nothing, full, levels))
 
 
-@light
-@functools.partial(jax.jit, static_argnames="plan")
+@stage("cast", quickly=True)
 def decide_by_pilot(
-    grid: Grid, camera: Camera, transfer: TransferFunction, limits: Limits, lattice: Lattice, *, plan: Plan
+    grid: Grid, camera: Camera, transfer: TransferFunction, limits: Limits, lattice: Lattice, *, cast: CastPlan, tuning: Tuning
 ) -> Decided:
     """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient."""
     grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
-    dtype, slab_samples = grid.half_steps.dtype, plan.cast.slab_samples
-    work, full = _at_full_rate(grid, transfer, plan)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
-    found = residuals(grid, lattice, camera, transfer, slab_samples)
-    work, bound = pilot(grid, lattice, found, camera, work.origin, limits[0], slab_samples)
-    return Decided(work, full, bound, None)
+    schedule, full = _at_full_rate(grid, transfer, cast)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
+    schedule, bound = pilot(grid, lattice, found, camera, schedule.reference_quantity, limits.tolerance, cast.slab_samples)
+    return Decided(schedule, Verdict(bound, full, None))
 
 
-@functools.partial(jax.jit, static_argnames=("parts", "plan"))
+@stage("shards", "cast", "control")
 def decide_by_bounds(
     grid: Grid,
     camera: Camera,
@@ -183,43 +242,64 @@ def decide_by_bounds(
     wanted: Bool[Array, "cells bundles"],
     nth: Int[Array, ""],
     *,
-    parts: int,
-    plan: Plan,
+    shards: int,
+    cast: CastPlan,
+    control: ControlPlan,
+    tuning: Tuning,
 ) -> Decided:
-    """How each cell of the `nth` of `parts` of a band is sampled, if it is `wanted`. Decisions carry no gradient."""
-    assert isinstance(plan.control, ControlPlan)
+    """How each cell of the `nth` of `shards` of a band is sampled, if it is `wanted`. Decisions carry no gradient."""
     grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
-    dtype, grid = grid.half_steps.dtype, part_of(grid, nth, parts)
-    work, full = _at_full_rate(grid, transfer, plan)
+    dtype, grid = grid.half_steps.dtype, shard_of_grid(grid, nth, shards)
+    schedule, full = _at_full_rate(grid, transfer, cast)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
-    chosen = adapt(grid, camera, transfer, work.origin, wanted, *limits, plan.cast.slab_samples, plan.control)
-    return Decided(chosen[0], full, *chosen[1:])
+    reference = schedule.reference_quantity
+    schedule, bound, levels = adapt(grid, camera, transfer, reference, wanted, *limits, cast.slab_samples, control, tuning)
+    return Decided(schedule, Verdict(bound, full, levels))
 
 
-def _at_full_rate(grid: Grid, transfer: TransferFunction, plan: Plan) -> tuple[Worklist, Float[Array, " bundles"]]:
-    """The work of the reference image, and its evaluations."""
-    origin = origins(grid.cells, grid.lists.rank, grid.ordered.quantity)
-    # an origin far beyond what is shown would cost the digits of what is
-    work = full_rate(grid.cells, jnp.clip(origin, transfer.values[0], transfer.values[-1]))
-    return work, evaluations(work, plan.samples, plan.cast)
+def _at_full_rate(
+    grid: Grid, transfer: TransferFunction, cast: CastPlan, halo: int = 0
+) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
+    """The schedule of the reference image, and its evaluations."""
+    reference = reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity)
+    # a reference far beyond what is shown would cost the digits of what is
+    schedule = full_rate(grid.windows, jnp.clip(reference, transfer.values[0], transfer.values[-1]))
+    return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
 
 
-@functools.partial(jax.jit, static_argnames=("parts", "plan", "kernel"))
-def cast_part(
+class Cast(NamedTuple):
+    """What the rays of a shard meet, and the kernel evaluations of each bundle, a pixel."""
+
+    rays: RayResult
+    evaluations: Float[Array, " bundles"]
+
+
+@stage("shards", "cast_plan", "integrator", "screen", "kernel")
+def cast_shard(
     grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
-    work: Worklist,
+    media: tuple[Medium, ...],
+    schedule: SlabSchedule,
     lattice: Lattice | None,
     nth: Int[Array, ""],
     *,
-    parts: int,
-    plan: Plan,
+    shards: int,
+    cast_plan: CastPlan,
+    integrator: str,
+    screen: str,
     kernel: str,
-) -> Rays:
-    """What the rays of the `nth` of `parts` of a band meet. The grid is of the whole band, and so is the work with a lattice."""
+    tuning: Tuning,
+) -> Cast:
+    """The `nth` of `shards` of a band. The grid is of the whole band, and so is the schedule with a lattice."""
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    of_nodes = None if lattice is None else lattice.evaluations
     if lattice is not None:
-        work, spent = dealt((work, lattice.evaluations), nth, parts)
-        lattice = dataclasses.replace(lattice, evaluations=spent)
-    return cast(part_of(grid, nth, parts), work, camera, transfer, kernel, plan_of_part(plan.cast, parts), lattice)
+        schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
+    made = registry.integrator(integrator)
+    method = CastMethod(kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets)
+    grid = shard_of_grid(grid, nth, shards)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice)
+    spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)
+    spent = method.packets_of(grid, camera).per_pixel(spent, BUNDLE * BUNDLE)
+    return Cast(rays, spent if of_nodes is None else spent + of_nodes)

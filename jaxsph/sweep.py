@@ -73,7 +73,7 @@ def sweep(
         scene, camera: what to render, and from where; or as many of both as the sequence has frames.
         settings: the settings of full rate; default `Settings()`. `tolerance`, `estimator` and `relax` are the sweep's.
         tolerances: each >= 0.
-        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, the first paper's) and `"pilot"`.
+        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`.
         baselines: `"samples/K"`, uniform sampling with K times fewer samples; `"size/K"`, an image K times smaller each
             way, scaled up bilinearly.
         repeats: turns, at least 1.

@@ -1,4 +1,4 @@
-"""The first stage of a frame: its particles and transfer function as the camera sees them, in the units of all later stages.
+"""The first stage of a frame: its particles, other media and transfer function as the camera sees them, in the units of all later stages.
 
 Flow: scene, camera -> [viewing] -> plan, stages.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +17,32 @@ from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.access.view import Viewed, view_particles
 from jaxsph.model.camera import Camera
+from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.programs import light
 
 
+class Seen(NamedTuple):
+    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles."""
+
+    viewed: Viewed
+    transfer: TransferFunction
+    media: tuple[Medium, ...]
+
+
 @light
 @functools.partial(jax.jit, static_argnames=("samples", "num_classes"))
-def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) -> tuple[Viewed, TransferFunction]:
+def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
     dtype = jnp.promote_types(scene.particles.dtype, camera.dtype)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     quantity, transfer = rescaled(scene.particles.quantity.astype(dtype), transfer)
     particles = dataclasses.replace(scene.particles, quantity=quantity)
     viewed = view_particles(particles, camera, half_steps(camera, dtype, samples)[1::2], num_classes)
-    return dataclasses.replace(viewed, faults=viewed.faults | _input_faults(scene, camera, samples)), transfer
+    viewed = dataclasses.replace(viewed, faults=viewed.faults | _input_faults(scene, camera, samples))
+    return Seen(viewed, transfer, tuple(medium.seen_by(camera) for medium in scene.media))
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:

@@ -17,9 +17,9 @@ import jaxsph as js
 from jaxsph.access.lists import ListPlan
 from jaxsph.access.ordering import rank_particles
 from jaxsph.access.view import view_particles
-from jaxsph.cast.stretches import CastPlan
+from jaxsph.cast.batches import CastPlan
 from jaxsph.control.errors import fits
-from jaxsph.control.worklist import CELL, COARSEST, origins
+from jaxsph.field.schedule import CELL_SAMPLES, MAX_LEVEL, reference_quantities
 from jaxsph.numerics import memory_maps
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
@@ -50,7 +50,7 @@ class Frames:
 
     def deep(self, slab_samples: int) -> Frames:
         """Frames of as many whole cells as the coarsest level merges, and one that is not whole."""
-        return dataclasses.replace(self, samples=(CELL << COARSEST - fits(slab_samples)) + 3)
+        return dataclasses.replace(self, samples=(CELL_SAMPLES << MAX_LEVEL - fits(slab_samples)) + 3)
 
     @property
     def settings(self) -> js.Settings:
@@ -179,7 +179,7 @@ def grid_of(particles, camera, *, plan):
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
     grid = make_grid(ordered, camera, 0, plan=plan).of(ordered)
-    return grid, origins(grid.cells, grid.lists.rank, ordered.quantity)
+    return grid, reference_quantities(grid.windows, grid.lists.rank, ordered.quantity)
 
 
 @pytest.fixture(scope="session")

@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.cells import Cells
 from jaxsph.access.lists import BUNDLE, BundleLists
 from jaxsph.access.ordering import Ordered
+from jaxsph.access.slab_windows import SlabWindows
 from jaxsph.model.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Particles by rank, the lists of all bundles, and the windows of all cells.
+    """Particles by rank, the lists of all bundles, and the windows of all slabs.
 
     Attributes:
         row, column: pixel row and column of each bundle's upper left corner.
@@ -29,7 +29,7 @@ class Grid:
 
     ordered: Ordered
     lists: BundleLists
-    cells: Cells
+    windows: SlabWindows
     row: Int[Array, " bundles"]
     column: Int[Array, " bundles"]
     half_steps: Float[Array, " two_samples_and_one"]

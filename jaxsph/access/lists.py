@@ -27,12 +27,12 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
-from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.sums import running_sum
 
-MOST_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
+MAX_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
 WORD = 32  # flags in a word
-BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in the first paper)
+BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in Hochstetter et al. 2016)
 TILE = 2 * BUNDLE
 
 
@@ -71,6 +71,13 @@ class ListPlan:
         """Bundles in a band, four a tile; bundle ids are `4 * tile + 2 * lower + right`."""
         return 4 * self.num_tiles
 
+    def as_image(self, value: Array) -> Array:
+        """What bundles hold, (bundles, down, across, ...), side by side as they lie in the band."""
+        down, across = value.shape[1:3]
+        value = value.reshape(self.tile_rows, self.tile_columns, 2, 2, *value.shape[1:])
+        value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
+        return value.reshape(self.tile_rows * 2 * down, self.tile_columns * 2 * across, *value.shape[6:])
+
 
 @dataclasses.dataclass(frozen=True)
 class BundleLists:
@@ -104,7 +111,7 @@ def build_lists(ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Int
 
 def _run_by_run(always: Array, function: Callable[[Any], Array], runs: Any) -> Array:
     """`lax.map`; a result that XLA fuses with its being stored would be computed on one thread, so it is kept apart."""
-    return lax.map(lambda run: computed_once(always, function, run), runs)
+    return lax.map(lambda run: fusion_barrier(always, function, run), runs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +155,7 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
     words = plan.runs * -(-plan.tile_capacity // (plan.runs * WORD))
     rectangles = functools.partial(_rectangles, plan=plan, words=words)
     always = ranges.left[0] >= 0
-    seen, last, total = computed_once(always, rectangles, ranges)
+    seen, last, total = fusion_barrier(always, rectangles, ranges)
     bits = max(ranges.left.shape[0] - 1, 1).bit_length()
     wide = bits + plan.num_tiles.bit_length() > 32
     used = jnp.minimum(total, plan.tile_capacity)
@@ -207,7 +214,7 @@ def counted(count: Int[Array, "*any"], total: Int[Array, ""]) -> Int[Array, ""]:
 
     The sum in float32 tells the two apart but is itself good to some 1e-6 only, so it is not compared with any capacity.
     """
-    return jnp.where(count.astype(jnp.float32).sum() < MOST_PAIRS, total, -1)
+    return jnp.where(count.astype(jnp.float32).sum() < MAX_PAIRS, total, -1)
 
 
 def _flags_before(word: Int[Array, "*some words"]) -> Int[Array, "*some words"]:

@@ -20,7 +20,7 @@ ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off
 LIFT = 30  # binary digits by which strengths are lifted, so that weights far below the largest are no underflow; of 3, 5 and 6
 OFF = 2  # eps of its distance from the eye that a view coordinate may be off
 SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
-LEAST_STEP = 16  # eps of its depth that a sample must be away from the next
+MIN_STEP = 16  # eps of its depth that a sample must be away from the next
 RANGE = 0.4  # power of the largest number that lengths may reach, so that products of two and their quotients stay finite
 THINNEST = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
 
@@ -49,7 +49,7 @@ def too_fine(camera: Camera, samples: int) -> Bool[Array, ""]:
     else:
         largest = jnp.maximum(jnp.abs(near), jnp.abs(far))
         step, bad = (far - near) / (samples * largest), (largest < 1 / limit) | (largest > limit)
-    return bad | (step < LEAST_STEP * jnp.finfo(near.dtype).eps)
+    return bad | (step < MIN_STEP * jnp.finfo(near.dtype).eps)
 
 
 def unresolved(

@@ -1,18 +1,19 @@
 r"""The march as a function that can be differentiated either way.
 
-Flow: worklist -> [adjoint: points] -> image; cotangents of the image -> [adjoint: worth -> moments] -> cotangents.
+Flow: schedule -> [adjoint: march] -> image; cotangents of the image -> [adjoint: replay -> integrator -> media] -> cotangents.
 
-Forward, derivatives are those of the march itself. Backward, the slabs are marched again, a stretch of the stacks at a time as
-in `points`: its sums over particles and its light are held, what each slab is worth follows from the rays before and behind it
-(`worth`), and what it is worth is paid out to the samples, and by them to particles (`moments`). So memory is that of the march,
-whatever the number of samples or of particles in a cell.
+Forward, derivatives are those of the march itself. Backward, the slabs are marched again, a batch at a time: what media gather
+and the light are held, the cotangents of each slab follow from the rays before and behind it (`replay`), and are pulled through
+the integrator by `jax.vjp` and through each medium by `Medium.pull`. So neither needs an adjoint of its own, but where a gather
+is worth one; and memory is that of the march, whatever the number of samples or of particles in a cell.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,120 +23,135 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import Lattice
-from jaxsph.cast.composite import RAYS, unlit
-from jaxsph.cast.moments import COLUMNS, WIDTH, owe_particles
-from jaxsph.cast.points import Rays, cast_points, gather_field
-from jaxsph.cast.shading import shade
-from jaxsph.cast.stretches import CastPlan, stretches_of, with_room
-from jaxsph.cast.worth import Seen, owe_transfer, pathwise, unseen, value_samples, value_slabs
-from jaxsph.control.worklist import Worklist
+from jaxsph.cast.batches import Batches, CastPlan, batches_of, with_room
+from jaxsph.cast.composite import Together
+from jaxsph.cast.integrator import Integrator, Optics
+from jaxsph.cast.march import RayResult, march
+from jaxsph.cast.replay import ReplayState, fresh_replay, pull_composite
+from jaxsph.field.lattice import Lattice
+from jaxsph.field.particles import ParticleMedium, Wanted
+from jaxsph.field.schedule import SlabSchedule
+from jaxsph.field.tasks import RayPackets, SlabTask
+from jaxsph.field.transposed import COLUMNS
 from jaxsph.model.camera import Camera
+from jaxsph.model.medium import COLORS, Medium, mixed_colors, mixed_extinction
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.transposed import linear_map
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
-Light = tuple[Array, Array]  # colour and transmittance of an image, or what is to be said of them
+Layers = tuple[Array, Array]  # colour and transmittance of an image, or their cotangents
 
 
 @dataclasses.dataclass(frozen=True)
-class Values:
-    """What a march is differentiated by."""
+class CastMethod:
+    """How rays are cast, static: by which kernel, sizes and integrator, and through which packets of rays."""
+
+    kernel: str
+    plan: CastPlan
+    integrator: Integrator
+    packets_of: Callable[[Grid, Camera], RayPackets]
+
+
+@dataclasses.dataclass(frozen=True)
+class DiffInputs:
+    """What a march is differentiated by; `media` are those besides particles."""
 
     columns: dict[str, Float[Array, " particles"]]
     half_steps: Float[Array, " two_samples_and_one"]
     half_height: Float[Array, ""]
     transfer: TransferFunction
+    media: tuple[Medium, ...]
 
 
 @dataclasses.dataclass(frozen=True)
-class Held:
+class NonDiffInputs:
     """What is held fixed: which particles and samples meet, and how they are sampled."""
 
     grid: Grid
-    work: Worklist
+    schedule: SlabSchedule
     camera: Camera
     lattice: Lattice | None
 
 
-class Wanted(NamedTuple):
-    """Which cotangents are asked for: by where samples and particles are and what those carry, and by the transfer function."""
-
-    field: bool
-    transfer: bool
-
-
 def cast(
     grid: Grid,
-    work: Worklist,
+    schedule: SlabSchedule,
     camera: Camera,
     transfer: TransferFunction,
-    kernel: str,
-    plan: CastPlan,
+    media: tuple[Medium, ...],
+    method: CastMethod,
     lattice: Lattice | None = None,
-) -> Rays:
-    """`points.cast_points`, differentiable in both modes.
+) -> RayResult:
+    """`march.march`, differentiable in both modes.
 
     Differentiation:
-        Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening
-        and by the transfer function. Lists, windows, levels and the origins of sums are held fixed; `depth` and `evaluations`
-        have none.
+        Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
+        by the transfer function and by what other media are made of. Lists, windows, levels and the references of sums are
+        held fixed; `depth` has none.
 
     Raises:
-        NotImplementedError: while differentiating work that has super-pixels or interpolated slabs, whose values are made
+        NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
             elsewhere; and when differentiated twice.
     """
     columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
-    values = Values(columns, grid.half_steps, camera.half_height, transfer)
-    held = jax.tree.map(lax.stop_gradient, Held(grid, work, camera, lattice))
-    return _cast(kernel, plan, values, held)
+    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
+    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice))
+    return _cast(method, inputs, fixed)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _cast(kernel: str, plan: CastPlan, values: Values, held: Held) -> Rays:
-    return _march(kernel, plan, values, held)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
+    return _march(method, inputs, fixed)
 
 
-def _march(kernel: str, plan: CastPlan, values: Values, held: Held) -> Rays:
-    grid, camera = _of(values, held)
-    return cast_points(grid, held.work, camera, values.transfer, kernel, plan, held.lattice)
+def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
+    grid, camera = _seen(inputs, fixed)
+    media, packets = _media(method, inputs, fixed, Wanted()), method.packets_of(grid, camera)
+    return march(grid, fixed.schedule, packets, media, method.integrator, method.plan, camera.is_perspective)
 
 
-def _of(values: Values, held: Held) -> tuple[Grid, Camera]:
-    ordered = dataclasses.replace(held.grid.ordered, **values.columns)
-    grid = dataclasses.replace(held.grid, ordered=ordered, half_steps=values.half_steps)
-    return grid, dataclasses.replace(held.camera, half_height=values.half_height)
+def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
+    ordered = dataclasses.replace(fixed.grid.ordered, **inputs.columns)
+    grid = dataclasses.replace(fixed.grid, ordered=ordered, half_steps=inputs.half_steps)
+    return grid, dataclasses.replace(fixed.camera, half_height=inputs.half_height)
 
 
-def _moved(kernel: str, plan: CastPlan, primals: tuple[Values, Held], tangents: tuple[Values, Held]) -> tuple[Rays, Rays]:
+def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
+    """All media, particles first."""
+    grid, _ = _seen(inputs, fixed)
+    return ParticleMedium(grid, inputs.transfer.segments(), fixed.lattice, method.kernel, wanted), *inputs.media
+
+
+def _moved(
+    method: CastMethod, primals: tuple[DiffInputs, NonDiffInputs], tangents: tuple[DiffInputs, NonDiffInputs]
+) -> tuple[RayResult, RayResult]:
     """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
-    values, held = primals
-    found = _cast(kernel, plan, values, held)
+    inputs, fixed = primals
+    found = _cast(method, inputs, fixed)
     color, transmittance = (checkpoint_name(layer, KEPT) for layer in (found.color, found.transmittance))
     found = dataclasses.replace(found, color=color, transmittance=transmittance)
     still = jax.tree.map(jnp.zeros_like, found)
-    leaves, structure = jax.tree.flatten(values)
+    leaves, structure = jax.tree.flatten(inputs)
     moves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
     moving = [i for i, move in enumerate(moves) if not _is_zero(move)]
     if not moving:
         return found, still
-    _require_values(held)
+    _require_values(fixed)
     wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
 
-    def push(moves: list[Array]) -> Light:
-        def light(parts: list[Array]) -> Light:
+    def push(moves: list[Array]) -> Layers:
+        def light(parts: list[Array]) -> Layers:
             there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
-            rays = _march(kernel, plan, jax.tree.unflatten(structure, there), held)
+            rays = _march(method, jax.tree.unflatten(structure, there), fixed)
             return rays.color, rays.transmittance
 
         return jax.jvp(light, ([leaves[i] for i in moving],), (moves,))[1]
 
-    def pull(worth: Light) -> list[Array]:
-        image = found.color, found.transmittance
-        owed = jax.tree.leaves(_pull(kernel, plan, wanted, values, held, image, worth))
-        return [owed[i] for i in moving]
+    def pull(cotangent: Layers) -> list[Array]:
+        cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, (found.color, found.transmittance), cotangent))
+        return [cotangents[i] for i in moving]
 
     like = found.color, found.transmittance
     color, transmittance = linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE)
@@ -153,99 +169,145 @@ def _moves(part: Any) -> bool:
     return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
 
 
-def _require_values(held: Held) -> None:
+def _require_values(fixed: NonDiffInputs) -> None:
     """Raise where values come from elsewhere, so that their derivatives would be missing."""
-    if held.work.paint is not None:
+    if fixed.schedule.paint is not None:
         raise NotImplementedError(
             "an image with super-pixels has no derivatives, as their colours come from bounds; "
             "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
         )
-    if held.lattice is not None:
+    if fixed.lattice is not None:
         raise NotImplementedError(
             "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
         )
 
 
-def _pull(kernel: str, plan: CastPlan, wanted: Wanted, values: Values, held: Held, image: Light, worth: Light) -> Values:
-    """Cotangents of `values`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
-    plan = dataclasses.replace(plan, held=max(plan.held // (2 * plan.chunk), 1) * plan.chunk)  # as twice as much is held of each
-    grid, camera = _of(values, held)
-    stretches, segments = stretches_of(grid, held.work, plan), values.transfer.segments()
-    perspective, half_steps, dtype = camera.is_perspective, stretches.half_steps, grid.half_steps.dtype
+@dataclasses.dataclass(frozen=True)
+class Accumulated:
+    """Cotangents added up over slabs.
 
-    def rays_at(bundle: Array) -> tuple[Array, Array]:
-        return tuple(rays.T for rays in grid.rays(camera, bundle))  # type: ignore[return-value]
+    Attributes:
+        media: of each medium, see `Medium.no_cotangents`.
+        half_steps: of the depths of samples and borders.
+        factor: of a common factor of all ray coordinates.
+    """
 
-    def march(at: Array) -> tuple[list[Array], tuple[Array, Array]]:
-        """What the slabs `at` emit, and the sums at their samples."""
-        item, slab, bundle = stretches.item(at)
-        u, v = rays_at(bundle)
-        s, border = stretches.depths(item, slab)
-        sums = gather_field(grid.ordered, grid.lists.rank, item, (u, v, s), perspective, kernel)
-        *light, _ = shade(sums, (u, v, border), segments, item, perspective)
-        sums = sums.reshape(*sums.shape[:2], RAYS)
-        return light, (sums.real, sums.imag)
+    media: tuple[Any, ...]
+    half_steps: Float[Array, " two_samples_and_more"]
+    factor: Float[Array, ""]
 
-    def settle(at: Array, sums: tuple[Array, Array], worth: Array, owed: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Add what the slabs `at` owe, being `worth` that much."""
-        table, opening, depths, control = owed
-        item, slab, bundle = stretches.item(at)
-        u, v = rays_at(bundle)
-        (s, border), pull_depths = jax.vjp(lambda depths: stretches.depths(item, slab, depths), half_steps)
-        square = (u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, RAYS)
-        slant = jnp.sqrt(1 + square) if perspective else jnp.ones_like(square)
-        path = pathwise(border, slant)
-        samples = computed_once(slab[0] >= 0, value_samples, sums, path, segments, item, worth)
-        if wanted.transfer:
-            control = control + owe_transfer(samples, segments)
-        if not wanted.field:
-            return table, opening, depths, control
-        worths = samples.weight, samples.weighted
-        paid = owe_particles(table, grid.ordered, grid.lists.rank, item, (u, v, s), worths, perspective, kernel)
-        of_step = (samples.path * slant[:, None]).sum(2)
-        of_border = jnp.pad(of_step, ((0, 0), (1, 0))) - jnp.pad(of_step, ((0, 0), (0, 1)))
-        of_s, of_opening = paid.along, paid.lateral.sum()
-        if perspective:
-            # lateral coordinates are u s and v s; the slant grows with the opening as (u^2 + v^2) / slant
-            of_s = of_s + paid.lateral / s.T
-            of_opening += (samples.path * (border[:, 1:] - border[:, :-1])[:, :, None] * (square / slant)[:, None]).sum()
-        return paid.table, opening + of_opening, depths + pull_depths((of_s.T, of_border))[0], control
 
-    def pull_stretch(nth: Array, carry: tuple[Seen, Any, tuple[Array, ...]]) -> tuple[Seen, Any, tuple[Array, ...]]:
-        seen, (light, sums), owed = carry
-        stretch = stretches.stretch(nth)
-
-        def march_chunk(chunk: Array, store: Any) -> Any:
-            at, begin = stretches.chunk(stretch, chunk)
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), store, march(at))
-
-        light, sums = lax.fori_loop(0, stretch.chunks, march_chunk, (light, sums))
-        seen, worth = value_slabs(seen, tuple(light), stretch.held_at, stretches.stacks.start, stretch.first, stretch.number)
-
-        def settle_chunk(chunk: Array, owed: tuple[Array, ...]) -> tuple[Array, ...]:
-            at, begin = stretches.chunk(stretch, chunk)
-            here = [lax.dynamic_slice_in_dim(value, begin, plan.chunk) for value in sums]
-            worths = lax.dynamic_slice_in_dim(worth, begin, plan.chunk, 1)
-            return settle(at, (here[0], here[1]), worths, owed)
-
-        return seen, (light, sums), lax.fori_loop(0, stretch.chunks, settle_chunk, owed)
-
-    *light, thickness = unlit(stretches.places + 1, plan.slab_samples, dtype)
-    owed = (
-        jnp.zeros((grid.ordered.x.shape[0], WIDTH), dtype),
-        jnp.zeros((), dtype),
-        jnp.zeros_like(half_steps),
-        jnp.zeros((5, segments.start.shape[0]), dtype),
+def _pull(
+    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
+) -> DiffInputs:
+    """Cotangents of `inputs`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
+    plan = method.plan.of_shard(2)  # as twice as much is held of each slab
+    grid, camera = _seen(inputs, fixed)
+    packets, media = method.packets_of(grid, camera), _media(method, inputs, fixed, wanted)
+    on_borders = bool(method.integrator.halo)
+    batches = batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, on_borders)
+    dtype = grid.half_steps.dtype
+    start = Accumulated(
+        tuple(medium.no_cotangents() for medium in media), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype)
     )
-    carry = unseen(image, worth, stretches.stacks.place), (light, (thickness, thickness)), owed
-    table, opening, depths, control = lax.fori_loop(0, stretches.number, pull_stretch, carry)[2]
-    _, pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, held.work.count.shape[0], plan), grid.half_steps)
-    columns = {name: table[:, i] for i, name in enumerate(COLUMNS)}
-    transfer = TransferFunction(control[4], control[:3].T, control[3])
-    half_height = opening / camera.half_height.astype(dtype)
-    total = Values(columns, pull_room(depths)[0], half_height, transfer)
-    return jax.tree.map(lambda value, like: value.astype(like.dtype), total, values)
+    found = _pull_batches(batches, media, method.integrator, image, cotangent, start)
+    particles, *others = found.media
+    pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
+    half_height = found.factor / camera.half_height.astype(dtype)
+    (half_steps,) = pull_room(found.half_steps)
+    total = DiffInputs(particles.columns(), half_steps, half_height, particles.of_transfer(), tuple(others))
+    return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
-for _kind in (Values, Held):
+def _pull_batches(
+    batches: Batches, media: tuple[Medium, ...], integrator: Integrator, image: Layers, cotangent: Layers, start: Accumulated
+) -> Accumulated:
+    """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
+    together = Together.of(batches.num_packets, batches.plan.tuning)
+
+    def march_slabs(items: Array) -> tuple[tuple[Array, ...], tuple[Any, ...]]:
+        """Red, green, blue and transmittance of slabs, and what media gather there."""
+        task = batches.task(items)
+        gathered = tuple(medium.gather(task) for medium in media)
+        light = integrator(media, gathered, task)
+        return (*light.color, light.transmittance), gathered
+
+    def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
+        rays, held, total = carry
+        batch = batches.batch(nth)
+
+        def march_chunk(chunk: Array, held: Any) -> Any:
+            items, begin = batches.chunk(batch, chunk)
+            put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
+            return jax.tree.map(put, held, march_slabs(items))
+
+        light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
+        rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together)
+
+        def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
+            items, begin = batches.chunk(batch, chunk)
+            here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
+            of_chunk = lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1)
+            return _pull_slabs(batches, items, media, integrator, here, of_chunk, total)
+
+        return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+
+    items = jnp.zeros(batches.plan.chunk, jnp.int32)
+    held = jax.tree.map(
+        lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(march_slabs, items)
+    )
+    held = ((*held[0][:3], jnp.ones_like(held[0][3])), held[1])
+    rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
+    return lax.fori_loop(0, batches.number, pull_batch, (rays, held, start))[2]
+
+
+def _pull_slabs(
+    batches: Batches,
+    items: Array,
+    media: tuple[Medium, ...],
+    integrator: Integrator,
+    gathered: tuple[Any, ...],
+    of_slabs: Float[Array, "4 tasks rays"],
+    total: Accumulated,
+) -> Accumulated:
+    """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
+    task = batches.task(items)
+    through = functools.partial(_pull_integrator, media, integrator, gathered, task, of_slabs)
+    of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
+    of_media, of_depth, of_factor = [], jnp.zeros_like(task.depth), total.factor
+    for medium, so_far, found, cotangents in zip(media, total.media, gathered, of_optics, strict=True):
+        added, (depth, factor) = medium.pull(so_far, found, task, cotangents)
+        of_media.append(added)
+        of_depth, of_factor = of_depth + depth, of_factor + factor
+
+    def path(border: Array, factor: Array) -> Array:
+        return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
+
+    of_border, factor = jax.vjp(path, task.border, jnp.ones_like(of_factor))[1](of_path)
+    pull_depths = jax.vjp(functools.partial(batches.depths, items), batches.half_steps)[1]
+    (of_half_steps,) = pull_depths((of_depth, of_border))
+    return Accumulated(tuple(of_media), total.half_steps + of_half_steps, of_factor + factor)
+
+
+def _pull_integrator(
+    media: tuple[Medium, ...], integrator: Integrator, gathered: tuple[Any, ...], task: SlabTask, of_slabs: Array
+) -> tuple[list[Optics], Array]:
+    """Cotangents of each medium's red, green, blue and extinction at samples, and of path lengths."""
+
+    def light(optics: list[Optics], path: Array) -> tuple[Optics, Array]:
+        extinctions = [of_one[3] for of_one in optics]
+        mixed = [*mixed_colors([of_one[:3] for of_one in optics], extinctions), mixed_extinction(extinctions)]
+        return integrator.segment(mixed, path)
+
+    optics = []
+    for medium, found in zip(media, gathered, strict=True):
+        extinction, samples = medium.extinction(found, task)
+        colors = medium.colors(samples, task, COLORS)
+        optics.append([jnp.broadcast_to(value, task.shape) for value in (*colors, extinction)])
+    (_, thickness), pull = jax.vjp(light, optics, task.path())
+    of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
+    return of_optics, of_path
+
+
+for _kind in (DiffInputs, NonDiffInputs, Accumulated):
     jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

@@ -1,138 +1,170 @@
-"""Front to back: the light of slabs put into the state of rays, first paper, equation 3.
+"""Front to back: the light of slabs put into the state of rays, Hochstetter et al. 2016, equation 3.
 
-Flow: points -> [composite] -> image.
+Flow: integrator -> [composite] -> image.
 
-A slab that emits colour C and lets through t, both as seen from right in front of it, adds T C to a ray and leaves it T t. In a
-slab a sample adds its colour times the light it takes away, $t_{k-1} - t_k$: however thin the samples, colours then add up to
-the alpha that is lost. And $t_k$ is the exponential of the thickness up to there: one rounding, where a product would round
-at every sample, and always the same way in a uniform medium.
+A slab that emits colour C and lets through t, both as seen from right in front of it, adds T C to a ray and leaves it T t.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
-from jaxsph.access.lists import BUNDLE
-from jaxsph.numerics.staging import computed_once
+from jaxsph.cast.batches import Batch
+from jaxsph.cast.integrator import Segment
+from jaxsph.cast.samples import transmitted
+from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.tuning import Tuning
 
-RAYS = BUNDLE * BUNDLE  # of a bundle, in one row: short rows do not vectorise
-TOGETHER = 256  # bundles of a layer that are composited together
-FEW = 32  # bundles among them whose depths of half transmittance are found together
-Light = tuple[Array, ...]  # of slabs: red, green, blue, transmittance (slabs, 64); optical thickness (slabs, samples, 64)
-State = tuple[Array, ...]  # of rays: red, green, blue, transmittance, and depth where that is one half (bundles, 64)
+Carry = TypeVar("Carry")
 
 
-def unlit(slabs: int, samples: int, dtype: Any) -> Light:
+@dataclasses.dataclass(frozen=True)
+class Together:
+    """How many packets of a layer are composited together, and for how many of them half depths are found together."""
+
+    packets: int
+    half_depths: int
+
+    @classmethod
+    def of(cls, packets: int, tuning: Tuning) -> Together:
+        """No more than there are."""
+        together = min(tuning.bundles_composited, packets)
+        return cls(together, min(tuning.half_depths_found, together))
+
+
+@dataclasses.dataclass(frozen=True)
+class RayState:
+    """Rays of packets in order of height, and room for as many as are composited together past the last.
+
+    Attributes:
+        color: red, green and blue met so far, premultiplied.
+        transmittance: of all that was met so far.
+        depth: where that fell to one half, infinite where it has not.
+    """
+
+    color: tuple[Float[Array, "packets rays"], ...]
+    transmittance: Float[Array, "packets rays"]
+    depth: Float[Array, "packets rays"]
+
+
+def empty_segments(slots: int, samples: int, rays: int, dtype: Any) -> Segment:
     """Slabs with nothing in them."""
-    return *(jnp.full((slabs, RAYS), value, dtype) for value in (0, 0, 0, 1)), jnp.zeros((slabs, samples, RAYS), dtype)
+    red, green, blue = (jnp.zeros((slots, rays), dtype) for _ in range(3))
+    return Segment((red, green, blue), jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype))
 
 
-def fresh(bundles: int, dtype: Any) -> State:
-    """Rays that have met nothing, with room for a chunk past the last."""
-    return tuple(jnp.full((bundles + TOGETHER, RAYS), value, dtype) for value in (0, 0, 0, 1, jnp.inf))
+def fresh_rays(packets: int, rays: int, dtype: Any, together: Together) -> RayState:
+    """Rays that have met nothing."""
+    room = packets + together.packets, rays
+    red, green, blue, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 1, jnp.inf))
+    return RayState((red, green, blue), transmittance, depth)
 
 
-def transmitted(thickness: Array) -> Array:
-    """What is left behind each sample of slabs of what enters them."""
-    through = [thickness[:, 0]]
-    for k in range(1, thickness.shape[1]):
-        through.append(through[-1] + thickness[:, k])
-    return jnp.exp(-jnp.stack(through, 1))
+def over_layers(
+    put: Callable[[Carry, Array, Array, Array], Carry],
+    carry: Carry,
+    starts: Int[Array, " layers_and_one"],
+    batch: Batch,
+    together: Together,
+) -> Carry:
+    """Take all slabs of a batch front to back, some of a layer of the compacted slabs at a time.
 
+    Args:
+        put: `put(carry, place, inside, packet)`: places in the batch, whether each is of the layer, and the packet of the first;
+            packets follow one another.
+        starts: where the layers of the compacted slabs begin.
+    """
 
-def emitted(colors: list[Array], left_behind: Array) -> list[Array]:
-    """Colours of slabs of samples, as seen from right in front, and their transmittance."""
-    left, total = jnp.ones_like(left_behind[:, 0]), [jnp.zeros_like(left_behind[:, 0])] * len(colors)
-    for k in range(left_behind.shape[1]):
-        behind = left_behind[:, k]
-        total = [added + (left - behind) * color[:, k] for added, color in zip(total, colors, strict=True)]
-        left = behind
-    return [*total, left]
+    def put_layer(layer: Array, carry: Carry) -> Carry:
+        begin = jnp.maximum(starts[layer] - batch.first, 0)
+        past = jnp.minimum(starts[layer + 1] - batch.first, batch.number)
+        packet = batch.first + begin - starts[layer]
+
+        def put_some(nth: Array, carry: Carry) -> Carry:
+            place = begin + nth * together.packets + jnp.arange(together.packets, dtype=jnp.int32)
+            inside = place < past
+            return put(carry, jnp.where(inside, place, 0), inside, packet + nth * together.packets)
+
+        return lax.fori_loop(0, (past - begin + together.packets - 1) // together.packets, put_some, carry)
+
+    top = (starts <= batch.first).sum(dtype=jnp.int32) - 1
+    bottom = (starts < batch.first + batch.number).sum(dtype=jnp.int32)
+    return lax.fori_loop(top, bottom, put_layer, carry)
 
 
 def composite(
-    state: State,
-    light: Light,
-    held_at: Int[Array, " held"],
+    state: RayState,
+    light: Segment,
+    batch: Batch,
     borders: Callable[[Array], Array],
     starts: Int[Array, " layers_and_one"],
-    first: Int[Array, ""],
-    number: Int[Array, ""],
-) -> State:
-    """Put the light of a stretch of the stacks into the rays, whose bundles are in order of height.
+    together: Together,
+) -> RayState:
+    """Put the light of a batch into the rays, whose packets are in order of height.
 
     Args:
-        light: of the slabs of the stretch, in any order, and of nothing at the end.
-        held_at: where in `light` each slab of the stretch is held.
-        borders: of slabs by place in the stretch, the depths of the borders of their samples.
-        starts: where the layers of the stacks begin.
-        first, number: where the stretch begins in the stacks, and how long it is.
+        light: of the slabs of the batch by slot, and of nothing at the end.
+        borders: of places in the batch, the depths of the borders of their samples.
+        starts: where the layers of the compacted slabs begin.
     """
+    nothing = light.transmittance.shape[0] - 1
 
-    def put_layer(layer: Array, state: State) -> State:
-        begin = jnp.maximum(starts[layer] - first, 0)
-        past = jnp.minimum(starts[layer + 1] - first, number)
-        bundle = first + begin - starts[layer]
+    def put(state: RayState, place: Array, inside: Array, packet: Array) -> RayState:
+        slot = jnp.where(inside, batch.slot[place], nothing)
+        # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
+        rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
+        rays = _behind(rays, light, slot, borders(place), together.half_depths)
+        return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, 0), state, rays)
 
-        def put_chunk(chunk: Array, state: State) -> State:
-            place = begin + chunk * TOGETHER + jnp.arange(TOGETHER, dtype=jnp.int32)
-            inside = place < past
-            place = jnp.where(inside, place, 0)
-            at = jnp.where(inside, held_at[place], light[0].shape[0] - 1)
-            here = bundle + chunk * TOGETHER
-            # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
-            rays = computed_once(here >= 0, _slice_of, state, here)
-            rays = _put(rays, light, at, borders(place))
-            return tuple(lax.dynamic_update_slice_in_dim(old, new, here, 0) for old, new in zip(state, rays, strict=True))
-
-        return lax.fori_loop(0, (past - begin + TOGETHER - 1) // TOGETHER, put_chunk, state)
-
-    top = (starts <= first).sum(dtype=jnp.int32) - 1
-    bottom = (starts < first + number).sum(dtype=jnp.int32)
-    return lax.fori_loop(top, bottom, put_layer, state)
+    return over_layers(put, state, starts, batch, together)
 
 
-def _slice_of(state: State, begin: Array) -> State:
-    return tuple(lax.dynamic_slice_in_dim(field, begin, TOGETHER) for field in state)
+def rows(state: Any, first: Array, number: int) -> Any:
+    """Some rows of arrays whose last but one axis is packets, or slabs."""
+    return jax.tree.map(lambda field: lax.dynamic_slice_in_dim(field, first, number, field.ndim - 2), state)
 
 
-def _put(rays: State, light: Light, at: Array, border: Array) -> State:
+def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_depths: int) -> RayState:
     """Rays behind one more slab each."""
-    *colors, transmittance, depth = rays
-    *emission, left = (field[at] for field in light[:-1])
-    behind = transmittance * left
-    crossed = (transmittance > 0.5) & (behind <= 0.5)
-    depth = _with_half_depth(depth, crossed, transmittance, light[-1], at, border)
-    return *(color + transmittance * added for color, added in zip(colors, emission, strict=True)), behind, depth
+    emitted, left = [channel[slot] for channel in light.color], light.transmittance[slot]
+    behind = rays.transmittance * left
+    crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
+    depth = _with_half_depth(rays, crossed, light.thickness, slot, border, half_depths)
+    color = tuple(color + rays.transmittance * added for color, added in zip(rays.color, emitted, strict=True))
+    return RayState(color, behind, depth)
 
 
-def _with_half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
-    """`depth` of rays, found for a few bundles at a time of those where any ray has crossed one half: others cost nothing."""
-    each = jnp.arange(TOGETHER, dtype=jnp.int32)
+def _with_half_depth(
+    rays: RayState, crossed: Array, thickness: Array, slot: Array, border: Array, together: int
+) -> Float[Array, "packets rays"]:
+    """`depth` of rays, found for a few packets at a time of those where any ray has crossed one half: others cost nothing."""
+    number = crossed.shape[0]
     some = crossed.any(1)
-    bundles = lax.sort(jnp.where(some, each, TOGETHER))
+    packets = lax.sort(jnp.where(some, jnp.arange(number, dtype=jnp.int32), number))
 
-    def settle(nth: Array, depth: Array) -> Array:
-        bundle = lax.dynamic_slice_in_dim(bundles, nth * FEW, FEW)
-        here = jnp.minimum(bundle, TOGETHER - 1)
-        rays = [value[here] for value in (depth, crossed, transmittance)]
-        found = computed_once(nth >= 0, _half_depth, *rays, thickness, at[here], border[here])
-        return depth.at[bundle].set(found, mode="drop")
+    def find_some(nth: Array, depth: Array) -> Array:
+        packet = lax.dynamic_slice_in_dim(packets, nth * together, together)
+        here = jnp.minimum(packet, number - 1)
+        of_rays = [value[here] for value in (depth, crossed, rays.transmittance)]
+        found = fusion_barrier(nth >= 0, _half_depth, *of_rays, thickness, slot[here], border[here])
+        return depth.at[packet].set(found, mode="drop")
 
-    return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + FEW - 1) // FEW, settle, depth)
+    return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + together - 1) // together, find_some, rays.depth)
 
 
-def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, at: Array, border: Array) -> Array:
+def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, slot: Array, border: Array) -> Array:
     """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they have not `crossed` it.
 
     Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
     """
-    thickness = thickness[at]
+    thickness = thickness[slot]
     left, reached = transmitted(thickness), transmittance
     for k in range(thickness.shape[1]):
         behind = transmittance * left[:, k]
@@ -144,3 +176,6 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: A
         crossed = crossed & ~here
         reached = behind
     return depth
+
+
+jax.tree_util.register_dataclass(RayState, data_fields=["color", "transmittance", "depth"], meta_fields=[])

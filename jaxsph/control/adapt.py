@@ -11,16 +11,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import Cells, cells_with_borders
 from jaxsph.access.grid import Grid
+from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, slab_windows_with_borders
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
-from jaxsph.control.merge import coarse_work, coarser_windows, evaluations_of_levels, merged_levels, uncoarsened
+from jaxsph.control.merge import coarse_schedule, evaluations_of_levels, merged_levels, uncoarsened
 from jaxsph.control.probe import Probe, probe
 from jaxsph.control.ranges import range_tables
-from jaxsph.control.worklist import CELL, Worklist
+from jaxsph.field.schedule import SlabSchedule
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics.tuning import Tuning
 
 EMPTY = -1  # what a cell without particles is given
 
@@ -30,42 +31,44 @@ class ControlPlan:
     """Static choices of error control.
 
     Attributes:
-        super_pixels: whether a cell may be given one colour for all of its rays (first paper, section 5.2).
+        super_pixels: whether a cell may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
         merge: whether coarse cells are merged along depth (6.2).
         allocation: how a bundle's tolerance is shared among its cells, see `levels.choose`.
-        parts: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
+        coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
     """
 
     super_pixels: bool
     merge: bool
     allocation: str
-    parts: int = 2
+    coverage_subdivisions: int = 2
 
 
-def look(
+def screen_cells(
     grid: Grid,
     transfer: TransferFunction,
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
     plan: ControlPlan,
+    tuning: Tuning,
 ) -> Probe:
-    """Which cells are worth an analysis, of a band or of a part of it."""
+    """Which cells are worth an analysis, of a band or of a shard of it."""
     lateral = 1 - relax if plan.allocation == "paper" else 0.0
-    return probe(grid, range_tables(transfer), tolerance, lateral, slab_samples)
+    return probe(grid, range_tables(transfer), tolerance, lateral, slab_samples, tuning.cells_probed)
 
 
 def adapt(
     grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
-    origin: Float[Array, "slabs bundles"],
+    reference_quantity: Float[Array, "slabs bundles"],
     wanted: Bool[Array, "cells bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
     slab_samples: int,
     plan: ControlPlan,
-) -> tuple[Worklist, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
+    tuning: Tuning,
+) -> tuple[SlabSchedule, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
     r"""Decide how every cell is sampled, at full rate all but the `wanted`; where none is, nothing is analysed.
 
     Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
@@ -78,44 +81,49 @@ def adapt(
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
         each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
-    cells = grid.cells
+    cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
-    num_cells = -(-cells.count.shape[0] * slab_samples // CELL)
+    num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
     tables = range_tables(transfer)
-    whole = ((jnp.arange(num_cells) + 1) * CELL <= samples)[:, None]
+    whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 
-    def decide() -> tuple[Worklist, Array, Array]:
+    def decide() -> tuple[SlabSchedule, Array, Array]:
         windows = coarser_windows(cells, slab_samples)
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
         full = next(cost for cost in costs if cost is not None)
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(dtype).eps * (CELL * ((~empty).sum(0) + 1)).astype(dtype)
+        rounding = 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * ((~empty).sum(0) + 1)).astype(dtype)
         offer = Offer(saving, on_offer & ~empty & whole, rounding)
-        beside = cells_with_borders(grid.ordered, grid.lists)
-        analysis = analyse(grid, beside, camera, origin, wanted, tables, relax, slab_samples, plan.parts)
+        beside = slab_windows_with_borders(grid.ordered, grid.lists)
+        sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
+        analysis = analyse(grid, beside, camera, reference_quantity, wanted, tables, relax, *sizes)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
         free = _nowhere(beside, num_cells, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
         largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
         paint = analysis.paint if plan.super_pixels else None
-        return coarse_work(windows, final, origin, paint, slab_samples), largest, final
+        return coarse_schedule(windows, final, reference_quantity, paint, slab_samples), largest, final
 
-    def leave() -> tuple[Worklist, Array, Array]:
-        return uncoarsened(cells, origin, plan.super_pixels), jnp.zeros(bundles, dtype), untouched(cells, slab_samples)
+    def leave() -> tuple[SlabSchedule, Array, Array]:
+        return (
+            uncoarsened(cells, reference_quantity, plan.super_pixels),
+            jnp.zeros(bundles, dtype),
+            untouched(cells, slab_samples),
+        )
 
     work, largest, final = lax.cond(wanted.any(), decide, leave)
     return work, largest, jnp.where(empty, EMPTY, final)
 
 
-def untouched(cells: Cells, slab_samples: int) -> Int[Array, "cells bundles"]:
+def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:
     """Levels of cells that are all left at full rate."""
-    empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL), slab_samples)
+    empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES), slab_samples)
     return jnp.where(empty, jnp.int32(EMPTY), 0)
 
 
-def _nowhere(cells: Cells, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
-    """Cells that no particle can touch."""
-    count = jnp.pad(cells.count, ((0, num_cells * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
+def _nowhere(cells: SlabWindows, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
+    """SlabWindows that no particle can touch."""
+    count = jnp.pad(cells.count, ((0, num_cells * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
     return count.reshape(num_cells, -1, count.shape[1]).sum(1) == 0

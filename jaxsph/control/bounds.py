@@ -4,15 +4,15 @@ Flow: cells -> [bounds] -> errors -> levels -> merge -> cast -> image.
 
 CSPH values are affine combinations of the quantities of the particles whose supports hold the sample, so the least and the
 greatest quantity among the particles whose spheres meet a *sample slab* (the footprint of the bundle, between two borders of
-fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border (first
-paper, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its sub-rectangles lies
+fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border (Hochstetter et al.
+2016, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its sub-rectangles lies
 inside the support of a single particle; in any other, a sample may be empty.
 
 Why the bounds hold in floating point: a sphere counts as meeting the slab with its `reach`, outside which computed weights are
 zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle
 is `SOLID` enough for that not to underflow. Boxes are made of the very numbers that the cast multiplies, and rounding is
 monotone. Sums are taken of quantities relative to that of a particle near by: a quotient of two computed sums of n terms is
-off by less than (n + 6) eps of how far quantities are from that origin, and adding it rounds once more.
+off by less than (n + 6) eps of how far quantities are from that reference_quantity, and adding it rounds once more.
 
 Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises.
 """
@@ -27,11 +27,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import position
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
+from jaxsph.access.slab_windows import position
 from jaxsph.control.ranges import RangeTables, transfer_ranges
-from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.fusion import fusion_barrier
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
 COVERERS = 96  # particles in the middle of a window, that is nearest in depth, among which coverage is sought
@@ -89,29 +89,29 @@ def sample_bounds(
     window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
     footprint: Footprint,
     borders: Float[Array, "samples_and_one bundles"],
-    origin: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
+    reference_quantity: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
     tables: RangeTables,
     perspective: bool,
-    parts: int,
+    subdivisions: int,
 ) -> SampleBounds:
     """Bounds for the samples between `borders`, from the particles of a window.
 
     Args:
-        origin: least and greatest quantity that the sums of these samples may be taken relative to.
-        parts: sub-rectangles on each side of the footprint, for the test of coverage.
+        reference_quantity: least and greatest quantity that the sums of these samples may be taken relative to.
+        subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
     """
     spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
     total = window[1].sum(0)
     samples, bundles = borders.shape[0] - 1, borders.shape[1]
     dtype = borders.dtype
     box = _boxes(footprint.columns, spread, 1), _boxes(footprint.rows, spread, 1)
-    boxes = _boxes(footprint.columns, spread, parts), _boxes(footprint.rows, spread, parts)
+    boxes = _boxes(footprint.columns, spread, subdivisions), _boxes(footprint.rows, spread, subdivisions)
     sides = jnp.asarray([-1, 1], dtype)[:, None, None]
     one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
     def add_nearest(block: Array, outermost: Array) -> Array:
-        ball = computed_once(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
-        near, near_depth = computed_once(block >= 0, _nearest, ball, box, borders)
+        ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
+        near, near_depth = fusion_barrier(block >= 0, _nearest, ball, box, borders)
         for k in range(PARTICLES):
             meets = near[k] + near_depth[k] <= 1
             outermost = jnp.maximum(outermost, jnp.where(meets, sides * ball.quantity[k], -jnp.inf))
@@ -119,8 +119,8 @@ def sample_bounds(
 
     def add_farthest(block: Array, farthest: Array) -> Array:
         index = jnp.maximum(total // 2 - COVERERS // 2, 0) + block * PARTICLES + one_block
-        ball = computed_once(block >= 0, _fetch, balls, rank, window, index)
-        column, row, depth = computed_once(block >= 0, _farthest, ball, boxes, borders)
+        ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, index)
+        column, row, depth = fusion_barrier(block >= 0, _farthest, ball, boxes, borders)
         for k in range(PARTICLES):
             farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
         return farthest
@@ -128,13 +128,13 @@ def sample_bounds(
     fullest = total.max()
     outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
     outermost = lax.fori_loop(0, (fullest + PARTICLES - 1) // PARTICLES, add_nearest, outermost)
-    farthest = jnp.full((samples, parts, parts, bundles), jnp.inf, dtype)
+    farthest = jnp.full((samples, subdivisions, subdivisions, bundles), jnp.inf, dtype)
     enough = jnp.minimum(fullest, COVERERS)
     farthest = lax.fori_loop(0, (enough + PARTICLES - 1) // PARTICLES, add_farthest, farthest)
     touched = outermost[1] > -jnp.inf
     lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
     eps = jnp.finfo(dtype).eps
-    farthest_off = jnp.maximum(jnp.maximum(hi - origin[0], origin[1] - lo), 0)
+    farthest_off = jnp.maximum(jnp.maximum(hi - reference_quantity[0], reference_quantity[1] - lo), 0)
     rounding = sum_rounding(total, dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
     least, greatest = transfer_ranges(tables, lo - rounding, hi + rounding)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
@@ -154,7 +154,7 @@ def _boxes(rays: Array, spread: tuple[Array, Array], parts: int) -> tuple[Array,
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
     """A block of particles of each bundle's windows; past the last they do not count."""
     place = jnp.clip(position(index, *window), 0, rank.shape[0] - 1)
-    particle = computed_once(index[0, 0] >= 0, lambda at: rank.at[at].get(mode="promise_in_bounds"), place)
+    particle = fusion_barrier(index[0, 0] >= 0, lambda at: rank.at[at].get(mode="promise_in_bounds"), place)
     found = jax.tree.map(lambda column: column.at[particle].get(mode="promise_in_bounds"), balls)
     inside = index < window[1].sum(0)
     outer, inner = (jnp.where(inside, inverse, jnp.inf) for inverse in (found.outer, found.inner))

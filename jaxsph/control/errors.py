@@ -1,4 +1,4 @@
-r"""How much a cell's light can change when it is sampled more coarsely: first paper, sections 4.2 and 5, in additive form.
+r"""How much a cell's light can change when it is sampled more coarsely: Hochstetter et al. 2016, sections 4.2 and 5, in additive form.
 
 Flow: bounds -> [errors] -> levels -> merge -> cast -> image.
 
@@ -28,10 +28,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
 from jaxsph.control.bounds import SampleBounds
-from jaxsph.control.worklist import CELL, COARSEST
 
-LEVELS = COARSEST + 1
+LEVELS = MAX_LEVEL + 1
 SUPER_PIXEL = LEVELS  # the candidate after the last level
 CANDIDATES = LEVELS + 1
 EXPONENTIAL = 2  # eps that a computed transmittance may be off: 2 ulp of the exponential, 3 half ulp of its argument
@@ -41,7 +41,7 @@ EVALUATION = 512  # roundings, at most, between the bounds and an error; all ter
 
 def fits(slab_samples: int) -> int:
     """The level at which a cell is one slab; beyond it, cells are merged."""
-    return (CELL // slab_samples).bit_length() - 1
+    return (CELL_SAMPLES // slab_samples).bit_length() - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _filled(lo: Array, hi: Array, touched: Array) -> tuple[Array, Array]:
 
 def _sum_in_front(depth: Array) -> Array:
     sums = [jnp.zeros_like(depth[0])]
-    for k in range(CELL - 1):
+    for k in range(CELL_SAMPLES - 1):
         sums.append(sums[-1] + depth[k])
     return jnp.stack(sums)
 
@@ -155,7 +155,7 @@ def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax
     middle = slice(width // 2 - 1, width // 2 + 1)
 
     def windows(value: Array) -> Array:
-        return value.reshape(CELL // width, width, -1)
+        return value.reshape(CELL_SAMPLES // width, width, -1)
 
     def deviation(lo: Array, hi: Array) -> Array:
         """How far a fine sample can be from the coarse one, which lies in the ranges of both middle slabs.
@@ -200,7 +200,7 @@ def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
         uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * dark)
         off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.dark_hi + uneven).sum(0))
     lost = jnp.exp(-optics.thin.sum(0)) * _opacity(off_depth)
-    rounding = (CELL + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
+    rounding = (CELL_SAMPLES + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
     return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding
 
 

@@ -1,9 +1,9 @@
-"""Turn choices into work: coarse slabs with the particles that they need, cells merged until they are full.
+"""Turn choices into a schedule: coarse slabs with the particles that they need, cells merged until they are full.
 
 Flow: levels -> [merge] -> worklist -> cast -> image.
 
 A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
-one depth-ordered list, so nothing is copied and nothing is referenced twice (first paper, section 6.2). As long as it fits
+one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as it fits
 into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of them
 allow it. A cell whose neighbours do not falls back to the last level that fits, which costs the same and errs less.
 """
@@ -16,31 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.cells import Cells
+from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, SlabWindows, Window, pad_slabs
 from jaxsph.control.errors import LEVELS, SUPER_PIXEL, fits
-from jaxsph.control.worklist import CELL, COARSEST, Worklist, full_rate
-
-
-@dataclasses.dataclass(frozen=True)
-class Window:
-    """Windows of the bundle's list, for each class of supports, of slabs 2^l times as deep as those of the grid."""
-
-    begin: Int[Array, "classes slabs bundles"]
-    length: Int[Array, "classes slabs bundles"]
-
-
-def coarser_windows(cells: Cells, slab_samples: int) -> list[Window]:
-    """Unions of the windows of 1, 2, 4, 8 and 16 slabs; the number of slabs is rounded up to a multiple of 16."""
-    windows = [Window(_pad_slabs(cells.begin, cells), _pad_slabs(cells.length, cells))]
-    for _ in range(COARSEST):
-        begin, length = windows[-1].begin, windows[-1].length
-        none = jnp.iinfo(begin.dtype).max
-        first = jnp.where(length > 0, begin, none)
-        end = jnp.where(length > 0, begin + length, 0)
-        first = jnp.minimum(first[:, ::2], first[:, 1::2])
-        length = jnp.maximum(jnp.maximum(end[:, ::2], end[:, 1::2]) - first, 0)
-        windows.append(Window(jnp.where(length > 0, first, 0), length))
-    return windows
+from jaxsph.field.schedule import SlabSchedule, full_rate
 
 
 def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
@@ -50,7 +28,7 @@ def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: i
     for level, window in enumerate(windows):
         count = window.length.sum(0).astype(jnp.float32) * slab_samples
         if level <= fitting:
-            groups = CELL // slab_samples >> level
+            groups = CELL_SAMPLES // slab_samples >> level
             costs.append(count.reshape(-1, groups, count.shape[1]).sum(1)[:num_cells])
         else:
             share = 1 << (level - fitting)
@@ -71,7 +49,7 @@ def merged_levels(
     fitting, num_cells = fits(slab_samples), chosen.shape[0]
     lateral = chosen == SUPER_PIXEL
     final = jnp.where(lateral, SUPER_PIXEL, jnp.minimum(chosen, fitting))
-    able = jnp.where(free, COARSEST, jnp.where(lateral, 0, chosen))
+    able = jnp.where(free, MAX_LEVEL, jnp.where(lateral, 0, chosen))
     for level in range(fitting + 1, LEVELS):
         share = 1 << (level - fitting)
         groups = jnp.pad(able, ((0, -num_cells % share), (0, 0))).reshape(-1, share, able.shape[1])
@@ -79,20 +57,20 @@ def merged_levels(
     return final
 
 
-def coarse_work(
+def coarse_schedule(
     windows: list[Window],
     levels: Int[Array, "cells bundles"],
-    origin: Float[Array, "slabs bundles"],
+    reference_quantity: Float[Array, "slabs bundles"],
     paint: Array | None,
     slab_samples: int,
-) -> Worklist:
-    """The list of work for the `levels` of cells, as `merged_levels` gives them.
+) -> SlabSchedule:
+    """The schedule for the `levels` of cells, as `merged_levels` gives them.
 
     Args:
-        origin: of the slabs at full rate; coarser ones take that of the first filled slab they span.
+        reference_quantity: of the slabs at full rate; coarser ones take that of the first filled slab they span.
         paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
     """
-    per_cell = CELL // slab_samples
+    per_cell = CELL_SAMPLES // slab_samples
     classes, slabs, bundles = windows[0].begin.shape
     level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, slabs - levels.shape[0] * per_cell), (0, 0)))
     place = jnp.arange(slabs, dtype=jnp.int32)[:, None]
@@ -105,36 +83,28 @@ def coarse_work(
             for union, value in ((window.begin, begin), (window.length, length))
         )
     count = length.sum(0).astype(jnp.int32)
-    origin = _shared_origins(origin, windows, level)
-    level = jnp.where(level == SUPER_PIXEL, COARSEST, level)
+    reference_quantity = _shared_references(reference_quantity, windows, level)
+    level = jnp.where(level == SUPER_PIXEL, MAX_LEVEL, level)
     if paint is None:
-        return Worklist(count > 0, level, begin, length, count, origin)
+        return SlabSchedule(count > 0, level, begin, length, count, reference_quantity)
     colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
-    return Worklist((count > 0) | painted, level, begin, length, count, origin, painted, colors)
+    return SlabSchedule((count > 0) | painted, level, begin, length, count, reference_quantity, painted, colors)
 
 
-def uncoarsened(cells: Cells, origin: Float[Array, "slabs bundles"], super_pixels: bool) -> Worklist:
-    """The reference image's work, in the shape of `coarse_work`."""
-    work = jax.tree.map(lambda leaf: _pad_slabs(leaf, cells), full_rate(cells, origin))
+def uncoarsened(cells: SlabWindows, reference_quantity: Float[Array, "slabs bundles"], super_pixels: bool) -> SlabSchedule:
+    """The reference image's schedule, in the shape of `coarse_schedule`."""
+    schedule = jax.tree.map(lambda leaf: pad_slabs(leaf, cells), full_rate(cells, reference_quantity))
     if not super_pixels:
-        return work
-    return dataclasses.replace(work, painted=jnp.zeros_like(work.filled), paint=jnp.zeros((4, *work.origin.shape), origin.dtype))
+        return schedule
+    paint = jnp.zeros((4, *schedule.count.shape), reference_quantity.dtype)
+    return dataclasses.replace(schedule, painted=jnp.zeros_like(schedule.filled), paint=paint)
 
 
-def _pad_slabs(value: Array, cells: Cells) -> Array:
-    """Round the number of slabs up to whole windows of the coarsest level."""
-    missing = -cells.count.shape[0] % (1 << COARSEST)
-    return jnp.pad(value, [(0, 0)] * (value.ndim - 2) + [(0, missing), (0, 0)])
-
-
-def _shared_origins(origin: Array, windows: list[Window], level: Array) -> Array:
+def _shared_references(reference_quantity: Array, windows: list[Window], level: Array) -> Array:
     """Of every item, that of the first filled slab that it spans."""
-    first = shared = jnp.pad(origin, ((0, level.shape[0] - origin.shape[0]), (0, 0)))
+    first = shared = jnp.pad(reference_quantity, ((0, level.shape[0] - reference_quantity.shape[0]), (0, 0)))
     for step in range(1, LEVELS):
         filled = windows[step - 1].length.sum(0) > 0
         first = jnp.where(filled[::2], first[::2], first[1::2])
         shared = jnp.where(level == step, jnp.repeat(first, 1 << step, 0), shared)
     return shared
-
-
-jax.tree_util.register_dataclass(Window, data_fields=["begin", "length"], meta_fields=[])

@@ -1,9 +1,9 @@
 r"""The pilot estimator: which slabs are interpolated, from the lattice or between some of their rays, and how widely they sample.
 
-Flow: lattice -> residuals -> [pilot] -> worklist -> cast -> image.
+Flow: lattice -> interpolation_error -> [pilot] -> worklist -> cast -> image.
 
 Errors are treated as noise whose variances add up along a bundle, and `DEVIATIONS` standard deviations are the estimate: not a
-bound. The budget goes to interpolation first (`residuals`): wherever it is taken, the price of an evaluation saved is the same.
+bound. The budget goes to interpolation first (`interpolation_error`): wherever it is taken, the price of an evaluation saved is the same.
 What that leaves is spent on wider spaced samples (`spacing`).
 """
 
@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.access.lattice import FINEST, Lattice, Spacing
 from jaxsph.access.lists import BUNDLE
-from jaxsph.control.budget import cheapest
-from jaxsph.control.residuals import Residuals
-from jaxsph.control.spacing import spaced
-from jaxsph.control.worklist import SPARSE, Worklist, full_rate
+from jaxsph.control.interpolation_error import InterpolationError
+from jaxsph.control.knapsack import select_under_budget
+from jaxsph.control.spacing import choose_spacing
+from jaxsph.field.lattice import FINEST, Lattice, Spacing
+from jaxsph.field.schedule import DENSE, INTERPOLATED, SUBSAMPLE, SUBSAMPLED, SlabSchedule, full_rate
 from jaxsph.model.camera import Camera
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
@@ -44,56 +44,59 @@ class PilotPlan:
 def pilot(
     grid: Grid,
     lattice: Lattice,
-    found: Residuals,
+    found: InterpolationError,
     camera: Camera,
-    origin: Float[Array, "slabs bundles"],
+    reference_quantity: Float[Array, "slabs bundles"],
     tolerance: Float[Array, ""],
     slab_samples: int,
-) -> tuple[Worklist, Float[Array, " bundles"]]:
+) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """Choose the slabs that are interpolated: as many evaluations saved as the tolerance allows.
 
-    A slab is interpolated from the lattice, marched at `SPARSE` of its rays, or marched at all. At all are those whose stencils
+    A slab is interpolated from the lattice, marched at `SUBSAMPLE` of its rays, or marched at all. At all are those whose stencils
     leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice.
 
     Returns:
         The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is
         marched.
     """
-    count = grid.cells.count
+    count = grid.windows.count
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
     # a slab is first marched at fewer rays, then at none: the second step is always the dearer, so never taken without the first
-    steps = jnp.concatenate([found.sparse * found.variance, (1 - found.sparse) * found.variance])
-    gain, rays = jnp.maximum(count, 1).astype(budget.dtype), len(SPARSE) ** 2 / BUNDLE**2
-    chosen, total = cheapest(steps, jnp.concatenate([(1 - rays) * gain, rays * gain]), jnp.tile(allowed, (2, 1)), budget)
+    steps = jnp.concatenate([found.subsampled_share * found.variance, (1 - found.subsampled_share) * found.variance])
+    gain, rays = jnp.maximum(count, 1).astype(budget.dtype), len(SUBSAMPLE) ** 2 / BUNDLE**2
+    gains = jnp.concatenate([(1 - rays) * gain, rays * gain])
+    chosen, total = select_under_budget(steps, gains, jnp.tile(allowed, (2, 1)), budget)
     fewer, taken = chosen[: count.shape[0]], chosen[count.shape[0] :]
-    level, more = spaced(taken, found.bend, budget - total, lattice.region.spacing.samples)
+    level, more = choose_spacing(taken, found.bend, budget - total, lattice.region.spacing.samples)
     estimate = jnp.where(chosen.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
-    work = full_rate(grid.cells, jnp.where(taken, lattice.origin, origin))
+    schedule = full_rate(grid.windows, jnp.where(taken, lattice.reference_quantity, reference_quantity))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0
-    empty = {"length": jnp.where(taken, 0, work.length), "count": jnp.where(taken, 0, work.count)}
-    kinds = {"interpolated": taken, "sparse": fewer & ~taken}
-    return dataclasses.replace(work, **empty, **kinds, filled=work.filled & begins, level=level), estimate
+    length, number = (jnp.where(taken, 0, value) for value in (schedule.length, schedule.count))
+    method = jnp.where(taken, INTERPOLATED + level, jnp.where(fewer, SUBSAMPLED, DENSE))
+    filled = schedule.filled & begins
+    schedule = dataclasses.replace(schedule, filled=filled, level=level, length=length, count=number, method=method)
+    return schedule, estimate
 
 
 def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
     """Whether the lattice resolves enough of a band's work to be sampled at all."""
-    count = grid.cells.count.astype(jnp.float32)
+    count = grid.windows.count.astype(jnp.float32)
     return jnp.where(_resolved(grid, camera, slab_samples, nodes), count, 0).sum() > WORTHWHILE * count.sum()
 
 
 def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, "slabs bundles"]:
     """Slabs where all classes of supports reach several nodes."""
-    slabs = grid.cells.count.shape[0]
+    slabs = grid.windows.count.shape[0]
     borders = grid.borders(slabs * slab_samples)
     back = borders[slab_samples::slab_samples]
     pixel = 2 * camera.half_height / camera.height * (back if camera.is_perspective else jnp.ones_like(back))
     deep = back - borders[slab_samples - nodes.samples :: slab_samples][: back.shape[0]]
     spacing = jnp.maximum(nodes.pixels * pixel, deep)
     reach, live = grid.ordered.reach, grid.ordered.live
-    classes = grid.cells.length.shape[0]
+    classes = grid.windows.length.shape[0]
     octaves = jnp.exp2(-1.0 - jnp.arange(classes, dtype=reach.dtype))
     least = jnp.where(live, reach, jnp.inf).min(initial=jnp.inf)
     smallest = jnp.maximum(jnp.where(live, reach, 0).max(initial=0) * octaves, least).at[-1].set(least)
     small = smallest[:, None] < RESOLVED * spacing
-    return ~((grid.cells.length > 0) & small[..., None]).any(0)
+    return ~((grid.windows.length > 0) & small[..., None]).any(0)

@@ -19,21 +19,19 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.access.cells import position
+from jaxsph.access.compaction import compact
 from jaxsph.access.grid import Grid
-from jaxsph.access.stacks import stack
+from jaxsph.access.slab_windows import CELL_SAMPLES, position
 from jaxsph.control.ranges import RangeTables, transfer_ranges
-from jaxsph.control.worklist import CELL
-from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.fusion import fusion_barrier
 
-CHUNK = 1024  # cells probed together
 PROBES = 8  # particles of each slab, from the middle half of its window
 WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
 
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """What a look at the bundles of a band, or of a part of it, has found.
+    """What a look at the bundles of a band, or of a shard of it, has found.
 
     Attributes:
         promising: cells that are to be analysed, if that is `worthwhile`.
@@ -47,15 +45,20 @@ class Probe:
 
 
 def worthwhile(shares: Sequence[tuple[Array, Array]]) -> Bool[Array, ""]:
-    """Whether promising cells hold enough of a band's work to be analysed, by `held` and `all_held` of all of its parts."""
+    """Whether promising cells hold enough of a band's work to be analysed, by `held` and `all_held` of all of its shards."""
     held, all_held = (functools.reduce(jnp.add, works) for works in zip(*shares, strict=True))
     return held >= WORTHWHILE * all_held
 
 
 def probe(
-    grid: Grid, tables: RangeTables, tolerance: Float[Array, ""], lateral: Float[Array, ""] | float, slab_samples: int
+    grid: Grid,
+    tables: RangeTables,
+    tolerance: Float[Array, ""],
+    lateral: Float[Array, ""] | float,
+    slab_samples: int,
+    cells_at_once: int,
 ) -> Probe:
-    """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
+    """SlabWindows whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
     What is promising grows with `tolerance`.
@@ -65,17 +68,17 @@ def probe(
         lateral: share of the variation between neighbouring rays, of all cells of a bundle together, that is to be taken from
             the tolerance before anything is saved.
     """
-    quantity, rank, cells = grid.ordered.quantity, grid.lists.rank, grid.cells
+    quantity, rank, cells = grid.ordered.quantity, grid.lists.rank, grid.windows
     slabs, bundles = cells.count.shape
-    per_cell = CELL // slab_samples
+    per_cell = CELL_SAMPLES // slab_samples
     num_cells = -(-slabs // per_cell)
-    chunk = min(CHUNK, -(-bundles // 16) * 16)
+    chunk = min(cells_at_once, -(-bundles // 16) * 16)
     pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 0))
     begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
     count = length.sum(0).reshape(num_cells + 1, per_cell, bundles)[:-1].sum(1)
-    stacks = stack(count > 0)
-    items = jnp.pad(stacks.item, (0, chunk), constant_values=num_cells * bundles)
-    borders = grid.borders(num_cells * CELL)
+    compacted = compact(count > 0)
+    items = jnp.pad(compacted.item, (0, chunk), constant_values=num_cells * bundles)
+    borders = grid.borders(num_cells * CELL_SAMPLES)
     steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
 
     def probe_chunk(step: Array, table: Array) -> Array:
@@ -83,12 +86,12 @@ def probe(
         cell, bundle = at // bundles, at % bundles
         slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
         window = begin[:, slab, bundle], length[:, slab, bundle]
-        lo, hi = computed_once(step >= 0, _extremes, quantity, rank, window)
-        entry = computed_once(step >= 0, _varies, lo, hi, steps[slab], tables)
+        lo, hi = fusion_barrier(step >= 0, _extremes, quantity, rank, window)
+        entry = fusion_barrier(step >= 0, _varies, lo, hi, steps[slab], tables)
         return table.at[:, at].set(entry)
 
     table = jnp.zeros((2, num_cells * bundles + 1), quantity.dtype)
-    table = lax.fori_loop(0, (stacks.start[-1] + chunk - 1) // chunk, probe_chunk, table)
+    table = lax.fori_loop(0, (compacted.start[-1] + chunk - 1) // chunk, probe_chunk, table)
     change, depth = table[:, :-1].reshape(2, num_cells, bundles)
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])

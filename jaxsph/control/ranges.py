@@ -1,4 +1,4 @@
-r"""Ranges of the transfer function over intervals of the quantity: first paper, section 4.1.
+r"""Ranges of the transfer function over intervals of the quantity: Hochstetter et al. 2016, section 4.1.
 
 Flow: transfer function -> [ranges] -> bounds.
 

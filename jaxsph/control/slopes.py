@@ -1,6 +1,6 @@
 """How steep a transfer function is over a range of quantities: the mean of its squared slopes.
 
-Flow: transfer -> [slopes] -> residuals.
+Flow: transfer -> [slopes] -> interpolation_error.
 
 The integral of the squared slope up to any quantity tells the mean over any range: a difference of two. It is tabulated at
 uniform borders, so a range is read without a search.
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.model.transfer import TransferFunction, look_up
-from jaxsph.numerics.staging import computed_once
+from jaxsph.numerics.fusion import fusion_barrier
 
 BUCKETS = 1024  # of the transfer function's domain: a slope is averaged over one at least
 
@@ -68,9 +68,9 @@ def mean_square_slope(squares: SquaredSlopes, low: Array, high: Array) -> list[A
         return upper - lower, upper
 
     always, lost = squares.rate >= 0, 4 * jnp.finfo(low.dtype).eps
-    first, past = computed_once(always, lambda low, high: (bucket(low), bucket(high) + 1), low, high)
+    first, past = fusion_barrier(always, lambda low, high: (bucket(low), bucket(high) + 1), low, high)
     extent = jnp.maximum(high - low, jnp.where(squares.rate > 0, 1 / squares.rate, 1))
-    *inside, (jumps, _) = (computed_once(always, between, row, first, past) for row in squares.integral)
+    *inside, (jumps, _) = (fusion_barrier(always, between, row, first, past) for row in squares.integral)
     return [jnp.where(jumps > 0, jnp.inf, (sum_of + lost * upper) / extent) for sum_of, upper in inside]
 
 

@@ -1,11 +1,11 @@
 r"""Wider spaced samples in interpolated slabs: where light bends little along the rays, fewer samples tell as much.
 
-Flow: residuals -> [spacing] -> worklist -> cast.
+Flow: interpolation_error -> [spacing] -> worklist -> cast.
 
 Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
 for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean, and twice w also resolves a kink of g that much worse. The nodes
 of the lattice know g, thus their second differences along a ray, so that is known without any sample more. They are taken at
-the nodes only and the rays between may meet a kink that those miss: `UNSEEN` times their root mean square is one deviation.
+the nodes only and the rays between may meet a kink that those miss: `DEVIATION_PER_BEND` times their root mean square is one deviation.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ import functools
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.control.budget import cheapest
+from jaxsph.control.knapsack import select_under_budget
+from jaxsph.field.schedule import MAX_SPACING_LEVEL
 
-WIDEST = 2  # level of the most widely spaced samples
-UNSEEN = 3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
+DEVIATION_PER_BEND = (
+    3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
+)
 LEAST = 8  # eps: what they differ by, at least
 
 
-def bends(
+def second_differences(
     colors: list[list[Float[Array, " nodes"]]],
     extinction: list[Float[Array, " nodes"]],
     step: Float[Array, "fewer nodes"],
@@ -53,7 +55,7 @@ def bends(
     return total, jnp.stack(last)
 
 
-def spaced(
+def choose_spacing(
     taken: Bool[Array, "slabs bundles"], bend: Float[Array, "slabs bundles"], budget: Float[Array, " bundles"], node_samples: int
 ) -> tuple[Int[Array, "slabs bundles"], Float[Array, " bundles"]]:
     """Levels of interpolated slabs, from the widest spaced down: aligned groups of slabs, all interpolated, share samples.
@@ -69,15 +71,15 @@ def spaced(
     """
     level, spent = jnp.zeros(taken.shape, jnp.int32), jnp.zeros_like(budget)
     least = LEAST * jnp.finfo(budget.dtype).eps
-    for coarse in range(WIDEST, 0, -1):
+    for coarse in range(MAX_SPACING_LEVEL, 0, -1):
         share = 1 << coarse
         whole = taken.shape[0] // share * share
         if not whole:
             continue
         groups = (taken & (level == 0))[:whole].reshape(-1, share, taken.shape[1])
         curved = functools.reduce(jnp.add, (bend[k:whole:share] for k in range(share)))
-        deviation = UNSEEN * (share**2 - 1) / (24 * node_samples**2) * curved + least
-        chosen, more = cheapest(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
+        deviation = DEVIATION_PER_BEND * (share**2 - 1) / (24 * node_samples**2) * curved + least
+        chosen, more = select_under_budget(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
         level = level.at[:whole].max(coarse * jnp.repeat(chosen, share, 0))
         spent += more
     return level, spent

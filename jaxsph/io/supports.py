@@ -115,7 +115,7 @@ def kernel_sum(
     _refuse_too_many_pairs(tree, points, radii)
     total = np.empty(len(askers))
     reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
-    order = np.argsort(reached, kind="stable")  # alike counts together, so that a block has little padding
+    order = np.argsort(reached, kind="stable")  # correlation_length counts together, so that a block has little padding
     for block in _slices(reached[order], progress, "kernel sums"):
         rows = order[block]
         most, farthest = max(2, int(reached[rows].max())), float(radii[rows].max())  # k = 1 would drop an axis

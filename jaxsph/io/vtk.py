@@ -1,6 +1,6 @@
 """Legacy VTK files (`.vtk`), ASCII and binary: the points and point data of polydata and unstructured grids.
 
-Binary data is big-endian. Cells of every kind are skipped; versions 2.0 to 5.1 are known. `FIELD` arrays, `SCALARS`,
+Binary data is big-endian. SlabWindows of every kind are skipped; versions 2.0 to 5.1 are known. `FIELD` arrays, `SCALARS`,
 `VECTORS`, `NORMALS` and `TENSORS` become columns; colours and texture coordinates are skipped.
 Source: VTK File Formats, Kitware, "Simple Legacy Formats".
 """

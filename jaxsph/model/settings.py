@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsph.model.registry import INTEGRATORS, SCREENS
+
 GIBIBYTE = 1 << 30
-
-
 ESTIMATORS = ("interval", "pilot")
 ALLOCATIONS = ("budget", "greedy", "paper", "independent")
 
@@ -23,7 +23,7 @@ class Settings:
         samples: fine samples N along every ray, at least 1.
         tolerance: largest absolute difference to the reference image that any colour channel or alpha of any pixel may have;
             `None` renders that reference image, at full rate.
-        estimator: how errors are foreseen; `"interval"` bounds them (first paper, sections 4 and 5), `"pilot"` estimates them
+        estimator: how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections 4 and 5), `"pilot"` estimates them
             from a coarse lattice of rays, and saves several times as many evaluations. It uses none of the choices below.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
@@ -32,6 +32,9 @@ class Settings:
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict
             form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
+        integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
+            (Hochstetter et al. 2016, section 2.2).
+        screen: which rays are cast; `"pixels"` gives every pixel its own.
         memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it.
     """
 
@@ -42,6 +45,8 @@ class Settings:
     super_pixels: bool = True
     merge: bool = True
     allocation: str = "budget"
+    integrator: str = "samples"
+    screen: str = "pixels"
     memory_limit: int = 4 * GIBIBYTE
 
     def __post_init__(self) -> None:
@@ -57,6 +62,9 @@ class Settings:
             raise ValueError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
         if self.allocation not in ALLOCATIONS:
             raise ValueError(f"`allocation` must be one of {', '.join(ALLOCATIONS)}, got {self.allocation!r}")
+        for name, known in (("integrator", INTEGRATORS), ("screen", SCREENS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         if not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
@@ -71,5 +79,5 @@ def _is_number(value: Any) -> bool:
 jax.tree_util.register_dataclass(
     Settings,
     data_fields=["tolerance", "relax"],
-    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "memory_limit"],
+    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "integrator", "screen", "memory_limit"],
 )

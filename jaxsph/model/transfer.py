@@ -89,7 +89,7 @@ class TransferFunction:
         width = jnp.append(self.values[1:] - self.values[:-1], 0)
         largest = jnp.finfo(width.dtype).max
         inverse = jnp.where(width > 0, jnp.minimum(1 / jnp.where(width > 0, width, 1), largest), 0)
-        buckets = BUCKETS_A_POINT * self.values.shape[0]
+        buckets = BUCKETS_PER_POINT * self.values.shape[0]
         extent = self.values[-1] - self.values[0]
         rate = jnp.where(extent > 0, jnp.minimum(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
         inside = _bucket(self.values, self.values[0], rate, buckets)
@@ -144,7 +144,7 @@ class Segments:
 
 
 EVEN = 4  # eps of the largest value that evenly spaced points may be off, as rounded tables are
-BUCKETS_A_POINT = 2
+BUCKETS_PER_POINT = 2
 SELECT_ALL = 16  # up to this many control points a chain of selects vectorises, and beats any gather
 
 

@@ -19,10 +19,11 @@ def is_traced(*values: Any) -> bool:
 
 
 def require_sizes(plan: Any) -> None:
-    """Raise `ValueError` unless all fields of a dataclass of sizes are at least 1."""
+    """Raise `ValueError` unless all integers of a dataclass of sizes are at least 1."""
     for field in dataclasses.fields(plan):
-        if getattr(plan, field.name) < 1:
-            raise ValueError(f"`{field.name}` must be at least 1, got {getattr(plan, field.name)}")
+        size = getattr(plan, field.name)
+        if isinstance(size, int) and not isinstance(size, bool) and size < 1:
+            raise ValueError(f"`{field.name}` must be at least 1, got {size}")
 
 
 def require_shape(name: str, value: Any, shape: tuple[int | None, ...], remedy: str) -> None:

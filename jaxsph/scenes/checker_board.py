@@ -1,4 +1,4 @@
-"""`checker_board`: cubes of increasing concentration that diffuse, as in the first paper's figure 8."""
+"""`checker_board`: cubes of increasing concentration that diffuse, as in Hochstetter et al. 2016, figure 8."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flubber`: two fluids wind around each other while they orbit a centre, after the first paper's figure 10; analytic."""
+"""`flubber`: two fluids wind around each other while they orbit a centre, after Hochstetter et al. 2016, figure 10; analytic."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`letters`: letters of dyed fluid fall into a basin and splash, after the first paper's figure 1; analytic."""
+"""`letters`: letters of dyed fluid fall into a basin and splash, after Hochstetter et al. 2016, figure 1; analytic."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HEIGHT, THICKNESS = 0.6, 0.2
 GAP, STAGGER = 0.25, 0.1
 """From the water to the first letter in frame 0, and what each further letter hangs higher, metres."""
 
-LEFT = (-0.84, -0.18, 0.48)
+SUBSAMPLE_VARIANCE = (-0.84, -0.18, 0.48)
 """Left edges of the letters, metres."""
 
 STROKE = 0.12
@@ -60,10 +60,10 @@ def letters(
     now, generator = moment * SECONDS_A_FRAME, np.random.default_rng(seed)
     drops = [letter(number, int(part), seed + 1 + number) for number, part in enumerate(parts[1:])]
     water = scatter(lower, upper, int(parts[0]), seed)
-    dropped = [fallen(drop, left, now, generator) for drop, left in zip(drops, LEFT, strict=True)]
+    dropped = [fallen(drop, left, now, generator) for drop, left in zip(drops, SUBSAMPLE_VARIANCE, strict=True)]
     sunk = sum(float((place[:, 1] <= upper[1]).sum()) for place in dropped) / max(count, 1) * sum(volumes)
     rise = 1 + sunk / volumes[0]
-    for number, left in enumerate(LEFT):
+    for number, left in enumerate(SUBSAMPLE_VARIANCE):
         water[:, 1] *= 1 + swell(water, left + HEIGHT * 0.3, now - float(_until_water(GAP + number * STAGGER)))
     position = np.concatenate([water, *dropped])
     position[:, 1] *= np.where(position[:, 1] <= upper[1] * (1 + SWELL), rise, 1.0)
@@ -76,7 +76,7 @@ def letters(
         colors=[(0.15, 0.40, 0.75), (0.20, 0.60, 0.80), (0.25, 0.85, 0.55), (0.98, 0.75, 0.20), (0.95, 0.30, 0.20)],
         extinction=[1.2, 2.5, 9.0, 9.0, 9.0],
     )
-    top = upper[1] + GAP + STAGGER * (len(LEFT) - 1) + HEIGHT * (1 + 2 * STROKE)
+    top = upper[1] + GAP + STAGGER * (len(SUBSAMPLE_VARIANCE) - 1) + HEIGHT * (1 + 2 * STROKE)
     camera = looking_at_box(BASIN[0], (BASIN[1][0], top, BASIN[1][2]), (-0.25, -0.4, -1.0), fluid, width, height)
     return Scene(particles=fluid, transfer=transfer), camera
 
@@ -93,7 +93,7 @@ GLYPHS: dict[str, list[list[tuple[float, float]]]] = {
 }
 """Lines along the middle of the strokes, in heights of a letter: y from 0 to 1, x from 0 to 0.6."""
 
-CELL = ((-STROKE, -STROKE), (0.6 + STROKE, 1 + STROKE))
+CELL_SAMPLES = ((-STROKE, -STROKE), (0.6 + STROKE, 1 + STROKE))
 """The box around a letter, in heights."""
 
 
@@ -111,7 +111,7 @@ def distance(place: Float[np.ndarray, "points 2"], name: str) -> Float[np.ndarra
 @functools.cache
 def area(name: str) -> float:
     """Of a letter's face, in squared heights."""
-    lower, upper = np.asarray(CELL)
+    lower, upper = np.asarray(CELL_SAMPLES)
     axes = [np.linspace(a, b, 200) for a, b in zip(lower, upper, strict=True)]
     inside = distance(np.stack(np.meshgrid(*axes), -1).reshape(-1, 2), name) <= STROKE
     return float(inside.mean() * (upper - lower).prod())
@@ -120,11 +120,11 @@ def area(name: str) -> float:
 def letter(number: int, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
     """`count` points, evenly spread through a letter where it hangs in frame 0, metres."""
     name = tuple(GLYPHS)[number]
-    lower, upper = (np.append(corner, depth) for corner, depth in zip(np.asarray(CELL), (-0.5, 0.5), strict=True))
+    lower, upper = (np.append(corner, depth) for corner, depth in zip(np.asarray(CELL_SAMPLES), (-0.5, 0.5), strict=True))
     box = scatter(lower, upper, round(count * float((upper - lower)[:2].prod()) / area(name)) + 1, seed)
     kept = box[np.sort(np.argsort(distance(box[:, :2], name), kind="stable")[:count])]
     bottom = BASIN[1][1] + GAP + STAGGER * number + HEIGHT * STROKE
-    return kept * (HEIGHT, HEIGHT, THICKNESS) + (LEFT[number], bottom, 0.0)
+    return kept * (HEIGHT, HEIGHT, THICKNESS) + (SUBSAMPLE_VARIANCE[number], bottom, 0.0)
 
 
 def _until_water(above: Float[np.ndarray, " points"] | float) -> Float[np.ndarray, " points"]:

@@ -1,4 +1,4 @@
-"""`mixer`: a paddle stirs a tank in which dye stands in cubes, as in the first paper's figure 9."""
+"""`mixer`: a paddle stirs a tank in which dye stands in cubes, as in Hochstetter et al. 2016, figure 9."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`radial`: a smooth concentration under a transfer function that is anything but, as in the first paper's figure 3."""
+"""`radial`: a smooth concentration under a transfer function that is anything but, as in Hochstetter et al. 2016, figure 3."""
 
 from __future__ import annotations
 

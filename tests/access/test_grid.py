@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.access.cells import find_cells
+from jaxsph.access.slab_windows import find_slab_windows
 from jaxsph.access.lists import build_lists, bundle_origins
 from jaxsph.access.ordering import rank_particles
 from jaxsph.access.view import view_particles
@@ -29,7 +29,7 @@ def grid(particles, camera, plan):
     return (
         ordered,
         lists,
-        find_cells(ordered, lists),
+        find_slab_windows(ordered, lists),
         bundle_origins(plan.lists, 0),
         (ordered.left, ordered.right, ordered.top, ordered.bottom),
     )

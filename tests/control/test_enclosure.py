@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.access.cells import cells_with_borders
-from jaxsph.cast.points import cast_points
+from jaxsph.access.slab_windows import slab_windows_with_borders
+from jaxsph.cast.march import cast_points
 from jaxsph.control.analysis import analyse
 from jaxsph.control.enclosure import bundle_bounds
 from jaxsph.control.errors import SUPER_PIXEL
 from jaxsph.control.levels import bound
 from jaxsph.control.merge import coarse_work, coarser_windows, merged_levels
 from jaxsph.control.ranges import range_tables
-from jaxsph.control.worklist import CELL, COARSEST
+from jaxsph.field.schedule import CELL_SAMPLES, MAX_LEVEL
 
 CANDIDATES = range(SUPER_PIXEL + 1)
 QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
@@ -47,9 +47,9 @@ jax.tree_util.register_dataclass(Looked, data_fields=[field.name for field in da
 def look(scene, camera, parts, wished, *, plan, kernel, form):
     grid, origin = parts
     slab_samples, number = plan.cast.slab_samples, wished.shape[0]
-    windows, beside = coarser_windows(grid.cells, slab_samples), cells_with_borders(grid.ordered, grid.lists)
-    filled, free = (held_by_cells(cells, slab_samples, number) for cells in (grid.cells, beside))
-    whole, free = ((jnp.arange(number) + 1) * CELL <= plan.samples)[:, None], ~free
+    windows, beside = coarser_windows(grid.windows, slab_samples), slab_windows_with_borders(grid.ordered, grid.lists)
+    filled, free = (held_by_cells(cells, slab_samples, number) for cells in (grid.windows, beside))
+    whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
     levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)
     tables, unrelaxed = range_tables(scene.transfer), jnp.zeros((), origin.dtype)
     analysis = analyse(grid, beside, camera, origin, filled, tables, unrelaxed, slab_samples, 2)
@@ -61,15 +61,15 @@ def look(scene, camera, parts, wished, *, plan, kernel, form):
 
     exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))
     # a super-pixel is a sample as long as a cell, of colours within all ranges: as one of the coarsest level
-    bounds = bundle_bounds(grid, camera, scene.transfer, jnp.minimum(levels, COARSEST), slab_samples, form=form)
-    rounding = 2 * jnp.finfo(origin.dtype).eps * CELL * (filled.sum(0) + 1)
+    bounds = bundle_bounds(grid, camera, scene.transfer, jnp.minimum(levels, MAX_LEVEL), slab_samples, form=form)
+    rounding = 2 * jnp.finfo(origin.dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
     off = bound(analysis.error, jnp.where(filled, levels, 0), rounding)
     return Looked(exact, found, bounds.lo, bounds.hi, off, levels, filled)
 
 
 def held_by_cells(cells, slab_samples, number):
     """Which cells have particles in any of their slabs, (cells, bundles)."""
-    of_slabs = jnp.pad(cells.count, ((0, number * CELL // slab_samples - cells.count.shape[0]), (0, 0)))
+    of_slabs = jnp.pad(cells.count, ((0, number * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
     return of_slabs.reshape(number, -1, of_slabs.shape[1]).any(1)
 
 
@@ -111,7 +111,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
 ):
     frames = frames.deep(slab_samples)
     plan = frames.plan(slab_samples)
-    cells, bundles, met = -(-frames.samples // CELL), plan.lists.num_bundles, set()
+    cells, bundles, met = -(-frames.samples // CELL_SAMPLES), plan.lists.num_bundles, set()
 
     def holds(scene, camera, wished):
         found = looked(stages, scene, camera, wished, plan, form)
@@ -133,7 +133,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
 
 
 @pytest.fixture
-def alike(frames, x64):
+def correlation_length(frames, x64):
     """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
     frames = frames.deep(4)
     scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
@@ -144,13 +144,13 @@ def alike(frames, x64):
         quantity = 0.4 + spread * particles.quantity
         return js.Scene(particles=dataclasses.replace(particles, quantity=quantity), transfer=transfer)
 
-    return of, camera, frames.plan(4), (-(-frames.samples // CELL), 16)
+    return of, camera, frames.plan(4), (-(-frames.samples // CELL_SAMPLES), 16)
 
 
-def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(stages, alike):
+def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(stages, correlation_length):
     """Nothing is left that could vary but the lengths of rays, and the bounds are the range of the pixels."""
-    of, camera, plan, (cells, bundles) = alike
-    levels = np.broadcast_to(np.arange(bundles) % (COARSEST + 1), (cells, bundles)).astype(np.int32)
+    of, camera, plan, (cells, bundles) = correlation_length
+    levels = np.broadcast_to(np.arange(bundles) % (MAX_LEVEL + 1), (cells, bundles)).astype(np.int32)
     found = looked(stages, of(0.0), camera, levels, plan, "lerp")
     assert found.found.max() > 0.1
     np.testing.assert_allclose(found.lo, found.found.min((2, 3)), atol=1e-12)
@@ -158,9 +158,9 @@ def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(st
 
 
 @pytest.mark.parametrize("spread", [0.01, 0.1])
-def test_bounds_and_errors_inform(stages, alike, spread):
+def test_bounds_and_errors_inform(stages, correlation_length, spread):
     """They add little to what the pixels of a bundle differ by anyway: the slopes of colours and of extinction are 1 and less."""
-    of, camera, plan, size = alike
+    of, camera, plan, size = correlation_length
     full, painted = (
         looked(stages, of(spread), camera, np.full(size, level, np.int32), plan, "lerp") for level in (0, SUPER_PIXEL)
     )

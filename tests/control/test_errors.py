@@ -10,23 +10,23 @@ import numpy as np
 
 from jaxsph.control.bounds import SampleBounds
 from jaxsph.control.errors import SUPER_PIXEL, cell_errors
-from jaxsph.control.worklist import CELL
+from jaxsph.field.schedule import CELL_SAMPLES
 
 BUNDLES = 64
 errors_of = jax.jit(functools.partial(cell_errors, fitting=2), compiler_options={"xla_backend_optimization_level": 0})
 
 
 def found(relax):
-    """Cells whose samples are all touched and covered, some in part empty, some with slabs that nothing touches."""
+    """SlabWindows whose samples are all touched and covered, some in part empty, some with slabs that nothing touches."""
     rng = np.random.default_rng(0)
-    shape = (CELL, BUNDLES)
+    shape = (CELL_SAMPLES, BUNDLES)
     touched = rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 3, 0.8, 1)
     covered = touched & (rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 1, 0.8, 1))
     low = [rng.uniform(0, 0.5, shape) for _ in range(4)]
     high = [value + rng.uniform(0, 0.3, shape) for value in low]
     low, high = ([jnp.asarray(value, jnp.float32) for value in side] for side in (low, high))
     bounds = SampleBounds(jnp.asarray(touched), jnp.asarray(covered), low, high)
-    borders = jnp.broadcast_to(jnp.linspace(1, 2, CELL + 1, dtype=jnp.float32)[:, None], (CELL + 1, BUNDLES))
+    borders = jnp.broadcast_to(jnp.linspace(1, 2, CELL_SAMPLES + 1, dtype=jnp.float32)[:, None], (CELL_SAMPLES + 1, BUNDLES))
     path, none = jnp.ones(BUNDLES, jnp.float32), jnp.zeros(BUNDLES, jnp.float32)
     errors = errors_of(bounds, borders, path, path, (none, none), jnp.float32(relax))
     return np.asarray(errors.error), np.asarray(errors.strict), (covered | ~touched).all(0)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.access.lattice import FINEST, Spacing
+from jaxsph.field.lattice import FINEST, Spacing
 from jaxsph.control.pilot import DEVIATIONS, pilot
-from jaxsph.control.residuals import residuals
-from jaxsph.stages import sum_part
+from jaxsph.control.interpolation_error import interpolation_error
+from jaxsph.stages import sum_shard
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
 FULL = js.Settings(samples=128)
@@ -153,8 +153,8 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
     slab_samples, (grid, origin) = plan.cast.slab_samples, stages(scene.particles, camera, plan=plan)
-    lattice = sum_part(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
-    found = residuals(grid, lattice, camera, scene.transfer, slab_samples)
+    lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
+    found = interpolation_error(grid, lattice, camera, scene.transfer, slab_samples)
     choose = functools.partial(pilot, grid, lattice, found, camera, origin, slab_samples=slab_samples)
     variance, before = np.asarray(found.variance), 0
     samples = np.minimum(slab_samples, PILOT.samples - slab_samples * np.arange(len(variance)))[:, None]
@@ -164,14 +164,14 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
         work, estimate = choose(tolerance=jnp.float32(tolerance))
         taken, sparse = np.asarray(work.interpolated), np.asarray(work.sparse)
         assert taken.any() and sparse.any() and not (taken & sparse).any()
-        np.testing.assert_array_equal(work.count, np.where(taken, 0, grid.cells.count))
+        np.testing.assert_array_equal(work.count, np.where(taken, 0, grid.windows.count))
         spent = np.where(taken, variance, np.where(sparse, np.asarray(found.sparse) * variance, 0)).sum(0)
         assert (DEVIATIONS * np.sqrt(spent) <= np.asarray(estimate) * (1 + 1e-5)).all()
         assert (np.asarray(estimate) <= np.float32(tolerance)).all()
         assert taken.sum() > before
         before = taken.sum()
         # what is counted: particles at all rays, or at sixteen of sixty-four, and those at nodes
-        count = np.asarray(grid.cells.count) * np.where(taken, 0, np.where(sparse, 0.25, 1)) * samples
+        count = np.asarray(grid.windows.count) * np.where(taken, 0, np.where(sparse, 0.25, 1)) * samples
         evaluations = (count.sum(0) + np.asarray(lattice.evaluations))[shown]
         image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=tolerance), plan=plan)
         np.testing.assert_allclose(np.asarray(image.evaluations)[rows[shown], columns[shown]], evaluations, rtol=1e-6)
@@ -200,7 +200,7 @@ def test_jit_agrees_with_eager():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [128, 256])
 def test_the_estimate_holds_however_dense_samples_are_along_the_ray(size):
-    """Where nodes across are far apart, neighbouring samples err alike: their errors do not average out."""
+    """Where nodes across are far apart, neighbouring samples err correlation_length: their errors do not average out."""
     scene, camera = js.scenes.load("checker_board", width=size, height=size)
     for samples in (128, 512):
         full = js.Settings(samples=samples)

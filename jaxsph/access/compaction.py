@@ -1,0 +1,66 @@
+"""Compact what is filled along each bundle, so that empty space costs nothing.
+
+Flow: cells -> [compaction] -> control, cast.
+
+Layer n of the compacted slabs holds every bundle's n-th filled item, front to back without gaps. With bundles in order of height, the
+bundles of a layer are the first so many of all: the layers, one after the other, are a list of items in which those that are
+near in depth are near each other, and any stretch of it can be put in front of what follows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from jaxsph.numerics.sums import running_sum
+
+SIZE_BITS = 5  # of a sort key: how full an item is, in quarters of octaves
+
+
+@dataclasses.dataclass(frozen=True)
+class CompactedSlabs:
+    """The filled items of a band, layer by layer; `slabs * bundles` is a dummy item.
+
+    Attributes:
+        item: `slab * bundles + bundle` of each, then dummies.
+        start: where each layer begins in `item`, and where the last ends.
+        bundle_rank: of each bundle in order of height, tallest first; the n-th item of a layer is that of the n-th bundle.
+    """
+
+    item: Int[Array, " items"]
+    start: Int[Array, " layers_and_one"]
+    bundle_rank: Int[Array, " bundles"]
+
+
+def compact(filled: Bool[Array, "slabs bundles"]) -> CompactedSlabs:
+    """Compact the `filled` items of each bundle."""
+    slabs, bundles = filled.shape
+    nth = running_sum(filled.astype(jnp.int32), 0)
+    height = nth[-1]
+    bits = (bundles - 1).bit_length()
+    key = lax.sort(((slabs - height).astype(jnp.uint32) << bits) | lax.iota(jnp.uint32, bundles))
+    bundle = (key & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
+    bundle_rank = jnp.zeros(bundles, jnp.int32).at[bundle].set(jnp.arange(bundles, dtype=jnp.int32))
+    active = (height > jnp.arange(slabs, dtype=jnp.int32)[:, None]).sum(1, dtype=jnp.int32)
+    start = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum(active)])
+    # always in bounds, as a dropped entry is a branch mispredicted
+    target = jnp.where(filled, start[jnp.maximum(nth - 1, 0)] + bundle_rank, slabs * bundles)
+    item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)
+    item = item.at[target.ravel()].set(jnp.arange(slabs * bundles, dtype=jnp.int32))
+    return CompactedSlabs(item.at[-1].set(slabs * bundles), start, bundle_rank)
+
+
+def fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
+    """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
+    size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 4), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
+    bits = 32 - SIZE_BITS
+    key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
+    order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
+
+
+jax.tree_util.register_dataclass(CompactedSlabs, data_fields=["item", "start", "bundle_rank"], meta_fields=[])

@@ -1,0 +1,75 @@
+"""From the optics of media at samples to the light of slabs: the interface of all integrators.
+
+Flow: media -> [integrator] -> composite.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsph.field.tasks import SlabTask
+from jaxsph.model.medium import COLORS, Medium, mixed_colors, mixed_extinction
+
+Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """Slabs as seen from right in front of each.
+
+    Attributes:
+        color: red, green and blue that a slab emits.
+        transmittance: what it lets through, the exponential of minus the sum of `thickness`.
+        thickness: optical thickness between borders.
+    """
+
+    color: tuple[Float[Array, "slabs rays"], Float[Array, "slabs rays"], Float[Array, "slabs rays"]]
+    transmittance: Float[Array, "slabs rays"]
+    thickness: Float[Array, "slabs samples rays"]
+
+
+class Integrator(abc.ABC):
+    """How samples become light.
+
+    What a slab does to light must not depend on what lies in front of it: slabs are marched in any order.
+
+    Attributes:
+        halo: 0 where samples are the middles of what they stand for; 1 where they lie on the borders, both ends included, so that
+            neighbouring slabs share one.
+    """
+
+    halo: int = 0
+
+    @abc.abstractmethod
+    def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
+        """Colour of slabs, and the optical thickness of their intervals; differentiable.
+
+        Args:
+            optics: at the samples, of all media together; no colour counts where extinction is 0.
+            path: path length of each interval.
+        """
+
+    def __call__(self, media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Segment:
+        """Light of slabs, by what media have gathered there; for an integrator that wants its passes over memory otherwise."""
+        color, thickness = self.segment(optics_of(media, gathered, task), task.path())
+        return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
+
+
+def optics_of(media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Optics:
+    """Optics at samples, of all media together."""
+    extinctions, colors = [], []
+    for medium, found in zip(media, gathered, strict=True):
+        extinction, samples = medium.extinction(found, task)
+        extinctions.append(extinction)
+        colors.append(medium.colors(samples, task, COLORS))
+    optics = [*mixed_colors(colors, extinctions), mixed_extinction(extinctions)]
+    return [jnp.broadcast_to(value, task.shape) for value in optics]
+
+
+jax.tree_util.register_dataclass(Segment, data_fields=["color", "transmittance", "thickness"], meta_fields=[])

@@ -1,0 +1,86 @@
+"""Marching: from schedule and media to what all rays have met.
+
+Flow: schedule, packets -> batches -> [march: media -> integrator -> composite] -> screen.
+
+What a slab of samples does to light does not depend on what lies in front of it. So a batch of slabs is marched in any order,
+chunk by chunk; what they emit and absorb is held, and then put into the rays' state layer by layer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxsph.access.grid import Grid
+from jaxsph.cast.batches import Batches, CastPlan, batches_of
+from jaxsph.cast.composite import RayState, Together, composite, empty_segments, fresh_rays
+from jaxsph.cast.integrator import Integrator, Segment
+from jaxsph.field.schedule import SlabSchedule
+from jaxsph.field.tasks import RayPackets
+from jaxsph.model.medium import Medium
+
+
+@dataclasses.dataclass(frozen=True)
+class RayResult:
+    """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance."""
+
+    color: Float[Array, "3 packets rows columns"]
+    transmittance: Float[Array, "packets rows columns"]
+    depth: Float[Array, "packets rows columns"]
+
+
+def march(
+    grid: Grid,
+    schedule: SlabSchedule,
+    packets: RayPackets,
+    media: tuple[Medium, ...],
+    integrator: Integrator,
+    plan: CastPlan,
+    perspective: bool,
+) -> RayResult:
+    """March all packets of a band.
+
+    Args:
+        schedule: the slabs of samples to march, by bundle.
+    """
+    batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo))
+    together = Together.of(batches.num_packets, plan.tuning)
+
+    def march_batch(nth: Array, state: tuple[RayState, Segment]) -> tuple[RayState, Segment]:
+        rays, light = state
+        batch = batches.batch(nth)
+
+        def march_chunk(chunk: Array, light: Segment) -> Segment:
+            items, begin = batches.chunk(batch, chunk)
+            found = segments_of(batches, items, media, integrator)
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
+
+        light = lax.fori_loop(0, batch.chunks, march_chunk, light)
+        borders = lambda place: batches.borders(batch.items[place])  # noqa: E731
+        return composite(rays, light, batch, borders, batches.compacted.start, together), light
+
+    dtype = grid.half_steps.dtype
+    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together)
+    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype)
+    rays, _ = lax.fori_loop(0, batches.number, march_batch, (rays, light))
+    return result_of(rays, batches)
+
+
+def segments_of(batches: Batches, items: Array, media: tuple[Medium, ...], integrator: Integrator) -> Segment:
+    """What slabs emit and let through."""
+    task = batches.task(items)
+    return integrator(media, tuple(medium.gather(task) for medium in media), task)
+
+
+def result_of(rays: RayState, batches: Batches) -> RayResult:
+    """Rays in the order of packets, as rows and columns."""
+    rank, shape = batches.compacted.bundle_rank, batches.packets.shape
+    *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
+    return RayResult(jnp.stack(color), transmittance, depth)
+
+
+jax.tree_util.register_dataclass(RayResult, data_fields=["color", "transmittance", "depth"], meta_fields=[])

@@ -1,0 +1,60 @@
+"""Fetch particles: those in the windows of slabs, a block at a time.
+
+Flow: schedule -> [fetch] -> gather, nodes, transposed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.ordering import Ordered
+from jaxsph.access.slab_windows import position
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Some particles of each of some slabs; of size 0 past the last of a slab's windows.
+
+    Attributes:
+        x, y, z: view coordinates, length units.
+        scale, size: reciprocal support and strength as folded into lengths, see `model.kernels`.
+        quantities: relative to the references that were given.
+    """
+
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+    z: Float[Array, "..."]
+    scale: Float[Array, "..."]
+    size: Float[Array, "..."]
+    quantities: tuple[Float[Array, "..."], ...]
+
+
+def particle_at(
+    rank: Int[Array, " pairs"], begin: Int[Array, "classes ..."], length: Int[Array, "classes ..."], index: Int[Array, "..."]
+) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
+    """The `index`-th particle of windows, and whether there are so many; if not, it is any."""
+    place = position(index, begin, length)
+    return rank[jnp.clip(place, 0, rank.shape[0] - 1)], index < length.sum(0)
+
+
+def fetch(
+    ordered: Ordered,
+    rank: Int[Array, " pairs"],
+    windows: tuple[Array, Array],
+    index: Int[Array, "..."],
+    references: tuple[Float[Array, "..."], ...],
+) -> tuple[Int[Array, "..."], Block]:
+    """The `index`-th particles of windows (`begin`, `length`), by rank and as such; shapes are those that broadcasting gives."""
+    particle, inside = particle_at(rank, *windows, index)
+    x, y, z, scale, size, *quantities = (
+        column[particle] for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *ordered.quantities)
+    )
+    relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
+    return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)
+
+
+jax.tree_util.register_dataclass(Block, data_fields=[field.name for field in dataclasses.fields(Block)], meta_fields=[])

@@ -1,0 +1,59 @@
+"""Sums over particles at samples: of weights, and of one or more quantities times weights.
+
+Flow: gather, nodes -> [sums] -> media.
+
+On CPUs XLA makes a kernel of every array that a loop carries, and each evaluates every weight again. So two sums travel as one
+complex number there, and are taken apart where they are read; elsewhere each is an array of its own (`numerics.tuning`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxsph.numerics.fusion import barriers_kept
+
+
+@dataclasses.dataclass(frozen=True)
+class Sums:
+    """Sums up to one common factor.
+
+    Attributes:
+        packed: one or two sums an array, in the order of `all`.
+        num_quantities: how many there are besides that of weights.
+    """
+
+    packed: tuple[Array, ...]
+    num_quantities: int
+
+    @property
+    def all(self) -> tuple[Float[Array, "..."], ...]:
+        """Of V W, then of (q - reference) V W for each quantity q."""
+        parts = [part for pair in self.packed for part in ((pair.real, pair.imag) if jnp.iscomplexobj(pair) else (pair,))]
+        return tuple(parts[: 1 + self.num_quantities])
+
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        """Of V W."""
+        return self.all[0]
+
+    @property
+    def weighted(self) -> tuple[Float[Array, "..."], ...]:
+        """Of (q - reference) V W, for each quantity."""
+        return self.all[1:]
+
+
+def sums_of(channels: list[Float[Array, "..."]]) -> Sums:
+    """Those sums, that of weights first."""
+    number = len(channels) - 1
+    if not barriers_kept():
+        return Sums(tuple(channels), number)
+    seconds = [*channels[1::2], jnp.zeros_like(channels[0])]
+    return Sums(tuple(lax.complex(*pair) for pair in zip(channels[::2], seconds, strict=False)), number)
+
+
+jax.tree_util.register_dataclass(Sums, data_fields=["packed"], meta_fields=["num_quantities"])

@@ -1,0 +1,108 @@
+"""What light meets along its way: the interface of all media.
+
+Flow: scene -> [medium] -> field, cast.
+
+A medium is a frozen dataclass and a pytree, whose floating leaves an image can be differentiated by. It is asked for its
+extinction and colours at the samples of slabs; how samples become light is the integrator's affair, and media that share a
+sample are mixed by it. What takes no loop of its own needs only `extinction` and `colors`, and no derivative written by hand.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model.camera import Camera
+
+COLORS = slice(0, 3)
+Total = TypeVar("Total")
+
+
+class Medium(abc.ABC):
+    """A participating medium that emits and absorbs.
+
+    Positions are in view space (length units): x right, y up, z forward from the eye.
+    """
+
+    def seen_by(self, camera: Camera) -> Medium:
+        """The medium in view space; by default as it is."""
+        return self
+
+    @abc.abstractmethod
+    def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
+        """Where any of it may be: slabs of samples that are to be marched for it.
+
+        Args:
+            slabs: `access.extents.SlabExtents`, boxes in view space around the slabs of a band.
+        """
+
+    def gather(self, task: Any) -> Any:
+        """What is found in loops, once for all that follows; by default nothing."""
+        return ()
+
+    @abc.abstractmethod
+    def extinction(self, gathered: Any, task: Any) -> tuple[Float[Array, "tasks samples rays"], Any]:
+        """Extinction a unit length at the samples of slabs, 0 where there is nothing; and what `colors` reads.
+
+        Args:
+            gathered: what `gather` found.
+            task: `field.tasks.SlabTask`, the slabs and where their samples are.
+        """
+
+    @abc.abstractmethod
+    def colors(self, samples: Any, task: Any, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Some of red, green and blue at the samples of slabs; of no meaning where extinction is 0."""
+
+    def no_cotangents(self) -> Any:
+        """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
+        return jax.tree.map(jnp.zeros_like, self)
+
+    def pull(self, total: Total, gathered: Any, task: Any, cotangents: list[Array]) -> tuple[Total, tuple[Array, Array]]:
+        """Cotangents of red, green, blue and extinction at samples, pulled back.
+
+        By default by differentiating `gather`, `extinction` and `colors`.
+
+        Args:
+            total: of the slabs before, see `no_cotangents`.
+
+        Returns:
+            `total` with those of these slabs; and cotangents of the samples' depths (tasks, samples) and of a common factor
+            of all ray coordinates u and v.
+        """
+
+        def optics(medium: Medium, depth: Array, factor: Array) -> list[Array]:
+            moved = dataclasses.replace(task, depth=depth, u=task.u * factor, v=task.v * factor)
+            extinction, samples = medium.extinction(medium.gather(moved), moved)
+            found = [*medium.colors(samples, moved, COLORS), extinction]
+            return [jnp.broadcast_to(value, task.shape) for value in found]
+
+        of_medium, of_depth, of_factor = jax.vjp(optics, self, task.depth, jnp.ones_like(task.depth[0, 0]))[1](cotangents)
+        added = [
+            value if more.dtype == jax.dtypes.float0 else value + more
+            for value, more in zip(jax.tree.leaves(total), jax.tree.leaves(of_medium), strict=True)
+        ]
+        return jax.tree.unflatten(jax.tree.structure(total), added), (of_depth, of_factor)
+
+
+def mixed_extinction(extinctions: list[Float[Array, "..."]]) -> Float[Array, "..."]:
+    """Of all media that share samples: extinctions add up (Kaehler et al. 2007, equation 2)."""
+    total = extinctions[0]
+    for extinction in extinctions[1:]:
+        total = total + extinction
+    return total
+
+
+def mixed_colors(colors: list[list[Float[Array, "..."]]], extinctions: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
+    """Of all media that share samples: colours weigh by extinction, which is exact for constant ones. By medium, then channel."""
+    if len(colors) == 1:
+        return colors[0]
+    total = mixed_extinction(extinctions)
+    inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
+    shares = [extinction * inverse for extinction in extinctions]
+    weighed = [[share * color for color in of_one] for share, of_one in zip(shares, colors, strict=True)]
+    return [mixed_extinction(list(of_channel)) for of_channel in zip(*weighed, strict=True)]

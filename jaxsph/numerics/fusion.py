@@ -1,0 +1,55 @@
+"""Keep XLA from fusing a computation into each of its consumers.
+
+On CPUs XLA fuses cheap-looking producers into every consumer and evaluates them anew in each: shading was computed six times,
+the sphere-against-pyramid test twelve times. `lax.optimization_barrier` is dropped before fusion there. A branch is a
+boundary that fusion respects, so the computation is put behind one that is always taken. On accelerators a branch is a round
+trip to the host, and fusion looks at what it costs: there is no barrier (`numerics.tuning`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+_BARRIERS = contextvars.ContextVar("barriers", default=True)
+
+
+@contextlib.contextmanager
+def barriers(kept: bool) -> Iterator[None]:
+    """Have barriers in what is traced meanwhile, or not."""
+    token = _BARRIERS.set(kept)
+    try:
+        yield
+    finally:
+        _BARRIERS.reset(token)
+
+
+def barriers_kept() -> bool:
+    """Whether what is traced now is worked around XLA's fusion for CPUs."""
+    return _BARRIERS.get()
+
+
+def fusion_barrier(witness: Bool[Array, ""], function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)`, computed once however many consumers it has.
+
+    Args:
+        witness: any scalar that is not known when compiling. Its value does not matter: the branch is taken where the number
+            of its bits is not negative, which holds for true, for false, and thus for comparisons with NaN.
+        function: pure; returns a pytree of arrays.
+    """
+    if not barriers_kept():
+        return function(*arguments)
+    shapes = jax.eval_shape(function, *arguments)
+
+    def nothing(*_: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    always = lax.population_count(jnp.asarray(witness).astype(jnp.int32)) >= 0
+    return lax.cond(always, function, nothing, *arguments)

@@ -1,0 +1,94 @@
+"""What is tuned for a kind of machine, in one place: how much is done at once, and what its compiler is kept from doing.
+
+Flow: [tuning] -> plan -> stages.
+
+No number here changes what an image shows: it is the same bit for bit where kernels round alike, and to rounding anywhere.
+
+On CPUs operands are to stay in the caches, of 1 MB (second level) and some 16 MB (third) a core; kernels are short, and each is
+compiled to machine code of its own, so few of them are wanted. On an accelerator every launch costs a few microseconds whatever
+it does, and each decision of the host a round trip: so batches are as large as memory allows, and nothing is put behind a branch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+from jaxtyping import Array
+
+from jaxsph.numerics.checks import require_sizes
+
+MAX_SHARDS = 4  # a tile has four bundles, so that many divide any band
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """Sizes of batches, for one kind of machine.
+
+    Attributes:
+        samples_at_once: samples along depth, times 64 rays, whose sums are accumulated together.
+        samples_held: those whose light is held before it is composited.
+        bundles_composited: bundles of a layer of slabs that are composited together.
+        half_depths_found: bundles among them whose depths of half transmittance are found together.
+        cells_of_nodes: cells of the lattice whose sums are accumulated together.
+        cells_bounded, cells_probed: cells whose errors are bounded together, and those looked at before.
+        max_sorts: sorts that run side by side.
+        pairs_per_sort: below that, a sort takes less than it costs to have one more.
+        max_shards: shards of a band that run side by side.
+        fusion_barriers: whether fusion is worked around: barriers are real (`numerics.fusion`), and two sums travel as one
+            complex number (`field.sums`).
+    """
+
+    samples_at_once: int
+    samples_held: int
+    bundles_composited: int
+    half_depths_found: int
+    cells_of_nodes: int
+    cells_bounded: int
+    cells_probed: int
+    max_sorts: int
+    pairs_per_sort: int
+    max_shards: int
+    fusion_barriers: bool
+
+    def __post_init__(self) -> None:
+        require_sizes(self)
+
+
+CPU = Tuning(
+    samples_at_once=1 << 10,  # accumulators and operands of a batch stay in the second-level cache
+    samples_held=1 << 15,  # stays in the third-level cache
+    bundles_composited=256,
+    half_depths_found=32,
+    cells_of_nodes=256,
+    cells_bounded=512,  # operands stay in the second-level cache
+    cells_probed=1024,
+    max_sorts=16,  # 16 sorts of 5 M pairs in all took 0.8 of 4, as each stays in the caches
+    pairs_per_sort=1 << 15,
+    max_shards=MAX_SHARDS,  # two threads in one program were 1.1 to 1.3 times as fast as one, two programs side by side 1.9 times
+    fusion_barriers=True,  # without them shading was computed six times, and every weight once for each sum
+)
+ACCELERATOR = Tuning(
+    samples_at_once=1 << 18,  # batches of 64 k slabs of 4 samples
+    samples_held=1 << 20,
+    bundles_composited=1 << 14,
+    half_depths_found=1 << 14,
+    cells_of_nodes=1 << 14,
+    cells_bounded=1 << 14,
+    cells_probed=1 << 16,
+    max_sorts=1,
+    pairs_per_sort=1 << 15,
+    max_shards=1,
+    fusion_barriers=False,
+)
+
+
+def tuning_for(array: Array) -> Tuning:
+    """What suits the device that holds `array`."""
+    return CPU if all(device.platform == "cpu" for device in array.devices()) else ACCELERATOR
+
+
+def shards_at_hand(tuning: Tuning) -> int:
+    """How many shards are run side by side: a power of two, as many as there are cores."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(tuning.max_shards, 1 << (cores.bit_length() - 1))
