@@ -29,9 +29,9 @@ import peers
 import workloads
 
 import jaxsph as js
-from jaxsph.access.slab_windows import SlabWindows, slab_windows_with_borders
 from jaxsph.access.grid import Grid
 from jaxsph.access.ordering import rank_particles
+from jaxsph.access.slab_windows import SlabWindows, slab_windows_with_borders
 from jaxsph.access.view import view_particles
 from jaxsph.cast.march import gather
 from jaxsph.field.schedule import CELL_SAMPLES, full_rate, reference_quantities

@@ -121,8 +121,8 @@ def sequences(found: dict) -> str:
     return f"""## Over sequences
 Frames {", ".join(f"{frame:g}" for frame in sorted({record["frame"] for record in found["records"]}))} of each scene,
 {found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {machine(found)}. `interval` is certified: no
-frame may be over its tolerance. "Rays over" is of the frame with most. Hochstetter et al. 2016 have up to 0.0125 % of rays over it, in 1
-frame of 1200 (its table 3, relaxed).
+frame may be over its tolerance. "Rays over" is of the frame with most. Hochstetter et al. 2016 have up to 0.0125 % of rays over
+it, in 1 frame of 1200 (its table 3, relaxed).
 
 {table(header, rows)}
 """

@@ -4,10 +4,10 @@ A certified pixel is off by no more than its bound, and its bound is within the 
 more than 15 % plus noise; and the analysis takes at most 15 % of the time of casting at full rate.
 
 All contenders render a scene in one process, in turns; compile time is apart. A first frame of each is compared with the image
-at full rate, later ones are timed: grid + adapt + cast. 'paper strict' is the order of Hochstetter et al. 2016 with its strict bounds;
-'paper relaxed' the setting of its results, an estimate; 'certificate' the default; the others are the default with one thing
-changed, and 'independent' breaks the tolerance by design. Writes `results/tolerance.json`; ends in asserts on bounds and, with
---check, on ratios of medians.
+at full rate, later ones are timed: grid + adapt + cast. 'paper strict' is the order of Hochstetter et al. 2016 with its strict
+bounds; 'paper relaxed' the setting of its results, an estimate; 'certificate' the default; the others are the default with one
+thing changed, and 'independent' breaks the tolerance by design. Writes `results/tolerance.json`; ends in asserts on bounds and,
+with --check, on ratios of medians.
 
     python benchmarks/tolerance.py [--repeats 5] [--size 512] [--scenes mixer radial] [--check]
 """

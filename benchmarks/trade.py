@@ -1,9 +1,9 @@
 """Claim: what is certified is never over its tolerance, and what the pilot estimates hardly ever.
 
 `jaxsph.sweep` measures every estimator at every tolerance, coarser sampling and smaller images for five scenes, those of the
-Hochstetter et al. 2016's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is measured on where
-an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are for reading. Most of
-the time is compiling: some three minutes a scene on two busy cores.
+Hochstetter et al. 2016's table 2. A folder of each scene under `results/trade/` holds its figures and the table, which is
+measured on where an earlier run was stopped. Writes `results/trade.json`; ends in asserts on errors and bounds, as times are
+for reading. Most of the time is compiling: some three minutes a scene on two busy cores.
 
     python benchmarks/trade.py [--repeats 3] [--size 512] [--scenes mixer radial] [--particles 50000] [--frames 0 2]
 """

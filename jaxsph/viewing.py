@@ -1,4 +1,4 @@
-"""The first stage of a frame: its particles, other media and transfer function as the camera sees them, in the units of all later stages.
+"""The first stage of a frame: all that is in the scene as the camera sees it, in the units of all later stages.
 
 Flow: scene, camera -> [viewing] -> plan, stages.
 """

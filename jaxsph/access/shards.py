@@ -2,9 +2,9 @@
 
 Flow: grid -> [shards] -> control, cast.
 
-On CPUs XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1 to
-1.3 times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out, and each shard is a run of the same
-program. What a bundle's rays meet does not depend on what it is marched with, so the image is the same bit for bit.
+On CPUs XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1
+to 1.3 times as fast as one, two programs side by side 1.9 times. So the bundles are dealt out, and each shard is a run of the
+same program. What a bundle's rays meet does not depend on what it is marched with, so the image is the same bit for bit.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from jaxsph.field.transposed import COLUMNS
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import COLORS, Medium, mixed_colors, mixed_extinction
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import linear_map
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
@@ -108,8 +108,9 @@ def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayRe
 
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
     grid, camera = _seen(inputs, fixed)
-    media, packets = _media(method, inputs, fixed, Wanted()), method.packets_of(grid, camera)
-    return march(grid, fixed.schedule, packets, media, method.integrator, method.plan, camera.is_perspective)
+    with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
+        media, packets = _media(method, inputs, fixed, Wanted()), method.packets_of(grid, camera)
+        return march(grid, fixed.schedule, packets, media, method.integrator, method.plan, camera.is_perspective)
 
 
 def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
@@ -210,7 +211,8 @@ def _pull(
     start = Accumulated(
         tuple(medium.no_cotangents() for medium in media), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype)
     )
-    found = _pull_batches(batches, media, method.integrator, image, cotangent, start)
+    with barriers(plan.tuning.fusion_barriers):
+        found = _pull_batches(batches, media, method.integrator, image, cotangent, start)
     particles, *others = found.media
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)

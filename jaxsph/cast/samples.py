@@ -2,8 +2,8 @@
 
 Flow: media -> [samples] -> composite.
 
-In a slab a sample adds its colour times the light it takes away, $t_{k-1} - t_k$: however thin the samples, colours then add up to
-the alpha that is lost. And $t_k$ is the exponential of the thickness up to there: one rounding, where a product would round
+In a slab a sample adds its colour times the light it takes away, $t_{k-1} - t_k$: however thin the samples, colours then add up
+to the alpha that is lost. And $t_k$ is the exponential of the thickness up to there: one rounding, where a product would round
 at every sample, and always the same way in a uniform medium.
 
 In few passes over memory: two colours travel as one complex number, such that XLA makes one kernel of them, and per sample only

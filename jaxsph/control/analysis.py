@@ -2,8 +2,8 @@
 
 Flow: cells -> probe -> [analysis: bounds -> errors] -> levels -> merge -> cast -> image.
 
-SlabWindows are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So promising
-cells can be taken in any order: fullest first, some at a time, wherever they are.
+SlabWindows are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So
+promising cells can be taken in any order: fullest first, some at a time, wherever they are.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ Flow: cells -> [bounds] -> errors -> levels -> merge -> cast -> image.
 
 CSPH values are affine combinations of the quantities of the particles whose supports hold the sample, so the least and the
 greatest quantity among the particles whose spheres meet a *sample slab* (the footprint of the bundle, between two borders of
-fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border (Hochstetter et al.
-2016, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its sub-rectangles lies
-inside the support of a single particle; in any other, a sample may be empty.
+fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border
+(Hochstetter et al. 2016, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its
+sub-rectangles lies inside the support of a single particle; in any other, a sample may be empty.
 
 Why the bounds hold in floating point: a sphere counts as meeting the slab with its `reach`, outside which computed weights are
 zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle

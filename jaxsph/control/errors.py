@@ -1,4 +1,4 @@
-r"""How much a cell's light can change when it is sampled more coarsely: Hochstetter et al. 2016, sections 4.2 and 5, in additive form.
+r"""How much a cell's light can change when it is sampled more coarsely: Hochstetter et al. 2016, sections 4.2, 5, made additive.
 
 Flow: bounds -> [errors] -> levels -> merge -> cast -> image.
 

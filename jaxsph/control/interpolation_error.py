@@ -1,18 +1,18 @@
 r"""How wrong light would be if slabs were interpolated from the lattice: by the lattice's own fourth differences.
 
-Flow: lattice -> [interpolation_error] -> pilot -> worklist.
+Flow: lattice -> [interpolation_error] -> pilot -> schedule.
 
 A cubic through four nodes errs by at most 3/128 of a fourth difference, about the middle between two nodes. So the lattice
 tells how well it can be interpolated: fourth differences of $\sum q V W - Q \sum V W$ over $\sum V W$ are the error of Q, to
-first order. It is a residual of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab,
-its effect on light that times the mean square slope of the transfer function over the quantities met, and slabs' variances
-add up along a bundle. Errors stay correlation_length for about as far as nodes are apart, across or in depth, whatever lies nearer: samples
-within count as one. Narrow bands need no rule of their own: it is sums that are interpolated, not light, and where Q meets a
-steep part, its mean square slope is large; a jump is never interpolated over.
+first order. It is of no known sign, so it is treated as noise: its variance is the mean over the nodes of a slab, its effect on
+light that times the mean square slope of the transfer function over the quantities met, and slabs' variances add up along a
+bundle. Errors are correlated over about as far as nodes are apart, across or in depth, whatever lies nearer: samples within count
+as one. Narrow bands need no rule of their own: it is sums that are interpolated, not light, and where Q meets a steep part, its
+mean square slope is large; a jump is never interpolated over.
 
-A slab that is marched at `worklist.SUBSAMPLE` of its rays errs across only, and by `SUBSAMPLE_VARIANCE` of that variance: these rays are up to
-three pixels apart, and where a kernel's third derivative jumps, errors fall with the third power of the distance. The share was
-measured, not derived.
+A slab that is marched at `schedule.SUBSAMPLE` of its rays errs across only, and by `SUBSAMPLED_SHARE` of that variance: these
+rays are up to three pixels apart, and where a kernel's third derivative jumps, errors fall with the third power of the distance.
+The share was measured, not derived (`benchmarks/calibrate.py`).
 
 The a-posteriori error of Kratz et al. 2011 (section 4) takes the same view of a finite element: the residual of the next order,
 weighted.
@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.access.grid import Grid
-from jaxsph.control.slopes import mean_square_slope, squared_slopes
+from jaxsph.control.slopes import SquaredSlopes, mean_square_slope, squared_slopes
 from jaxsph.control.spacing import second_differences
 from jaxsph.field.lattice import GAP, REACH, Lattice
 from jaxsph.model.camera import Camera
@@ -39,11 +40,9 @@ from jaxsph.numerics.fusion import fusion_barrier
 
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
-LEAST = 8  # eps: what interpolated samples differ by, at least
-SUBSAMPLE_VARIANCE = (
-    0.1  # of the variance across, between rays of `SUBSAMPLE`: 0.04 to 0.13 in the median over slabs, 0.31 in nine of ten
-)
-SMALLEST = 1 / 64  # share of the variance that is across, at least
+MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
+SUBSAMPLED_SHARE = 0.1  # of the variance across, what is left between rays of `SUBSAMPLE`
+MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
 Combine = Callable[[Array, Array], Array]
 
 
@@ -62,105 +61,225 @@ class InterpolationError:
     bend: Float[Array, "slabs bundles"]
 
 
-jax.tree_util.register_dataclass(InterpolationError, data_fields=["variance", "subsampled_share", "bend"], meta_fields=[])
+class AtNodes(NamedTuple):
+    """What the nodes of some layers tell; of one, without the first axis.
+
+    Attributes:
+        variance: of Q between nodes: that of one sample, times how many in a row err as one. Infinite where the sum of weights
+            is not clear of zero.
+        across: the part of it that is across.
+        quantity: Q.
+        red, green, blue, extinction: its optics.
+    """
+
+    variance: Float[Array, "layers nodes"]
+    across: Float[Array, "layers nodes"]
+    quantity: Float[Array, "layers nodes"]
+    red: Float[Array, "layers nodes"]
+    green: Float[Array, "layers nodes"]
+    blue: Float[Array, "layers nodes"]
+    extinction: Float[Array, "layers nodes"]
+
+
+class Sweep(NamedTuple):
+    """What a slab takes over from the one before it, at the nodes of a layer.
+
+    Attributes:
+        tau: optical thickness in front.
+        light: what reaches the eye from a unit of length, one layer before, see `spacing.second_differences`.
+        first: the slab's first layer.
+    """
+
+    tau: Float[Array, " nodes"]
+    light: Float[Array, "4 nodes"]
+    first: AtNodes
+
+
+class OfBundles(NamedTuple):
+    """A slab's nodes, pooled over each bundle.
+
+    Attributes:
+        deviation: root mean square error of Q.
+        share: see `InterpolationError.subsampled_share`.
+        low, high: least and greatest Q.
+        front: most of the light that is let through in front.
+        taken: most of what the slab takes of it.
+    """
+
+    deviation: Float[Array, "rows columns"]
+    share: Float[Array, "rows columns"]
+    low: Float[Array, "rows columns"]
+    high: Float[Array, "rows columns"]
+    front: Float[Array, "rows columns"]
+    taken: Float[Array, "rows columns"]
 
 
 def interpolation_error(
     grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int
 ) -> InterpolationError:
-    """InterpolationError of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
+    """Of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
 
     def nothing() -> InterpolationError:
         shape, dtype = grid.windows.count.shape, lattice.weight.dtype
         return InterpolationError(
-            jnp.full(shape, jnp.inf, dtype), jnp.full(shape, SUBSAMPLE_VARIANCE, dtype), jnp.zeros(shape, dtype)
+            jnp.full(shape, jnp.inf, dtype), jnp.full(shape, SUBSAMPLED_SHARE, dtype), jnp.zeros(shape, dtype)
         )
 
-    found = functools.partial(_residuals, grid, lattice, camera, transfer, slab_samples)
+    found = functools.partial(_swept, grid, lattice, camera, transfer, slab_samples)
     return lax.cond((lattice.evaluations > 0).any(), found, nothing)
 
 
-def _residuals(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> InterpolationError:
-    """Slab by slab from front to back, such that what is at hand stays in the cache.
+@dataclasses.dataclass(frozen=True)
+class _Nodes:
+    """The lattice in memory, and what all slabs of a band are judged by.
 
-    Infinite variance where a cubic may take nodes beyond the lattice: at its first and last slabs, rows and columns.
+    Attributes:
+        path: path length of the nodes' rays a unit of depth, longest of each bundle as `longest`.
+        edges: depths of layers.
+        within: layers of a slab.
+        pixel: size of a pixel at depth 1 (perspective) or any depth.
     """
-    slabs = grid.windows.count.shape[0]
-    region, nodes = lattice.region, lattice.region.spacing
-    within = slab_samples // nodes.samples
-    down, across = (side - GAP for side in lattice.weight.shape[1:])
-    rows, columns = region.rows, region.columns
-    layer = (down + GAP) * (across + GAP)
-    weight, weighted = (value.ravel() for value in (lattice.weight, *lattice.weighted))
-    segments, squares = transfer.segments(), squared_slopes(transfer)
-    path = _slant(lattice, camera, down + GAP, across + GAP).ravel()
-    pooled = functools.partial(_pooled, down=down, across=across, of_bundle=nodes.across)
-    longest = pooled(path, jnp.maximum)
 
-    at_nodes = functools.partial(_at_nodes, across=across + GAP, layer=layer, node_samples=nodes.samples)
-    pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
+    weight: Float[Array, " nodes"]
+    weighted: Float[Array, " nodes"]
+    lattice: Lattice
+    segments: Segments
+    squares: SquaredSlopes
+    path: Float[Array, " nodes"]
+    longest: Float[Array, "rows columns"]
+    edges: Float[Array, " layers"]
+    pixel: Float[Array, ""]
+    within: int
+    perspective: bool
 
-    def one_slab(state: tuple[Array, ...], slab: Array) -> tuple[tuple[Array, ...], tuple[Array, Array, Array]]:
-        before, previous, *first = state
-        begin, number = (slab * within + 1) * layer, (within + 2 * REACH) * layer
-        near = [lax.dynamic_slice_in_dim(value, begin, number) for value in (weight, weighted)]
-        border = lax.dynamic_slice(edges, (slab * within,), (within + 1,))
-        spacing = nodes.pixels * pixel * (border[-1] if camera.is_perspective else 1)
-        correlation_length = jnp.maximum(
-            slab_samples * spacing / (border[-1] - border[0]), 1
-        )  # samples in a row that err correlation_length across
-        new = fusion_barrier(slab >= 0, at_nodes, *near, lattice.reference_quantity, segments, correlation_length)
-        spread, lateral, quantity, *colors, extinction = ([a, *b] for a, b in zip(first, new, strict=True))
-        absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * path
+    @property
+    def down_across(self) -> tuple[int, int]:
+        """Nodes of a layer, without the gap."""
+        rows, columns = self.lattice.weight.shape[1:]
+        return rows - GAP, columns - GAP
 
-        def of_bundles(
-            spread: list[Array], lateral: list[Array], quantity: list[Array], before: Array, absorbed: Array
-        ) -> tuple[Array, ...]:
-            def pool(layers: list[Array], combine: Combine) -> Array:
-                return pooled(functools.reduce(combine, layers), combine)
+    @property
+    def layer(self) -> int:
+        """How far apart in memory neighbours in depth are."""
+        _, rows, columns = self.lattice.weight.shape
+        return rows * columns
 
-            total, across = pool(spread, jnp.add), pool(lateral, jnp.add)
-            deviation = jnp.sqrt(total / ((within + 1) * (nodes.across + 1) ** 2))
-            share = SUBSAMPLE_VARIANCE * jnp.clip(across / jnp.where(total > 0, total, 1), SMALLEST, 1)
-            front, taken = jnp.exp(-pool([before], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
-            return deviation, share, pool(quantity, jnp.minimum), pool(quantity, jnp.maximum), front, taken
+    def pooled(self, value: Float[Array, " nodes"], combine: Combine) -> Float[Array, "rows columns"]:
+        """Nodes of a layer combined over each bundle."""
+        down, across = self.down_across
+        return _pooled(value, combine, down=down, across=across, of_bundle=self.lattice.region.spacing.across)
 
-        pieces = spread, lateral, quantity, before, absorbed
-        deviation, share, low, high, front, taken = fusion_barrier(slab >= 0, of_bundles, *pieces)
-        around = 2 * deviation / jnp.sqrt(correlation_length)
-        *of_colors, of_extinction = mean_square_slope(squares, low - around, high + around)
-        length = (border[-1] - border[0]) * longest
-        # what errs correlation_length is in the deviation; the rest is independent: a sum grows by the root of its number, a mean falls so
-        light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
-        step = (border[1:] - border[:-1])[:, None] * path
-        bend, previous = fusion_barrier(slab >= 0, second_differences, colors, extinction, step, before, previous)
-        bend = jnp.sqrt(pooled(bend**2, jnp.add)) / (nodes.across + 1)
-        variance = front**2 * deviation**2 * light / slab_samples
-        return (before + absorbed, previous, *(layers[-1] for layers in new)), (variance, share, bend)
+    def judge(self, sweep: Sweep, slab: Array) -> tuple[Sweep, tuple[Array, Array, Array]]:
+        """Variance, share and bend of a slab, (rows, columns); and what the next takes over."""
+        spacing, within, always = self.lattice.region.spacing, self.within, slab >= 0
+        begin, number = (slab * within + 1) * self.layer, (within + 2 * REACH) * self.layer
+        near = [lax.dynamic_slice_in_dim(value, begin, number) for value in (self.weight, self.weighted)]
+        border = lax.dynamic_slice(self.edges, (slab * within,), (within + 1,))
+        slab_samples = within * spacing.samples
+        node_distance = spacing.pixels * self.pixel * (border[-1] if self.perspective else 1)
+        correlated = jnp.maximum(slab_samples * node_distance / (border[-1] - border[0]), 1)
+        at_nodes = functools.partial(
+            _at_nodes, columns=self.lattice.weight.shape[2], layer=self.layer, node_samples=spacing.samples
+        )
+        new: AtNodes = fusion_barrier(always, at_nodes, *near, self.lattice.reference_quantity, self.segments, correlated)
+        layers = AtNodes(*([a, *b] for a, b in zip(sweep.first, new, strict=True)))  # type: ignore[arg-type]
+        absorbed = sum(layers.extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * self.path
+        pieces = list(layers.variance), list(layers.across), list(layers.quantity), sweep.tau, absorbed
+        pool = functools.partial(_of_bundles, self.pooled, (within + 1) * (spacing.across + 1) ** 2)
+        bundle: OfBundles = fusion_barrier(always, pool, *pieces)
+        variance = self._variance(bundle, correlated, (border[-1] - border[0]) * self.longest) / slab_samples
+        colors, step = [list(layers.red), list(layers.green), list(layers.blue)], (border[1:] - border[:-1])[:, None] * self.path
+        bends = fusion_barrier(always, second_differences, colors, list(layers.extinction), step, sweep.tau, sweep.light)
+        bend = jnp.sqrt(self.pooled(bends[0] ** 2, jnp.add)) / (spacing.across + 1)
+        after = Sweep(sweep.tau + absorbed, bends[1], AtNodes(*(value[-1] for value in new)))
+        return after, (variance, bundle.share, bend)
 
-    # one more border than there are samples, and layers past the last
-    last = grid.half_steps.shape[0] - 1
-    edges = grid.half_steps[jnp.minimum(2 * nodes.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
+    def _variance(self, bundle: OfBundles, correlated: Array, length: Array) -> Float[Array, "rows columns"]:
+        """Of a slab's light, times its samples.
+
+        Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
+        falls so.
+        """
+        around = 2 * bundle.deviation / jnp.sqrt(correlated)
+        *of_colors, of_extinction = mean_square_slope(self.squares, bundle.low - around, bundle.high + around)
+        light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * bundle.taken**2
+        return bundle.front**2 * bundle.deviation**2 * light
+
+    def skip(self, sweep: Sweep, _: Array) -> tuple[Sweep, tuple[Array, Array, Array]]:
+        """An empty slab before an empty one."""
+        nothing = jnp.zeros_like(self.longest)
+        still = jax.tree.map(jnp.zeros_like, sweep)
+        return still._replace(tau=sweep.tau), (nothing, nothing + SUBSAMPLED_SHARE, nothing)
+
+
+def _swept(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> InterpolationError:
+    """Slab by slab from front to back, such that what is at hand stays in the cache."""
+    nodes = _nodes(grid, lattice, camera, transfer, slab_samples)
+    slabs, path = grid.windows.count.shape[0], nodes.path
     # the first layer counts as empty: its slab is not interpolated anyway
-    start = jnp.zeros_like(path), jnp.zeros((4, *path.shape), path.dtype), *([jnp.zeros_like(path)] * 7)
-
-    def skip(state: tuple[Array, ...], _: Array) -> tuple[tuple[Array, ...], tuple[Array, Array, Array]]:
-        nothing = jnp.zeros((rows, columns), path.dtype)
-        return (state[0], *(jnp.zeros_like(value) for value in state[1:])), (nothing, nothing + SUBSAMPLE_VARIANCE, nothing)
-
+    nothing = jnp.zeros_like(path)
+    start = Sweep(nothing, jnp.zeros((4, *path.shape), path.dtype), AtNodes(*[nothing] * len(AtNodes._fields)))
     filled = jnp.append((grid.windows.count > 0).any(1), False)
     judged = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
     each = jnp.arange(slabs, dtype=jnp.int32), judged
-    _, (variance, share, bend) = lax.scan(lambda state, x: lax.cond(x[1], one_slab, skip, state, x[0]), start, each)
-    variance += (LEAST * jnp.finfo(variance.dtype).eps) ** 2
-    slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (slabs, rows, columns))
-    spared = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // nodes.samples)
-    past = -(-2 // nodes.across)  # bundles at the far sides from which a cubic takes nodes beyond
-    spared = spared[:, None, None] & ((row > 0) & (row < rows - past))[:, None] & ((column > 0) & (column < columns - past))
-    row, column, inside = region.place(grid)
-    at = jnp.where(inside, row * columns + column, 0)
-    variance, share, bend = (value.reshape(slabs, -1)[:, at] for value in (jnp.where(spared, variance, jnp.inf), share, bend))
+    found = lax.scan(lambda sweep, x: lax.cond(x[1], nodes.judge, nodes.skip, sweep, x[0]), start, each)[1]
+    variance, share, bend = found
+    variance += (MIN_DEVIATION * jnp.finfo(variance.dtype).eps) ** 2
+    return _of_grid(grid, lattice, nodes.within, jnp.where(_spared(grid, lattice, nodes.within), variance, jnp.inf), share, bend)
+
+
+def _nodes(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> _Nodes:
+    spacing, slabs = lattice.region.spacing, grid.windows.count.shape[0]
+    rows, columns = lattice.weight.shape[1:]
+    within = slab_samples // spacing.samples
+    weight, weighted = (value.ravel() for value in (lattice.weight, *lattice.weighted))
+    path = _slant(lattice, camera, rows, columns).ravel()
+    longest = _pooled(path, jnp.maximum, down=rows - GAP, across=columns - GAP, of_bundle=spacing.across)
+    # one more border than there are samples, and layers past the last
+    last = grid.half_steps.shape[0] - 1
+    edges = grid.half_steps[jnp.minimum(2 * spacing.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
+    pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
+    tables = transfer.segments(), squared_slopes(transfer)
+    return _Nodes(weight, weighted, lattice, *tables, path, longest, edges, pixel, within, camera.is_perspective)
+
+
+def _spared(grid: Grid, lattice: Lattice, within: int) -> Array:
+    """Slabs (slabs, rows, columns) whose cubics take no nodes beyond the lattice: not the first, nor the last."""
+    region, spacing = lattice.region, lattice.region.spacing
+    slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (grid.windows.count.shape[0], region.rows, region.columns))
+    inside = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // spacing.samples)
+    past = -(-2 // spacing.across)  # bundles at the far sides from which a cubic takes nodes beyond
+    inside_rows, inside_columns = (row > 0) & (row < region.rows - past), (column > 0) & (column < region.columns - past)
+    return inside[:, None, None] & inside_rows[:, None] & inside_columns
+
+
+def _of_grid(grid: Grid, lattice: Lattice, within: int, variance: Array, share: Array, bend: Array) -> InterpolationError:
+    """From the bundles of a region (slabs, rows, columns) to those of a grid; infinite variance elsewhere."""
+    row, column, inside = lattice.region.place(grid)
+    at = jnp.where(inside, row * lattice.region.columns + column, 0)
+    variance, share, bend = (value.reshape(value.shape[0], -1)[:, at] for value in (variance, share, bend))
     return InterpolationError(jnp.where(inside, variance, jnp.inf), share, bend)
+
+
+def _of_bundles(
+    pooled: Callable[[Array, Combine], Array],
+    number: int,
+    variance: list[Array],
+    across: list[Array],
+    quantity: list[Array],
+    tau: Array,
+    absorbed: Array,
+) -> OfBundles:
+    """The nodes of a slab's layers, those of the next slab's first among them, pooled over bundles of `number` nodes."""
+
+    def pool(layers: Sequence[Array], combine: Combine) -> Array:
+        return pooled(functools.reduce(combine, layers), combine)
+
+    total, lateral = pool(variance, jnp.add), pool(across, jnp.add)
+    deviation = jnp.sqrt(total / number)
+    share = SUBSAMPLED_SHARE * jnp.clip(lateral / jnp.where(total > 0, total, 1), MIN_ACROSS, 1)
+    front, taken = jnp.exp(-pool([tau], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
+    return OfBundles(deviation, share, pool(quantity, jnp.minimum), pool(quantity, jnp.maximum), front, taken)
 
 
 def _at_nodes(
@@ -168,21 +287,18 @@ def _at_nodes(
     weighted: Array,
     reference_quantity: Array,
     segments: Segments,
-    correlation_length: Array,
+    correlated: Array,
     *,
-    across: int,
+    columns: int,
     layer: int,
     node_samples: int,
-) -> tuple[Array, ...]:
-    """Variance of Q between nodes, its part across, Q, and its optics: (layers, nodes of a layer), but `REACH` on either side.
-
-    The variance is that of one sample times how many in a row err correlation_length; infinite where the sum of weights is not clear of zero.
+) -> AtNodes:
+    """What nodes in a row tell, without `REACH` layers on either side.
 
     Args:
-        correlation_length: how many samples in a row err correlation_length across.
-        weight, weighted: sums at nodes in a row.
-        across, layer: how far apart in memory neighbours are down and in depth.
-        node_samples: fine samples from one layer to the next.
+        correlated: how many samples in a row err as one across.
+        columns, layer: how far apart in memory neighbours are down and in depth.
+        node_samples: fine samples from one layer to the next, that err as one in depth.
     """
     number = weight.shape[0] - 2 * REACH * layer
 
@@ -197,19 +313,20 @@ def _at_nodes(
     inside = here > 0
     inverse = jnp.where(inside, 1 / jnp.where(inside, here, 1), 0)
     ratio = shifted(weighted, 0) * inverse
-    spread, lateral, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio), jnp.zeros_like(ratio)
-    for stride in (1, across, layer):
-        lateral = spread
+    variance, across, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio), jnp.zeros_like(ratio)
+    for stride in (1, columns, layer):
+        across = variance
         of_weight = fourth(weight, stride)
         unsure += CUBIC * jnp.abs(of_weight)
         error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
-        spread += (node_samples if stride == layer else correlation_length) * error
-    spread, lateral = jnp.where(inside & (here > MIN_CLEARANCE * unsure), spread * inverse**2, jnp.inf), lateral * inverse**2
+        variance += (node_samples if stride == layer else correlated) * error
+    clear = inside & (here > MIN_CLEARANCE * unsure)
+    variance, across = jnp.where(clear, variance * inverse**2, jnp.inf), across * inverse**2
     quantity = reference_quantity + ratio
-    place = fusion_barrier(correlation_length > 0, find, segments, quantity)
+    place = fusion_barrier(correlated > 0, find, segments, quantity)
     *colors, extinction = read(segments, place)
-    found = spread, lateral, quantity, *colors, jnp.where(inside, extinction, 0)
-    return tuple(value.reshape(-1, layer) for value in found)
+    found = variance, across, quantity, *colors, jnp.where(inside, extinction, 0)
+    return AtNodes(*(value.reshape(-1, layer) for value in found))
 
 
 def _slant(lattice: Lattice, camera: Camera, down: int, across: int) -> Array:
@@ -231,3 +348,6 @@ def _pooled(
         number = value.shape[0] - of_bundle * stride
         value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(of_bundle + 1)))
     return value[: down * (across + GAP)].reshape(down, -1)[::of_bundle, :across:of_bundle]
+
+
+jax.tree_util.register_dataclass(InterpolationError, data_fields=["variance", "subsampled_share", "bend"], meta_fields=[])

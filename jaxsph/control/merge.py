@@ -3,9 +3,9 @@
 Flow: levels -> [merge] -> worklist -> cast -> image.
 
 A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
-one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as it fits
-into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of them
-allow it. A cell whose neighbours do not falls back to the last level that fits, which costs the same and errs less.
+one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as
+it fits into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of
+them allow it. A cell whose neighbours do not falls back to the last level that fits, which costs the same and errs less.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ r"""The pilot estimator: which slabs are interpolated, from the lattice or betwe
 Flow: lattice -> interpolation_error -> [pilot] -> worklist -> cast -> image.
 
 Errors are treated as noise whose variances add up along a bundle, and `DEVIATIONS` standard deviations are the estimate: not a
-bound. The budget goes to interpolation first (`interpolation_error`): wherever it is taken, the price of an evaluation saved is the same.
-What that leaves is spent on wider spaced samples (`spacing`).
+bound. The budget goes to interpolation first (`interpolation_error`): wherever it is taken, the price of an evaluation saved is
+the same. What that leaves is spent on wider spaced samples (`spacing`).
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def pilot(
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """Choose the slabs that are interpolated: as many evaluations saved as the tolerance allows.
 
-    A slab is interpolated from the lattice, marched at `SUBSAMPLE` of its rays, or marched at all. At all are those whose stencils
-    leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice.
+    A slab is interpolated from the lattice, marched at `SUBSAMPLE` of its rays, or marched at all. At all are those whose
+    stencils leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice.
 
     Returns:
         The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is

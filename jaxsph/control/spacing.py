@@ -5,7 +5,8 @@ Flow: interpolation_error -> [spacing] -> worklist -> cast.
 Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
 for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean, and twice w also resolves a kink of g that much worse. The nodes
 of the lattice know g, thus their second differences along a ray, so that is known without any sample more. They are taken at
-the nodes only and the rays between may meet a kink that those miss: `DEVIATION_PER_BEND` times their root mean square is one deviation.
+the nodes only and the rays between may meet a kink that those miss: `DEVIATION_PER_BEND` times their root mean square is one
+deviation.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class ParticleMedium(Medium):
     segments: Segments
     lattice: Lattice | None
     kernel: str
-    wanted: Wanted = Wanted()
+    wanted: Wanted
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Slabs that have any particle."""

@@ -106,6 +106,9 @@ def write_image(path: str | os.PathLike[str], image: Image) -> None:
     _image_format(file).write(file, image)
 
 
+Image.writer = staticmethod(write_image)
+
+
 def read_image(path: str | os.PathLike[str]) -> Image:
     """Read an image that `write_image` wrote. Layers that the file does not hold are NaN.
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -45,6 +46,9 @@ class Image:
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
 
+    writer: ClassVar[Callable[[str | os.PathLike[str], Image], None]]
+    """How images become files: given by `jaxsph.io`, which knows the formats."""
+
     @property
     def alpha(self) -> Float[Array, "height width"]:
         """Opacity, `1 - transmittance`."""
@@ -57,9 +61,7 @@ class Image:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`: `.exr` (all layers) or `.png` (colour over black). See `jaxsph.io.write_image`."""
-        from jaxsph.io import write_image
-
-        write_image(path, self)
+        type(self).writer(path, self)
 
     def to_uint8(self) -> np.ndarray:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""
