@@ -23,7 +23,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.tuning import CPU, Tuning
+from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
 
 LARGEST_CAPACITY = 1 << 30
 MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
@@ -162,7 +162,7 @@ class FrameShape:
         num_classes: classes of support.
         headroom: factor that the number of particles may yet grow by within those entries, and pairs with it.
         number: bytes of a number.
-        tuning: for the device that holds the particles.
+        tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
     """
 
     width: int
@@ -173,6 +173,7 @@ class FrameShape:
     headroom: float
     number: int
     tuning: Tuning = CPU
+    memory: int = MEMORY
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
@@ -190,17 +191,18 @@ def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: C
         ValueError: when even a band of one row of tiles exceeds `settings.memory_limit`.
     """
     tile_rows, bands = -(-shape.height // TILE), 1
+    limit = settings.memory_limit or shape.memory
     while True:
         made = _in_bands(measures, shape, settings, choices, bands)
         slabs = made.lists.num_bundles * -(-shape.samples // choices.slab_samples)
-        fits = made.bytes <= settings.memory_limit and made.lists.list_capacity <= LARGEST_CAPACITY and slabs < MAX_SLABS
+        fits = made.bytes <= limit and made.lists.list_capacity <= LARGEST_CAPACITY and slabs < MAX_SLABS
         if fits:
             return made
         if made.lists.tile_rows == 1:
             break
         bands = min(2 * bands, tile_rows)
     raise ValueError(
-        f"`memory_limit` = {settings.memory_limit} bytes is too little: one band of {TILE} pixel rows needs "
+        f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs "
         f"about {made.bytes} bytes; raise the limit, or lower the image width, the samples or the number of particles"
     )
 

@@ -26,7 +26,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import light
-from jaxsph.numerics.tuning import tuning_for
+from jaxsph.numerics.tuning import Tuning, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class, require_controllable
 from jaxsph.viewing import Seen, view_scene
 
@@ -41,6 +41,7 @@ def plan(
     *,
     like: Plan | None = None,
     slab_samples: int | None = None,
+    tuning: Tuning | None = None,
 ) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
@@ -50,6 +51,7 @@ def plan(
             what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
         slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
             support is in samples.
+        tuning: of another kind of machine than holds the particles (`jaxsph.numerics.tuning`), to compile for it or to compare.
 
     Raises:
         ValueError: under a trace; when even a band of one row of tiles exceeds `settings.memory_limit`; where `like` is for
@@ -60,6 +62,8 @@ def plan(
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     require_controllable(scene, settings)
     shape = dataclasses.replace(shape_of(scene.particles, camera, settings), headroom=1.0)
+    if tuning is not None:
+        shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
@@ -102,7 +106,7 @@ class Plans:
         measures = measure(seen.viewed, camera, shape.samples)
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
-        made = self._recalled(needed, settings) or fitted(measures, shape, settings, choices)
+        made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)
         self._keep(made)
         run.mark("plan")
         return made, seen
@@ -128,7 +132,7 @@ class Plans:
         headroom = shape.headroom * capacity / shape.num_particles
         return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
 
-    def _recalled(self, needed: Plan, settings: Settings) -> Plan | None:
+    def _recalled(self, needed: Plan, shape: FrameShape, settings: Settings) -> Plan | None:
         """The smallest kept plan that has room for what is needed, and not much more."""
         fits = [
             kept
@@ -136,7 +140,7 @@ class Plans:
             if kept.control == needed.control
             and kept.serves(needed)
             and kept.is_near(needed)
-            and kept.bytes <= settings.memory_limit
+            and kept.bytes <= (settings.memory_limit or shape.memory)
         ]
         return min(fits, key=lambda kept: kept.lists.list_capacity, default=None)
 
@@ -156,7 +160,7 @@ def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameS
     number = np.dtype(particles.dtype).itemsize
     size = camera.width, camera.height, settings.samples
     classes = _num_classes(np.asarray(particles.support)[valid])
-    return FrameShape(*size, capacity, classes, headroom, number, tuning_for(particles.support))
+    return FrameShape(*size, capacity, classes, headroom, number, tuning_for(particles.support), memory_for(particles.support))
 
 
 def _num_classes(support: Any) -> int:

@@ -27,16 +27,23 @@ Carry = TypeVar("Carry")
 
 @dataclasses.dataclass(frozen=True)
 class Together:
-    """How many packets of a layer are composited together, and for how many of them half depths are found together."""
+    """What is composited together.
+
+    Attributes:
+        packets: of a layer.
+        half_depths: packets among them whose half depths are found together.
+        whole: whether that is all of any layer.
+    """
 
     packets: int
     half_depths: int
+    whole: bool
 
     @classmethod
     def of(cls, packets: int, tuning: Tuning) -> Together:
         """No more than there are."""
         together = min(tuning.bundles_composited, packets)
-        return cls(together, min(tuning.half_depths_found, together))
+        return cls(together, min(tuning.half_depths_found, together), together == packets)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +99,8 @@ def over_layers(
             inside = place < past
             return put(carry, jnp.where(inside, place, 0), inside, packet + nth * together.packets)
 
+        if together.whole:
+            return put_some(jnp.int32(0), carry)
         return lax.fori_loop(0, (past - begin + together.packets - 1) // together.packets, put_some, carry)
 
     top = (starts <= batch.first).sum(dtype=jnp.int32) - 1
@@ -146,6 +155,8 @@ def _with_half_depth(
 ) -> Float[Array, "packets rays"]:
     """`depth` of rays, found for a few packets at a time of those where any ray has crossed one half: others cost nothing."""
     number = crossed.shape[0]
+    if together >= number:
+        return _half_depth(rays.depth, crossed, rays.transmittance, thickness, slot, border)
     some = crossed.any(1)
     packets = lax.sort(jnp.where(some, jnp.arange(number, dtype=jnp.int32), number))
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from jaxsph.model.registry import INTEGRATORS, SCREENS
 
-GIBIBYTE = 1 << 30
 ESTIMATORS = ("interval", "pilot")
 ALLOCATIONS = ("budget", "greedy", "paper", "independent")
 
@@ -36,7 +35,8 @@ class Settings:
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
             (Hochstetter et al. 2016, section 2.2).
         screen: which rays are cast; `"pixels"` gives every pixel its own.
-        memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it.
+        memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it. None is 4 GiB, or
+            half of an accelerator's memory.
     """
 
     samples: int = 256
@@ -48,7 +48,7 @@ class Settings:
     allocation: str = "budget"
     integrator: str = "samples"
     screen: str = "pixels"
-    memory_limit: int = 4 * GIBIBYTE
+    memory_limit: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
@@ -66,7 +66,7 @@ class Settings:
         for name, known in (("integrator", INTEGRATORS), ("screen", SCREENS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
-        if not self.memory_limit > 0:
+        if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
 

@@ -69,23 +69,31 @@ CPU = Tuning(
     fusion_barriers=True,  # without them shading was computed six times, and every weight once for each sum
 )
 ACCELERATOR = Tuning(
-    samples_at_once=1 << 18,  # batches of 64 k slabs of 4 samples
+    samples_at_once=1 << 20,  # some 60 M samples a kernel: 2,400 launches for a frame of 1 M particles, of 694,000
     samples_held=1 << 20,
-    bundles_composited=1 << 14,
-    half_depths_found=1 << 14,
+    bundles_composited=1 << 16,  # a layer of 2048 x 2048 pixels
+    half_depths_found=1 << 16,
     cells_of_nodes=1 << 14,
     cells_bounded=1 << 14,
-    cells_probed=1 << 16,
+    cells_probed=1 << 14,
     max_sorts=1,
     pairs_per_sort=1 << 15,
     max_shards=1,
     fusion_barriers=False,
 )
+MEMORY = 4 << 30  # bytes that a frame's working arrays may take where the machine is shared with others
+SHARE_OF_DEVICE = 0.5  # of an accelerator's memory, the same
 
 
 def tuning_for(array: Array) -> Tuning:
     """What suits the device that holds `array`."""
     return CPU if all(device.platform == "cpu" for device in array.devices()) else ACCELERATOR
+
+
+def memory_for(array: Array) -> int:
+    """Bytes that a frame may take on the device that holds `array`: `MEMORY` on CPUs, else a share of what it has."""
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in array.devices() if device.platform != "cpu"]
+    return min((int(SHARE_OF_DEVICE * limit) for limit in limits if limit), default=MEMORY)
 
 
 def shards_at_hand(tuning: Tuning) -> int:
