@@ -1,0 +1,166 @@
+"""docs/extending.md keeps its word: what it adds, a file each, works as it stands, and is differentiable."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model import registry
+
+PAGE = (Path(__file__).parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
+FILES = {re.match(r"# (\w+)\.py\n", block)[1]: block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)}
+ENTRIES = re.findall(r'`(INTEGRATORS|SCREENS)\["(\w+)"\] = "jaxsph\.\w+\.(\w+:\w+)"`', PAGE)
+CENTRE, RADIUS, DENSITY, COLOR = (0.1, -0.05, 0.0), 0.6, 1.5, (0.2, 0.5, 0.9)
+
+
+@pytest.fixture
+def added(tmp_path, monkeypatch):
+    """The page's files, where they can be imported, and its entries in the registry."""
+    for name, code in FILES.items():
+        (tmp_path / f"{name}.py").write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    for table, name, place in ENTRIES:
+        monkeypatch.setitem(getattr(registry, table), name, place)
+    return {name: importlib.import_module(name) for name in FILES}
+
+
+def camera(width=37, height=29):
+    return js.Camera.look_at((0.3, 0.2, -3.0), (0.0, 0.0, 0.0), fov_degrees=40.0, width=width, height=height, near=1.5, far=4.5)
+
+
+def particles(count):
+    rng = np.random.default_rng(2)
+    position = rng.uniform(-0.8, 0.8, (count, 3)).astype(np.float32)
+    found = js.Particles.from_arrays(position, 0.5, position[:, 0])
+    transfer = js.TransferFunction.from_points([-0.8, 0.0, 0.8], [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0.5, 2.0, 1.0])
+    return {"particles": found, "transfer": transfer}
+
+
+def ball(added, **changed):
+    given = {"centre": CENTRE, "radius": RADIUS, "density": DENSITY, "color": COLOR} | changed
+    return added["ball"].Ball(**{name: jnp.asarray(value, jnp.float32) for name, value in given.items()})
+
+
+def chords(view):
+    """Of all pixels' rays with the ball, in float64; and a ray's length a unit of depth."""
+    u = np.asarray(view.column(np.arange(view.width) + 0.5), np.float64)
+    v = np.asarray(view.row(np.arange(view.height) + 0.5), np.float64)[:, None]
+    direction = np.stack(np.broadcast_arrays(u, v, 1.0), -1)
+    slant = np.linalg.norm(direction, axis=-1)
+    centre = np.asarray(view.to_view(jnp.asarray(CENTRE)), np.float64)
+    along = (direction @ centre) / slant
+    return 2 * np.sqrt(np.maximum(RADIUS**2 - (centre @ centre - along**2), 0)), slant
+
+
+def test_the_page_adds_one_of_each():
+    assert set(FILES) == {"ball", "trapezoids", "every_other"} and len(ENTRIES) == 2
+
+
+def test_a_ball_without_particles_is_the_light_integral_but_for_its_borders(added):
+    view, settings = camera(), js.Settings(samples=512)
+    image = js.render(js.Scene(**particles(0), media=(ball(added),)), view, settings)
+    chord, slant = chords(view)
+    alpha = 1 - np.exp(-DENSITY * chord)
+    step = float(view.far) * np.log(float(view.far) / float(view.near)) / 512 * slant  # the longest there is
+    assert (np.abs(np.asarray(image.alpha) - alpha) <= DENSITY * step + 1e-6).all()
+    np.testing.assert_allclose(image.color, np.asarray(COLOR) * np.asarray(image.alpha)[..., None], atol=1e-6)
+    assert float(image.alpha.max()) > 0.5 and (np.asarray(image.alpha)[0] == 0).all()
+
+
+def test_media_share_a_ray_and_are_sorted_in_depth(added):
+    """An absent ball changes no bit; an opaque one hides what is behind it, and not what is in front."""
+    view, settings, fluid = camera(), js.Settings(samples=128), particles(60)
+    alone = js.render(js.Scene(**fluid), view, settings)
+    absent = js.render(js.Scene(**fluid, media=(ball(added, density=0.0),)), view, settings)
+    np.testing.assert_allclose(absent.color, alone.color, atol=1e-6)
+    np.testing.assert_allclose(absent.transmittance, alone.transmittance, atol=1e-6)
+    both = js.render(js.Scene(**fluid, media=(ball(added, density=1e4, color=(0.0, 0.0, 0.0)),)), view, settings)
+    middle = view.height // 2, view.width // 2
+    assert float(both.alpha[middle]) > 0.999
+    assert 0.05 < float(both.color[middle].sum()) < float(alone.color[middle].sum())
+    assert float(both.depth[middle]) <= float(alone.depth[middle])
+
+
+def test_a_ball_is_differentiated_by_what_it_is_made_of(added, x64):
+    view, settings = camera(19, 17), js.Settings(samples=64)
+    fluid = particles(20)
+    plan = js.plan(js.Scene(**fluid, media=(ball(added),)), view, settings)
+
+    def light(density, color):
+        scene = js.Scene(**fluid, media=(ball(added, density=density, color=color),))
+        image = js.render(scene, view, settings, plan=plan)
+        return (image.color * jnp.arange(3.0)).sum() + image.transmittance.sum()
+
+    density, color = jnp.float32(DENSITY), jnp.asarray(COLOR, jnp.float32)
+    found = jax.grad(light, (0, 1))(density, color)
+    pushed = jax.jvp(light, (density, color), (jnp.float32(1), jnp.zeros(3, jnp.float32)))[1]
+    step = 1e-2
+    wanted = (light(density + step, color) - light(density - step, color)) / (2 * step)
+    np.testing.assert_allclose(found[0], wanted, rtol=2e-3)
+    np.testing.assert_allclose(pushed, found[0], rtol=1e-4)
+    of_red = (light(density, color + step * jnp.eye(3)[2]) - light(density, color - step * jnp.eye(3)[2])) / (2 * step)
+    np.testing.assert_allclose(found[1][2], of_red, rtol=2e-3)
+
+
+def test_trapezoids_integrate_what_point_samples_do_and_better(added):
+    """Inside one large support the field is smooth: their error falls faster with the number of samples."""
+    position = np.asarray([[0.0, 0, 0], [0.4, 0, 0]], np.float32)
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [[1, 0, 0], [0, 0, 1]], [0.2, 1.0])
+    scene = js.Scene(particles=js.Particles.from_arrays(position, 8.0, [0.0, 1.0]), transfer=transfer)
+    view = camera(11, 9)
+    fine = js.render(scene, view, js.Settings(samples=512))
+    for samples in (16, 20):  # a whole number of slabs, and not
+        coarse = js.render(scene, view, js.Settings(samples=samples, integrator="trapezoids"))
+        np.testing.assert_allclose(coarse.color, fine.color, atol=2e-3)
+        np.testing.assert_allclose(coarse.transmittance, fine.transmittance, atol=2e-3)
+    assert coarse.stats["evaluations"] > 0
+
+
+def test_trapezoids_are_differentiable_without_an_adjoint_of_their_own(added):
+    fluid, view, settings = particles(30), camera(13, 11), js.Settings(samples=32, integrator="trapezoids")
+    scene = js.Scene(**fluid)
+    plan = js.plan(scene, view, settings)
+
+    def light(extinction):
+        transfer = js.TransferFunction(fluid["transfer"].values, fluid["transfer"].colors, extinction)
+        image = js.render(js.Scene(particles=fluid["particles"], transfer=transfer), view, settings, plan=plan)
+        return image.color.sum() + 2 * image.transmittance.sum()
+
+    at = fluid["transfer"].extinction
+    found, step = jax.grad(light)(at), 1e-2
+    for k, direction in enumerate(np.eye(3, dtype=np.float32)):
+        wanted = (light(at + step * direction) - light(at - step * direction)) / (2 * step)
+        np.testing.assert_allclose(found[k], wanted, rtol=5e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("size", [(37, 29), (8, 8), (1, 1)])
+def test_every_other_pixel_shows_the_ray_that_was_cast_there(added, size):
+    scene, view = js.Scene(**particles(60)), camera(*size)
+    every, other = (js.render(scene, view, js.Settings(samples=64, screen=screen)) for screen in ("pixels", "every_other"))
+    for layer in ("color", "transmittance", "depth"):
+        wanted, found = (np.asarray(getattr(image, layer)) for image in (every, other))
+        np.testing.assert_array_equal(found[::2, ::2], wanted[::2, ::2])
+        np.testing.assert_array_equal(found[1::2, 1::2], found[::2, ::2][: found.shape[0] // 2, : found.shape[1] // 2])
+    assert other.stats["evaluations"] == pytest.approx(every.stats["evaluations"] / 4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"integrator": "trapezoids"}, "integrator='trapezoids'"),
+        ({"screen": "every_other"}, "screen='every_other'"),
+        ({}, "media"),
+    ],
+)
+def test_a_tolerance_that_no_estimator_keeps_is_refused_by_name(added, changed, what):
+    media = {} if changed else {"media": (ball(added),)}
+    scene, view = js.Scene(**particles(5), **media), camera(8, 8)
+    with pytest.raises(ValueError, match=f"`tolerance` does not cover `.*{what}"):
+        js.render(scene, view, js.Settings(tolerance=0.01, **changed))
