@@ -42,6 +42,7 @@ CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its 
 MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
 SUBSAMPLED_SHARE = 0.1  # of the variance across, what is left between rays of `SUBSAMPLE`
+DEVIATIONS_AROUND = 2.0  # of Q, by which quantities between nodes are taken to lie beyond those at the nodes
 MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
 Combine = Callable[[Array, Array], Array]
 
@@ -200,7 +201,7 @@ class _Nodes:
         Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
         falls so.
         """
-        around = 2 * bundle.deviation / jnp.sqrt(correlated)
+        around = DEVIATIONS_AROUND * bundle.deviation / jnp.sqrt(correlated)
         *of_colors, of_extinction = mean_square_slope(self.squares, bundle.low - around, bundle.high + around)
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * bundle.taken**2
         return bundle.front**2 * bundle.deviation**2 * light
