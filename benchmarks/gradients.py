@@ -43,14 +43,14 @@ RESULTS = peers.RESULTS.with_name("gradients.json")
 
 def total(draw: Callable, scene: js.Scene, camera: js.Camera) -> Callable:
     """A scalar of the image as a function of the scene's and the camera's numbers."""
-    worth = jnp.asarray(np.random.default_rng(0).normal(size=(camera.height, camera.width, 4)), jnp.float32)
+    cotangent = jnp.asarray(np.random.default_rng(0).normal(size=(camera.height, camera.width, 4)), jnp.float32)
 
     def of(numbers: dict) -> jax.Array:
         parts = {name: numbers[name] for name in ("position", "support", "quantity", "volume")}
         particles = dataclasses.replace(scene.particles, **parts)
         transfer = js.TransferFunction(*(numbers[name] for name in ("values", "colors", "extinction")))
         view = dataclasses.replace(camera, **{name: numbers[name] for name in ("eye", "axes", "half_height")})
-        return (draw(js.Scene(particles=particles, transfer=transfer), view) * worth).mean()
+        return (draw(js.Scene(particles=particles, transfer=transfer), view) * cotangent).mean()
 
     return of
 

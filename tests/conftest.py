@@ -16,10 +16,11 @@ import pytest
 import jaxsph as js
 from jaxsph.access.lists import ListPlan
 from jaxsph.access.ordering import rank_particles
+from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
 from jaxsph.access.view import view_particles
 from jaxsph.cast.batches import CastPlan
 from jaxsph.control.errors import fits
-from jaxsph.field.schedule import CELL_SAMPLES, MAX_LEVEL, reference_quantities
+from jaxsph.field.schedule import reference_quantities
 from jaxsph.numerics import memory_maps
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
@@ -45,7 +46,7 @@ class Frames:
 
     def plan(self, slab_samples: int = 4, num_classes: int = 3) -> js.Plan:
         lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
-        cast = CastPlan(16, slab_samples, 48)  # stretches that end within a layer
+        cast = CastPlan(16, slab_samples, 48)  # batches that end within a layer
         return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
 
     def deep(self, slab_samples: int) -> Frames:
@@ -178,7 +179,8 @@ def grid_of(particles, camera, *, plan):
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    grid = make_grid(ordered, camera, 0, plan=plan).of(ordered)
+    sizes = {"lists": plan.lists, "samples": plan.samples, "halo": 0, "tuning": plan.cast.tuning}
+    grid = make_grid(ordered, camera, 0, **sizes).of(ordered)
     return grid, reference_quantities(grid.windows, grid.lists.rank, ordered.quantity)
 
 

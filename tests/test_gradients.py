@@ -46,10 +46,10 @@ PHENOMENA = {
 @pytest.mark.parametrize("phenomenon", PHENOMENA)
 def test_gradients_are_those_of_differences_when(frames, x64, phenomenon):
     rng = np.random.default_rng(list(PHENOMENA).index(phenomenon))
-    inputs, worth, plan = filled(frames, rng), weights(rng, frames), frames.plan()
+    inputs, cotangent, plan = filled(frames, rng), weights(rng, frames), frames.plan()
     move = towards(inputs, PHENOMENA[phenomenon](inputs, rng))
-    difference, pushed, owed = differ(inputs, move, worth, frames.settings, plan)
-    slope, size = along(owed, move)
+    difference, pushed, gradient = differ(inputs, move, cotangent, frames.settings, plan)
+    slope, size = along(gradient, move)
     assert difference != 0
     assert slope == pytest.approx(difference, abs=CLOSE * (1 + size))
     assert pushed == pytest.approx(slope, abs=AGREE * size)
@@ -71,9 +71,9 @@ def test_both_modes_agree_on_hard_scenes(frames, kernel, projection, data, seed)
         inputs = scene, data.draw(cameras(frames, projection))
         names = ("position", "support", "quantity", "volume", "values", "colors", "extinction", "eye", "axes", "half_height")
         move = towards(inputs, anyhow(*names)(inputs, rng))
-        worth, plan = weights(rng, frames), frames.plan()
-        _, pushed, owed = looked(inputs, move, worth, frames.settings, plan)
-        slope, size = along(owed, move)
+        cotangent, plan = weights(rng, frames), frames.plan()
+        _, pushed, gradient = looked(inputs, move, cotangent, frames.settings, plan)
+        slope, size = along(gradient, move)
         assert np.isfinite(size)
         assert float(pushed) == pytest.approx(slope, abs=AGREE * size)
 
@@ -130,41 +130,41 @@ def test_gradients_are_finite_with(frames, special, dtype):
     with jax.enable_x64(dtype is np.float64):
         scene, camera = frames.scene(rng, dtype=dtype), frames.camera(rng, dtype=dtype)
         inputs = SPECIAL[special](scene, camera, frames), camera
-        worth = weights(rng, frames).astype(dtype)
+        cotangent = weights(rng, frames).astype(dtype)
         plan = frames.plan()
-        owed = (pulled if dtype is np.float64 else lambda *given: valued(*given)[1])(inputs, worth, frames.settings, plan)
-        for part in jax.tree.leaves(owed):
+        gradient = (pulled if dtype is np.float64 else lambda *given: valued(*given)[1])(inputs, cotangent, frames.settings, plan)
+        for part in jax.tree.leaves(gradient):
             assert part.dtype == jax.dtypes.float0 or (part.dtype == dtype and np.isfinite(part).all())
         if special == "empty space":
-            assert not any(np.any(part) for part in jax.tree.leaves(owed) if part.dtype != jax.dtypes.float0)
+            assert not any(np.any(part) for part in jax.tree.leaves(gradient) if part.dtype != jax.dtypes.float0)
         if special == "no volume":
-            particles = owed[0].particles
+            particles = gradient[0].particles
             for part in (particles.position, particles.support, particles.quantity, particles.volume):
                 assert not np.any(part[:3]) and np.any(part[3:])
 
 
 def test_single_precision_gives_the_same_gradients_but_for_rounding(frames):
-    owed = {}
+    gradients = {}
     for dtype in (np.float64, np.float32):
         with jax.enable_x64(dtype is np.float64):
             rng = np.random.default_rng(1)
             scene, camera = filled(frames, rng, dtype)
-            worth = weights(rng, frames).astype(dtype)
-            given = (scene, camera), worth, frames.settings, frames.plan()
-            owed[dtype] = jax.tree.map(np.asarray, pulled(*given) if dtype is np.float64 else valued(*given)[1])
-    for exact, rounded in zip(*(jax.tree.leaves(found) for found in owed.values()), strict=True):
+            cotangent = weights(rng, frames).astype(dtype)
+            given = (scene, camera), cotangent, frames.settings, frames.plan()
+            gradients[dtype] = jax.tree.map(np.asarray, pulled(*given) if dtype is np.float64 else valued(*given)[1])
+    for exact, rounded in zip(*(jax.tree.leaves(found) for found in gradients.values()), strict=True):
         if exact.dtype != jax.dtypes.float0:
-            # of a camera's few numbers all samples are owed, and nearly cancel
+            # to a camera's few numbers all samples add, and nearly cancel
             share = 1e-4 if exact.size > 9 else 5e-3
             assert np.linalg.norm(rounded - exact) <= share * max(np.linalg.norm(exact), 1e-3)
 
 
-def test_padding_and_what_is_out_of_view_owe_nothing(frames, x64):
+def test_padding_and_what_is_out_of_view_have_no_gradient(frames, x64):
     rng = np.random.default_rng(2)
     scene, camera = alone(frames.scene(rng, dtype=np.float64), 9), frames.camera(rng, dtype=np.float64)
     behind = scene.particles.position.at[3].set(camera.eye - 5 * camera.axes[2])
     scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, position=behind))
-    owed = pulled((scene, camera), weights(rng, frames), frames.settings, frames.plan())[0].particles
-    for part in (owed.position, owed.support, owed.quantity, owed.volume):
+    gradient = pulled((scene, camera), weights(rng, frames), frames.settings, frames.plan())[0].particles
+    for part in (gradient.position, gradient.support, gradient.quantity, gradient.volume):
         assert not np.any(part[9:]) and not np.any(part[3])
         assert np.any(part[:9])

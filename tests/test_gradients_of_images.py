@@ -19,13 +19,13 @@ STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this fil
 @pytest.mark.parametrize("order", ["a batch of gradients", pytest.param("the gradient of a batch", marks=pytest.mark.slow)])
 def test_gradients_are_batched_as(frames, x64, order):
     rng = np.random.default_rng(3)
-    scene, worth, plan = frames.scene(rng, dtype=np.float64), weights(rng, frames), frames.plan()
+    scene, cotangent, plan = frames.scene(rng, dtype=np.float64), weights(rng, frames), frames.plan()
     cameras = [frames.camera(rng, dtype=np.float64) for _ in range(2)]
     many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
 
     def of(quantity, camera):
         particles = dataclasses.replace(scene.particles, quantity=quantity)
-        return total((dataclasses.replace(scene, particles=particles), camera), worth, frames.settings, plan)
+        return total((dataclasses.replace(scene, particles=particles), camera), cotangent, frames.settings, plan)
 
     def of_all(quantity, cameras):
         return jax.vmap(of, (None, 0))(quantity, cameras).sum()
@@ -33,11 +33,11 @@ def test_gradients_are_batched_as(frames, x64, order):
     by_both = (0, 1)
     batched = jax.vmap(jax.grad(of, by_both), (None, 0)) if order == "a batch of gradients" else jax.grad(of_all, by_both)
     quantity, batch = jax.jit(batched, compiler_options=QUICKLY)(scene.particles.quantity, many)
-    owed = [pulled((scene, camera), worth, frames.settings, plan) for camera in cameras]
-    for i, (_, camera) in enumerate(owed):
+    gradients = [pulled((scene, camera), cotangent, frames.settings, plan) for camera in cameras]
+    for i, (_, camera) in enumerate(gradients):
         np.testing.assert_allclose(batch.eye[i], camera.eye, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(batch.axes[i], camera.axes, rtol=1e-9, atol=1e-12)
-    of_each = np.stack([scene.particles.quantity for scene, _ in owed])
+    of_each = np.stack([scene.particles.quantity for scene, _ in gradients])
     wanted = of_each if order == "a batch of gradients" else of_each.sum(0)
     np.testing.assert_allclose(quantity, wanted, rtol=1e-9, atol=1e-12)
 
@@ -48,17 +48,17 @@ def test_gradients_of_bands_and_of_many_control_points_are_those_of_differences(
     scene, camera = filled(frames, rng)
     values = np.sort(rng.uniform(0, 1, 20))
     transfer = js.TransferFunction.from_points(values, rng.uniform(0, 1, (20, 3)), rng.uniform(0, 4, 20))
-    inputs, worth = (dataclasses.replace(scene, transfer=transfer), camera), weights(rng, frames)
+    inputs, cotangent = (dataclasses.replace(scene, transfer=transfer), camera), weights(rng, frames)
     whole = js.plan(*inputs, frames.settings)
     low = dataclasses.replace(frames.settings, memory_limit=whole.bytes - 1)
     plan = js.plan(*inputs, low)
     assert whole.bands == 1 and plan.bands == 2
     moves = [anyhow("position", "support", "quantity", "volume", "eye"), anyhow("values"), anyhow("colors"), anyhow("extinction")]
-    owed = valued(inputs, worth, low, plan)[1]
+    gradient = valued(inputs, cotangent, low, plan)[1]
     for direction in moves:
         move = towards(inputs, direction(inputs, rng))
-        ahead, behind = (valued(stepped(inputs, move, by), worth, low, plan)[0] for by in (STEP, -STEP))
-        slope, size = along(owed, move)
+        ahead, behind = (valued(stepped(inputs, move, by), cotangent, low, plan)[0] for by in (STEP, -STEP))
+        slope, size = along(gradient, move)
         assert abs(slope) > 100 * CLOSE
         assert slope == pytest.approx(float(ahead - behind) / (2 * STEP), abs=CLOSE * (1 + size))
 
@@ -71,9 +71,9 @@ def test_depth_has_gradients_of_zero(frames, x64):
         depth = js.render(*inputs, frames.settings, plan=frames.plan()).depth
         return jnp.where(jnp.isfinite(depth), depth, 0).sum()
 
-    found, owed = jax.jit(jax.value_and_grad(of, allow_int=True), compiler_options=QUICKLY)((scene, camera))
+    found, gradient = jax.jit(jax.value_and_grad(of, allow_int=True), compiler_options=QUICKLY)((scene, camera))
     assert found > 0
-    assert not any(np.any(part) for part in jax.tree.leaves(owed) if part.dtype != jax.dtypes.float0)
+    assert not any(np.any(part) for part in jax.tree.leaves(gradient) if part.dtype != jax.dtypes.float0)
 
 
 def adaptive(frames, tolerance):
@@ -93,26 +93,26 @@ def even(frames, rng):
 
 def test_the_gradient_of_an_adaptive_image_is_that_of_this_image(frames, x64):
     rng = np.random.default_rng(4)
-    inputs, worth = even(frames, rng), weights(rng, frames)
+    inputs, cotangent = even(frames, rng), weights(rng, frames)
     asked, plan = adaptive(frames, 0.03)
     names = ("position", "support", "quantity", "values", "extinction", "eye")
     move = towards(inputs, anyhow(*names)(inputs, rng))
-    ahead, behind = (valued(stepped(inputs, move, by), worth, asked, plan)[0] for by in (STEP, -STEP))
-    coarse, owed = valued(inputs, worth, asked, plan)
-    fine, of_fine = valued(inputs, worth, dataclasses.replace(asked, tolerance=0.0), plan)
+    ahead, behind = (valued(stepped(inputs, move, by), cotangent, asked, plan)[0] for by in (STEP, -STEP))
+    coarse, gradient = valued(inputs, cotangent, asked, plan)
+    fine, of_fine = valued(inputs, cotangent, dataclasses.replace(asked, tolerance=0.0), plan)
     assert coarse != fine  # samples were saved
-    slope, size = along(owed, move)
+    slope, size = along(gradient, move)
     assert abs(slope - along(of_fine, move)[0]) > 100 * CLOSE * (1 + size)
     assert slope == pytest.approx(float(ahead - behind) / (2 * STEP), abs=CLOSE * (1 + size))
 
 
 def test_tightening_the_tolerance_moves_gradients_no_more_than_so_much(frames, x64):
     rng = np.random.default_rng(4)
-    inputs, worth = even(frames, rng), weights(rng, frames)
+    inputs, cotangent = even(frames, rng), weights(rng, frames)
     found = {}
     for tolerance in (0.1, 0.03, 0.01, 0.003, 0.0):
         asked, plan = adaptive(frames, tolerance)
-        found[tolerance] = valued(inputs, worth, asked, plan)[1][0].particles.quantity
+        found[tolerance] = valued(inputs, cotangent, asked, plan)[1][0].particles.quantity
     exact = found[0.0]
     off = {tolerance: float(np.linalg.norm(slope - exact) / np.linalg.norm(exact)) for tolerance, slope in found.items()}
     assert all(off[tolerance] <= STEEPEST * tolerance for tolerance in found)
@@ -123,22 +123,22 @@ def test_tightening_the_tolerance_moves_gradients_no_more_than_so_much(frames, x
 ])  # fmt: skip
 def test_what_has_no_gradient_says_so(frames, how, control, asked):
     rng = np.random.default_rng(0)
-    inputs, worth = (frames.scene(rng), frames.camera(rng)), jnp.ones((frames.height, frames.width, 4))
+    inputs, cotangent = (frames.scene(rng), frames.camera(rng)), jnp.ones((frames.height, frames.width, 4))
     asked = dataclasses.replace(frames.settings, tolerance=0.01, **asked)
     plan = dataclasses.replace(frames.plan(), control=control)
     with pytest.raises(NotImplementedError, match=f"{how}.*tolerance=None"):
         jax.eval_shape(
-            lambda inputs, move: jax.jvp(lambda i: total(i, worth, asked, plan), (inputs,), (move,)), inputs, still(inputs)
+            lambda inputs, move: jax.jvp(lambda i: total(i, cotangent, asked, plan), (inputs,), (move,)), inputs, still(inputs)
         )
 
 
 def test_second_derivatives_say_that_there_are_none(frames):
     rng = np.random.default_rng(0)
-    scene, camera, worth = frames.scene(rng), frames.camera(rng), jnp.ones((frames.height, frames.width, 4))
+    scene, camera, cotangent = frames.scene(rng), frames.camera(rng), jnp.ones((frames.height, frames.width, 4))
 
     def of(extinction):
         transfer = dataclasses.replace(scene.transfer, extinction=extinction)
-        return total((dataclasses.replace(scene, transfer=transfer), camera), worth, frames.settings, frames.plan())
+        return total((dataclasses.replace(scene, transfer=transfer), camera), cotangent, frames.settings, frames.plan())
 
     with pytest.raises(NotImplementedError, match="second derivatives"):
         jax.eval_shape(jax.hessian(of), scene.transfer.extinction)

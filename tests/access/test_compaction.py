@@ -1,4 +1,4 @@
-"""The stacks hold every filled item once, front to back, tallest bundles first."""
+"""The compacted slabs hold every filled item once, front to back, tallest bundles first."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import hypothesis.extra.numpy as hnp
 import numpy as np
 from hypothesis import given, settings
 
-from jaxsph.access.compaction import stack
+from jaxsph.access.compaction import compact
 
 
 @settings(max_examples=30, deadline=None)
 @given(hnp.arrays(bool, (5, 7)))
 def test_layers_hold_the_nth_filled_item_of_every_bundle_in_order_of_height(filled):
     slabs, bundles = filled.shape
-    stacks = stack(filled)
-    item, start, place = (np.asarray(value) for value in (stacks.item, stacks.start, stacks.place))
+    compacted = compact(filled)
+    item, start, rank = (np.asarray(value) for value in (compacted.item, compacted.start, compacted.bundle_rank))
     height = filled.sum(0)
-    assert sorted(place) == list(range(bundles))
-    bundle = np.argsort(place)
+    assert sorted(rank) == list(range(bundles))
+    bundle = np.argsort(rank)
     assert (np.diff(height[bundle]) <= 0).all()
     assert start[0] == 0 and start[-1] == filled.sum()
     assert (item[start[-1] :] == slabs * bundles).all()

@@ -10,9 +10,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.access.slab_windows import find_slab_windows
 from jaxsph.access.lists import build_lists, bundle_origins
 from jaxsph.access.ordering import rank_particles
+from jaxsph.access.slab_windows import find_slab_windows
 from jaxsph.access.view import view_particles
 
 
@@ -59,19 +59,19 @@ def numbered(scene, dtype):
 
 def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
     particles = numbered(scene, dtype)
-    ordered, lists, cells, (row, column), _ = grid(particles, camera, plan)
+    ordered, lists, windows, (row, column), _ = grid(particles, camera, plan)
     assert int(lists.faults) == 0
     number = np.asarray(ordered.quantity).astype(int)[np.asarray(lists.rank)]
-    begin, length = np.asarray(cells.begin), np.asarray(cells.length)
+    begin, length = np.asarray(windows.begin), np.asarray(windows.length)
     members = np.zeros((begin.shape[2], begin.shape[1], particles.capacity), bool)
     for c, slab, bundle in np.argwhere(np.moveaxis(length, 0, 0) > 0):
         start = begin[c, slab, bundle]
         members[bundle, slab, number[start : start + length[c, slab, bundle]]] = True
     positive = weights(scene, camera, plan.samples, dtype) > 0
     positive &= np.asarray(particles.valid)[:, None, None, None]
-    origin = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
+    corner = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
     for particle, r, c, k in np.argwhere(positive):
-        bundle = origin[r // 8 * 8, c // 8 * 8]
+        bundle = corner[r // 8 * 8, c // 8 * 8]
         assert members[bundle, k // plan.cast.slab_samples, particle], (
             f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
         )
@@ -165,9 +165,9 @@ def test_a_full_capacity_is_a_fault_and_stays_in_bounds(frames, capacity):
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
     small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 5}))
-    _, lists, cells, *_ = grid(numbered(scene, np.float32), camera, small)
+    _, lists, windows, *_ = grid(numbered(scene, np.float32), camera, small)
     assert int(lists.faults) != 0
-    assert np.all(np.asarray(cells.begin + cells.length) <= small.lists.list_capacity)
+    assert np.all(np.asarray(windows.begin + windows.length) <= small.lists.list_capacity)
 
 
 def test_dead_and_padded_particles_are_listed_nowhere(frames):

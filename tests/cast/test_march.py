@@ -10,13 +10,13 @@ import pytest
 import jaxsph as js
 
 
-def test_how_many_slabs_are_held_before_they_are_composited_changes_no_bit(frames):
+def test_how_many_slabs_a_batch_has_changes_no_bit(frames):
     rng = np.random.default_rng(3)
     scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
     images = []
-    for held in (16, 48, 1024):
+    for batch_slabs in (16, 48, 1024):
         plan = frames.plan()
-        plan = dataclasses.replace(plan, cast=dataclasses.replace(plan.cast, held=held))
+        plan = dataclasses.replace(plan, cast=dataclasses.replace(plan.cast, batch_slabs=batch_slabs))
         images.append(js.render(scene, camera, frames.settings, plan=plan))
     assert float(images[0].alpha.max()) > 0.1
     for image in images[1:]:
@@ -26,4 +26,4 @@ def test_how_many_slabs_are_held_before_they_are_composited_changes_no_bit(frame
 
 def test_a_plan_whose_pieces_do_not_fit_together_is_refused(frames):
     with pytest.raises(ValueError, match="multiple of `chunk`"):
-        dataclasses.replace(frames.plan().cast, held=50)
+        dataclasses.replace(frames.plan().cast, batch_slabs=50)

@@ -1,4 +1,4 @@
-"""What slabs are worth is read and put in place, as light is; and control points are owed what their samples are worth."""
+"""Cotangents of slabs are put in place as light is, and no image is copied for either."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from programs import copies_in_loops
 
-import jaxsph as js
-from jaxsph.access.compaction import stack
-from jaxsph.cast.composite import composite, fresh, unlit
-from jaxsph.cast.replay import Samples, owe_transfer, unseen, value_slabs
-from jaxsph.model.transfer import SELECT_ALL
-from tests.shared.programs import copies_in_loops
+from jaxsph.access.compaction import compact
+from jaxsph.cast.batches import Batch
+from jaxsph.cast.composite import Together, composite, empty_segments, fresh_rays
+from jaxsph.cast.replay import fresh_replay, pull_composite
+from jaxsph.numerics.tuning import CPU
 
-SLABS, BUNDLES, SAMPLES = 5, 331, 4
+SLABS, BUNDLES, SAMPLES, RAYS = 5, 331, 4, 64
+TOGETHER = Together.of(BUNDLES, CPU)
 
 
-def stretch():
-    """One stretch that holds all slabs: light of none, where each is held, where the layers begin."""
+def batch():
+    """One batch that holds all slabs, light of none, and where the layers begin."""
     filled = jnp.asarray(np.random.default_rng(0).uniform(size=(SLABS, BUNDLES)) < 0.7)
-    stacks, held = stack(filled), SLABS * BUNDLES
-    return unlit(held + 1, SAMPLES, jnp.float32), jnp.arange(held), stacks.start, jnp.int32(0), filled.sum(dtype=jnp.int32)
+    compacted, slots = compact(filled), SLABS * BUNDLES
+    each = jnp.arange(slots)
+    found = (each, each, each, jnp.int32(0), filled.sum(dtype=jnp.int32), jnp.int32(1))
+    return empty_segments(slots + 1, SAMPLES, RAYS, jnp.float32), found, compacted.start
 
 
 def test_a_copy_in_a_loop_is_found():
@@ -38,34 +40,20 @@ def test_a_copy_in_a_loop_is_found():
 
 
 def test_compositing_copies_no_image():
-    state, (light, *where) = fresh(BUNDLES, jnp.float32), stretch()
+    rays = fresh_rays(BUNDLES, RAYS, jnp.float32, TOGETHER)
     borders = functools.partial(jnp.full, fill_value=0.0, dtype=jnp.float32)
 
-    def put(state, light, *where):
-        return composite(state, light, where[0], lambda at: borders((at.shape[0], SAMPLES + 1)), *where[1:])
+    def put(rays, light, found, starts):
+        return composite(rays, light, Batch(*found), lambda place: borders((place.shape[0], SAMPLES + 1)), starts, TOGETHER)
 
-    assert copies_in_loops(put, (state, light, *where), state[0].shape) == []
+    assert copies_in_loops(put, (rays, *batch()), rays.transmittance.shape) == []
 
 
-def test_valuing_copies_no_image():
+def test_pulling_back_copies_no_image():
     image = jnp.zeros((3, BUNDLES, 8, 8)), jnp.ones((BUNDLES, 8, 8))
-    seen = jax.jit(unseen)(image, image, jnp.arange(BUNDLES))
-    assert copies_in_loops(value_slabs, (seen, *stretch()), seen.transmittance.shape) == []
+    state = jax.jit(functools.partial(fresh_replay, together=TOGETHER))(image, image, jnp.arange(BUNDLES))
 
+    def pull(state, light, found, starts):
+        return pull_composite(state, (*light.color, light.transmittance), Batch(*found), starts, TOGETHER)
 
-@pytest.mark.parametrize("spacing", ["even", "uneven"])
-@pytest.mark.parametrize("points", [2, SELECT_ALL, SELECT_ALL + 1, 40])
-def test_control_points_are_owed_by_the_samples_between_them(points, spacing, x64):
-    """However many there are: on either side of where they are searched rather than compared."""
-    rng = np.random.default_rng(points)
-    values = {"even": np.linspace(-1, 2, points), "uneven": np.sort(rng.uniform(-1, 2, points))}[spacing]
-    segments = js.TransferFunction.from_points(values, np.zeros((points, 3)), np.zeros(points)).segments()
-    found, *worth = rng.normal(0.5, 1, (6, 3, 4, 64))
-    samples = Samples(None, None, [jnp.asarray(value) for value in worth[:4]], jnp.asarray(worth[4]), None, jnp.asarray(found))
-    wanted = np.zeros((5, points))
-    at = np.clip(np.searchsorted(values, found, side="right") - 1, 0, points - 2)
-    part = np.clip((found - values[at]) / (values[at + 1] - values[at]), 0, 1)
-    for row, value in zip(wanted, [*worth[:4], -worth[4]], strict=True):
-        np.add.at(row, at, (1 - part) * value)
-        np.add.at(row, at + 1, part * value)
-    np.testing.assert_allclose(owe_transfer(samples, segments), wanted, rtol=1e-9, atol=1e-9)
+    assert copies_in_loops(pull, (state, *batch()), state.transmittance.shape) == []

@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.control.bounds import SampleBounds
 from jaxsph.control.errors import SUPER_PIXEL, cell_errors
-from jaxsph.field.schedule import CELL_SAMPLES
 
 BUNDLES = 64
 errors_of = jax.jit(functools.partial(cell_errors, fitting=2), compiler_options={"xla_backend_optimization_level": 0})
 
 
 def found(relax):
-    """SlabWindows whose samples are all touched and covered, some in part empty, some with slabs that nothing touches."""
+    """Cells whose samples are all touched and covered, some in part empty, some with slabs that nothing touches."""
     rng = np.random.default_rng(0)
     shape = (CELL_SAMPLES, BUNDLES)
     touched = rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 3, 0.8, 1)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.control.interpolation_error import SUBSAMPLED_SHARE, interpolation_error
 from jaxsph.field.lattice import FINEST, GAP, Spacing, region_of
-from jaxsph.control.interpolation_error import SUBSAMPLE_VARIANCE, interpolation_error
 from jaxsph.stages import sum_shard
 
 
@@ -21,7 +21,8 @@ def band(stages):
     scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
     plan = js.plan(scene, camera, js.Settings(samples=96, tolerance=0.05, estimator="pilot"))
     grid, _ = stages(scene.particles, camera, plan=plan)
-    lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
+    sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
+    lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
     judge = jax.jit(functools.partial(interpolation_error, slab_samples=plan.cast.slab_samples))
     return grid, lattice, lambda lattice: judge(grid, lattice, camera, scene.transfer)
 
@@ -33,14 +34,15 @@ def test_some_slabs_with_particles_can_be_interpolated(band):
     usable = np.isfinite(found.variance)
     assert (usable & filled).sum() > 0.1 * filled.sum()
     assert (np.asarray(found.variance)[usable] > 0).all() and (np.asarray(found.bend) >= 0).all()
-    share = np.asarray(found.sparse)[usable]
-    assert (share > 0).all() and (share <= np.float32(SUBSAMPLE_VARIANCE)).all() and share.min() < share.max()
+    share = np.asarray(found.subsampled_share)[usable]
+    assert (share > 0).all() and (share <= np.float32(SUBSAMPLED_SHARE)).all() and share.min() < share.max()
 
 
 def test_rougher_sums_are_judged_worse(band):
     _, lattice, judge = band
-    rough = lattice.weighted * (1 + 0.1 * np.random.default_rng(0).normal(size=lattice.weighted.shape).astype(np.float32))
-    smooth, found = judge(lattice).variance, judge(dataclasses.replace(lattice, weighted=rough)).variance
+    (weighted,) = lattice.weighted
+    rough = weighted * (1 + 0.1 * np.random.default_rng(0).normal(size=weighted.shape).astype(np.float32))
+    smooth, found = judge(lattice).variance, judge(dataclasses.replace(lattice, weighted=(rough,))).variance
     both = np.isfinite(smooth) & np.isfinite(found) & (np.asarray(smooth) > 1e-9)
     assert both.any() and (np.asarray(found)[both] > np.asarray(smooth)[both]).mean() > 0.95
 
@@ -58,7 +60,7 @@ def test_what_would_be_interpolated_from_beyond_the_lattice_is_not(band, nodes):
     layers, down, across = lattice.weight.shape[0], 12 * nodes.across, 13 * nodes.across
     ramp = np.zeros((layers, down + GAP, across + GAP), np.float32)
     ramp[:, :down, :across] = across - np.arange(across)
-    even = dataclasses.replace(lattice, weight=jnp.asarray(ramp), weighted=jnp.asarray(0.3 * ramp), region=region)
+    even = dataclasses.replace(lattice, weight=jnp.asarray(ramp), weighted=(jnp.asarray(0.3 * ramp),), region=region)
     row, column, inside = (np.asarray(value) for value in region.place(grid))
     usable = np.isfinite(judge(even).variance).any(0)
     last = (column + 1) * nodes.across + 1, (row + 1) * nodes.across + 1  # nodes that a cubic takes

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.field.lattice import FINEST, Spacing
-from jaxsph.control.pilot import DEVIATIONS, pilot
 from jaxsph.control.interpolation_error import interpolation_error
+from jaxsph.control.pilot import DEVIATIONS, pilot
+from jaxsph.field.lattice import FINEST, Spacing
+from jaxsph.field.schedule import DENSE, INTERPOLATED, SUBSAMPLED
 from jaxsph.stages import sum_shard
 
 PILOT = js.Settings(tolerance=0.004, estimator="pilot", samples=128)
@@ -152,26 +153,29 @@ def test_a_jump_of_the_transfer_function_is_kept_sharp():
 def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_allows(stages):
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
-    slab_samples, (grid, origin) = plan.cast.slab_samples, stages(scene.particles, camera, plan=plan)
-    lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), parts=1, plan=plan, kernel=scene.particles.kernel)
+    slab_samples, (grid, reference) = plan.cast.slab_samples, stages(scene.particles, camera, plan=plan)
+    sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
+    lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
     found = interpolation_error(grid, lattice, camera, scene.transfer, slab_samples)
-    choose = functools.partial(pilot, grid, lattice, found, camera, origin, slab_samples=slab_samples)
+    choose = functools.partial(pilot, grid, lattice, found, camera, reference, slab_samples=slab_samples)
     variance, before = np.asarray(found.variance), 0
     samples = np.minimum(slab_samples, PILOT.samples - slab_samples * np.arange(len(variance)))[:, None]
     rows, columns = (np.asarray(side) for side in (grid.row, grid.column))
     shown = (rows < camera.height) & (columns < camera.width)
     for tolerance in (0.001, 0.01, 0.1):
-        work, estimate = choose(tolerance=jnp.float32(tolerance))
-        taken, sparse = np.asarray(work.interpolated), np.asarray(work.sparse)
-        assert taken.any() and sparse.any() and not (taken & sparse).any()
-        np.testing.assert_array_equal(work.count, np.where(taken, 0, grid.windows.count))
-        spent = np.where(taken, variance, np.where(sparse, np.asarray(found.sparse) * variance, 0)).sum(0)
+        schedule, estimate = choose(tolerance=jnp.float32(tolerance))
+        method = np.asarray(schedule.method)
+        taken, some = method >= INTERPOLATED, method == SUBSAMPLED
+        assert taken.any() and some.any() and (method[~taken & ~some] == DENSE).all()
+        np.testing.assert_array_equal(method[taken], INTERPOLATED + np.asarray(schedule.level)[taken])
+        np.testing.assert_array_equal(schedule.count, np.where(taken, 0, grid.windows.count))
+        spent = np.where(taken, variance, np.where(some, np.asarray(found.subsampled_share) * variance, 0)).sum(0)
         assert (DEVIATIONS * np.sqrt(spent) <= np.asarray(estimate) * (1 + 1e-5)).all()
         assert (np.asarray(estimate) <= np.float32(tolerance)).all()
         assert taken.sum() > before
         before = taken.sum()
         # what is counted: particles at all rays, or at sixteen of sixty-four, and those at nodes
-        count = np.asarray(grid.windows.count) * np.where(taken, 0, np.where(sparse, 0.25, 1)) * samples
+        count = np.asarray(grid.windows.count) * np.where(taken, 0, np.where(some, 0.25, 1)) * samples
         evaluations = (count.sum(0) + np.asarray(lattice.evaluations))[shown]
         image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=tolerance), plan=plan)
         np.testing.assert_allclose(np.asarray(image.evaluations)[rows[shown], columns[shown]], evaluations, rtol=1e-6)
@@ -192,7 +196,7 @@ def test_jit_agrees_with_eager():
     plan = js.plan(scene, camera, PILOT)
     traced = jax.jit(lambda s: js.render(s, camera, PILOT, plan=plan))(scene)
     away = np.abs(np.asarray(traced.color) - np.asarray(image.color))
-    assert (away <= 1e-5).mean() >= 0.999 and away.max() <= PILOT.tolerance  # rounding may tip a slab from one kind to another
+    assert (away <= 1e-5).mean() >= 0.999 and away.max() <= PILOT.tolerance  # rounding may tip a slab from one method to another
     assert error_of(traced, truth).max() <= PILOT.tolerance
     assert not bool(traced.certified)
 
@@ -200,7 +204,7 @@ def test_jit_agrees_with_eager():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [128, 256])
 def test_the_estimate_holds_however_dense_samples_are_along_the_ray(size):
-    """Where nodes across are far apart, neighbouring samples err correlation_length: their errors do not average out."""
+    """Where nodes across are far apart, neighbouring samples err alike: their errors do not average out."""
     scene, camera = js.scenes.load("checker_board", width=size, height=size)
     for samples in (128, 512):
         full = js.Settings(samples=samples)

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsph.control.spacing import MAX_SPACING_LEVEL, second_differences, choose_spacing
+from jaxsph.control.spacing import choose_spacing, second_differences
+from jaxsph.field.schedule import MAX_SPACING_LEVEL
 
 NODE_SAMPLES = 2
 PLENTY = jnp.full(1, 1e6, jnp.float32)

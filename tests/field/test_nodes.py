@@ -1,16 +1,14 @@
-"""Nodes hold the sums of full rate, and cubics are met between them."""
+"""Nodes hold the sums of full rate."""
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.field.lattice import FINEST, GAP, REACH, Lattice, Region, Spacing, region_of
-from jaxsph.field.nodes import interpolate, sum_at_nodes
-from jaxsph.control.spacing import MAX_SPACING_LEVEL
+from jaxsph.field.lattice import FINEST, GAP, REACH, Region, Spacing, region_of
+from jaxsph.field.nodes import sum_at_nodes
 from jaxsph.model import kernels
 
 WIDER = Spacing(8, 4)
@@ -30,6 +28,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
         plan.cast.slab_samples,
         Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, spacing),
         jnp.float64(0.4),
+        plan.cast.tuning.cells_of_nodes,
     )
 
     kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)
@@ -47,10 +46,10 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
     for k in range(len(x)):
         square = ((u * spread - x[k]) ** 2 + (v * spread - y[k]) ** 2 + (depth - z[k]) ** 2) * scale[k] ** 2
         w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
-        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.origin))
+        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.reference_quantity))
     # nodes beyond the image lie in bundles that it has no list for
     rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
-    for found, wanted in ((lattice.weight, weight), (lattice.weighted, weighted)):
+    for found, wanted in ((lattice.weight, weight), (*lattice.weighted, weighted)):
         assert np.asarray(found != 0).sum() == np.asarray(found[kept] != 0).sum(), "margins are zero"
         np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
     assert weight.max() > 0
@@ -64,37 +63,11 @@ def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     grid, _ = stages(scene.particles, camera, plan=plan)
     every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
     kept = slice(None), slice(-GAP), slice(-GAP)
+    sizes = jnp.float32(0.4), plan.cast.tuning.cells_of_nodes
     whole, part = (
-        sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, jnp.float32(0.4)).weight[kept]
+        sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, *sizes).weight[kept]
         for region in (every, some)
     )
     row, column = int(some.row) // FINEST.pixels, int(some.column) // FINEST.pixels
     np.testing.assert_array_equal(part, whole[:, row : row + part.shape[1], column : column + part.shape[2]])
     assert part.shape[1:] == (4, 6) and (part > 0).any()
-
-
-@pytest.mark.parametrize("spacing", [FINEST, WIDER])
-@pytest.mark.parametrize("level", range(MAX_SPACING_LEVEL + 1))
-def test_a_cubic_field_is_interpolated_exactly(level, spacing, x64):
-    rng, slab_samples = np.random.default_rng(0), 2 * spacing.samples
-    z, y, x = np.meshgrid(np.arange(16.0), np.arange(9.0), np.arange(8.0), indexing="ij")
-    cubic = rng.normal(size=(4, 4, 4))
-    field = jnp.asarray(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic))
-    field = jnp.pad(field, ((REACH, GAP), (0, GAP), (0, GAP)))
-    region = Region(jnp.int32(0), jnp.int32(0), 4, 4, spacing)
-    lattice = Lattice(field, 2 * field, jnp.float64(0), region, jnp.zeros(1))
-    slab, row, column = jnp.asarray([1, 2]), jnp.asarray([2, 4]), jnp.asarray([4, 2])
-    found = jax.jit(interpolate, static_argnames=("slab_samples", "level"))(
-        lattice, slab, (row, column), slab_samples=slab_samples, level=level
-    )
-    middles = (np.arange(slab_samples) + 0.5) * 2**level - 0.5
-    for k in range(2):
-        at = [
-            middles / spacing.samples + 2 * float(slab[k]),
-            np.arange(8) / spacing.pixels + float(row[k]),
-            np.arange(8) / spacing.pixels + float(column[k]),
-        ]
-        zs, ys, xs = np.meshgrid(*at, indexing="ij")
-        wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(slab_samples, 64)
-        np.testing.assert_allclose(found[k].real, wanted, rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(found[k].imag, 2 * wanted, rtol=1e-10, atol=1e-10)

@@ -17,10 +17,10 @@ def mapped(moves, by=MATRIX):
 
 
 def test_both_modes_are_the_two_rules():
-    moves, worth = jnp.asarray([1.0, -2.0, 0.25]), jnp.asarray([0.3, -0.7])
+    moves, cotangent = jnp.asarray([1.0, -2.0, 0.25]), jnp.asarray([0.3, -0.7])
     np.testing.assert_allclose(mapped(moves), MATRIX @ moves, rtol=1e-6)
     np.testing.assert_allclose(jax.jvp(mapped, (moves,), (moves,))[1], MATRIX @ moves, rtol=1e-6)
-    np.testing.assert_allclose(jax.vjp(mapped, moves)[1](worth)[0], MATRIX.T @ worth, rtol=1e-6)
+    np.testing.assert_allclose(jax.vjp(mapped, moves)[1](cotangent)[0], MATRIX.T @ cotangent, rtol=1e-6)
 
 
 def test_both_modes_are_batched():

@@ -17,30 +17,30 @@ AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers
 QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
 
 
-def total(inputs, worth, settings, plan):
-    """All layers that have derivatives, each pixel as often as it is worth."""
+def total(inputs, cotangent, settings, plan):
+    """All layers that have derivatives, weighted by their cotangents."""
     image = js.render(*inputs, settings, plan=plan)
-    return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * worth).sum()
+    return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * cotangent).sum()
 
 
 @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def looked(inputs, move, worth, settings, plan):
+def looked(inputs, move, cotangent, settings, plan):
     """The total, its slope in a direction by forward mode, and its gradient by reverse mode: one program."""
 
     def of(inputs):
-        return total(inputs, worth, settings, plan)
+        return total(inputs, cotangent, settings, plan)
 
     return *jax.jvp(of, (inputs,), (move,)), jax.grad(of, allow_int=True)(inputs)
 
 
-def pulled(inputs, worth, settings, plan):
-    return looked(inputs, still(inputs), worth, settings, plan)[2]
+def pulled(inputs, cotangent, settings, plan):
+    return looked(inputs, still(inputs), cotangent, settings, plan)[2]
 
 
 @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def valued(inputs, worth, settings, plan):
+def valued(inputs, cotangent, settings, plan):
     """The total and its gradient: a smaller program."""
-    return jax.value_and_grad(total, allow_int=True)(inputs, worth, settings, plan)
+    return jax.value_and_grad(total, allow_int=True)(inputs, cotangent, settings, plan)
 
 
 def still(inputs):
@@ -49,9 +49,9 @@ def still(inputs):
     return jax.tree.map(lambda x: jnp.zeros_like(x) if floating(x.dtype) else np.zeros(x.shape, jax.dtypes.float0), inputs)
 
 
-def along(owed, move):
+def along(gradient, move):
     """Slope in the direction `move`, and the sum of its terms' sizes."""
-    pairs = zip(jax.tree.leaves(owed), jax.tree.leaves(move), strict=True)
+    pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(move), strict=True)
     terms = [np.asarray(a * b).ravel() for a, b in pairs if a.dtype != jax.dtypes.float0]
     return float(sum(t.sum() for t in terms)), float(sum(np.abs(t).sum() for t in terms))
 
@@ -60,11 +60,11 @@ def stepped(inputs, move, step):
     return jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + step * d, inputs, move)
 
 
-def differ(inputs, move, worth, settings, plan):
+def differ(inputs, move, cotangent, settings, plan):
     """The central difference in the direction `move`, and the slope and gradient there."""
-    ahead, behind = (looked(stepped(inputs, move, by), still(inputs), worth, settings, plan)[0] for by in (STEP, -STEP))
-    _, pushed, owed = looked(inputs, move, worth, settings, plan)
-    return float(ahead - behind) / (2 * STEP), float(pushed), owed
+    ahead, behind = (looked(stepped(inputs, move, by), still(inputs), cotangent, settings, plan)[0] for by in (STEP, -STEP))
+    _, pushed, gradient = looked(inputs, move, cotangent, settings, plan)
+    return float(ahead - behind) / (2 * STEP), float(pushed), gradient
 
 
 def weights(rng, frames):

@@ -19,12 +19,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.slab_windows import slab_windows_with_borders
 from jaxsph.access.grid import Grid
+from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
 from jaxsph.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
 from jaxsph.control.errors import DEPTH_ROUNDING, EXPONENTIAL
 from jaxsph.control.ranges import range_tables
-from jaxsph.field.schedule import CELL_SAMPLES, MAX_LEVEL
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 
@@ -46,7 +45,7 @@ def bundle_bounds(
     levels: Int[Array, "cells bundles"],
     slab_samples: int,
     *,
-    parts: int = 2,
+    subdivisions: int = 2,
     form: str = "lerp",
 ) -> BundleBounds:
     """Bounds of the pixels of all bundles of a band when cells are sampled at `levels`, 0 to 4.
@@ -54,7 +53,7 @@ def bundle_bounds(
     Args:
         levels: of every cell; those of merged cells are equal.
         slab_samples: samples of each slab of the grid's cells.
-        parts: sub-rectangles on each side of a footprint, for the test of coverage.
+        subdivisions: sub-rectangles on each side of a footprint, for the test of coverage.
         form: `"lerp"`, or `"paper"` for irradiance and transmittance as separate intervals.
     """
     ordered, lists = grid.ordered, grid.lists
@@ -82,7 +81,8 @@ def bundle_bounds(
             window = begin[:, slab], length[:, slab]
             places = jnp.broadcast_to(least, (bundles,)), jnp.broadcast_to(greatest, (bundles,))
             footprint = Footprint(u, v[::-1])
-            found.append(sample_bounds(balls, lists.rank, window, footprint, edges, places, tables, camera.is_perspective, parts))
+            settings = tables, camera.is_perspective, subdivisions
+            found.append(sample_bounds(balls, lists.rank, window, footprint, edges, places, *settings))
         bounds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
         edges = borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1)]
         options = [_composited(bounds, edges, path, behind, level, form) for level in range(MAX_LEVEL + 1)]

@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
+from enclosure import bundle_bounds
 from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.access.slab_windows import slab_windows_with_borders
-from jaxsph.cast.march import cast_points
+from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows, slab_windows_with_borders
+from jaxsph.cast.adjoint import CastMethod, cast
 from jaxsph.control.analysis import analyse
-from jaxsph.control.enclosure import bundle_bounds
 from jaxsph.control.errors import SUPER_PIXEL
 from jaxsph.control.levels import bound
-from jaxsph.control.merge import coarse_work, coarser_windows, merged_levels
+from jaxsph.control.merge import coarse_schedule, merged_levels
 from jaxsph.control.ranges import range_tables
-from jaxsph.field.schedule import CELL_SAMPLES, MAX_LEVEL
+from jaxsph.model import registry
 
 CANDIDATES = range(SUPER_PIXEL + 1)
 QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
@@ -44,39 +44,41 @@ jax.tree_util.register_dataclass(Looked, data_fields=[field.name for field in da
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel", "form"), compiler_options=QUICKLY)
-def look(scene, camera, parts, wished, *, plan, kernel, form):
-    grid, origin = parts
+def look(scene, camera, frame, wished, *, plan, kernel, form):
+    grid, reference = frame
     slab_samples, number = plan.cast.slab_samples, wished.shape[0]
     windows, beside = coarser_windows(grid.windows, slab_samples), slab_windows_with_borders(grid.ordered, grid.lists)
-    filled, free = (held_by_cells(cells, slab_samples, number) for cells in (grid.windows, beside))
+    filled, free = (filled_cells(slabs, slab_samples, number) for slabs in (grid.windows, beside))
     whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
     levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)
-    tables, unrelaxed = range_tables(scene.transfer), jnp.zeros((), origin.dtype)
-    analysis = analyse(grid, beside, camera, origin, filled, tables, unrelaxed, slab_samples, 2)
+    tables, unrelaxed = range_tables(scene.transfer), jnp.zeros((), reference.dtype)
+    sizes = slab_samples, 2, plan.cast.tuning.cells_bounded
+    analysis = analyse(grid, beside, camera, reference, filled, tables, unrelaxed, *sizes)
+    method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), registry.screen(plan.screen).packets)
 
     def pixels(levels):
-        work = coarse_work(windows, levels, origin, analysis.paint, slab_samples)
-        rays = cast_points(grid, work, camera, scene.transfer, kernel, plan.cast)
+        schedule = coarse_schedule(windows, levels, reference, analysis.paint, slab_samples)
+        rays = cast(grid, schedule, camera, scene.transfer, (), method)
         return jnp.concatenate([rays.color, 1 - rays.transmittance[None]])
 
     exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))
     # a super-pixel is a sample as long as a cell, of colours within all ranges: as one of the coarsest level
     bounds = bundle_bounds(grid, camera, scene.transfer, jnp.minimum(levels, MAX_LEVEL), slab_samples, form=form)
-    rounding = 2 * jnp.finfo(origin.dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
+    rounding = 2 * jnp.finfo(reference.dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
     off = bound(analysis.error, jnp.where(filled, levels, 0), rounding)
     return Looked(exact, found, bounds.lo, bounds.hi, off, levels, filled)
 
 
-def held_by_cells(cells, slab_samples, number):
+def filled_cells(slabs, slab_samples, number):
     """Which cells have particles in any of their slabs, (cells, bundles)."""
-    of_slabs = jnp.pad(cells.count, ((0, number * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
+    of_slabs = jnp.pad(slabs.count, ((0, number * CELL_SAMPLES // slab_samples - slabs.count.shape[0]), (0, 0)))
     return of_slabs.reshape(number, -1, of_slabs.shape[1]).any(1)
 
 
 def looked(stages, scene, camera, wished, plan, form):
-    parts = stages(scene.particles, camera, plan=plan)
+    frame = stages(scene.particles, camera, plan=plan)
     kernel = scene.particles.kernel
-    return jax.tree.map(np.asarray, look(scene, camera, parts, jnp.asarray(wished), plan=plan, kernel=kernel, form=form))
+    return jax.tree.map(np.asarray, look(scene, camera, frame, jnp.asarray(wished), plan=plan, kernel=kernel, form=form))
 
 
 def wishes(cells, bundles):
@@ -133,7 +135,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
 
 
 @pytest.fixture
-def correlation_length(frames, x64):
+def alike(frames, x64):
     """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
     frames = frames.deep(4)
     scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
@@ -147,9 +149,9 @@ def correlation_length(frames, x64):
     return of, camera, frames.plan(4), (-(-frames.samples // CELL_SAMPLES), 16)
 
 
-def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(stages, correlation_length):
+def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(stages, alike):
     """Nothing is left that could vary but the lengths of rays, and the bounds are the range of the pixels."""
-    of, camera, plan, (cells, bundles) = correlation_length
+    of, camera, plan, (cells, bundles) = alike
     levels = np.broadcast_to(np.arange(bundles) % (MAX_LEVEL + 1), (cells, bundles)).astype(np.int32)
     found = looked(stages, of(0.0), camera, levels, plan, "lerp")
     assert found.found.max() > 0.1
@@ -158,9 +160,9 @@ def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(st
 
 
 @pytest.mark.parametrize("spread", [0.01, 0.1])
-def test_bounds_and_errors_inform(stages, correlation_length, spread):
+def test_bounds_and_errors_inform(stages, alike, spread):
     """They add little to what the pixels of a bundle differ by anyway: the slopes of colours and of extinction are 1 and less."""
-    of, camera, plan, size = correlation_length
+    of, camera, plan, size = alike
     full, painted = (
         looked(stages, of(spread), camera, np.full(size, level, np.int32), plan, "lerp") for level in (0, SUPER_PIXEL)
     )
