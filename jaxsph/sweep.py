@@ -101,11 +101,22 @@ def sweep(
     groups = contenders(settings, tolerances, estimators, baselines)
     views = _views(scene, camera, frames)
     shared = {"scene": name, "repeats": repeats, "converged": converged} | of_this_run()
+    each = [
+        _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number}) for number, one, view in views
+    ]
+    return _rows(each, groups, repeats, folder, progress)
+
+
+def _rows(
+    frames: list[_Frame],
+    groups: list[list[Contender]],
+    repeats: int,
+    folder: str | os.PathLike[str] | None,
+    progress: Progress | None,
+) -> list[Measurement]:
+    """The table: what the folder holds of it, and what is measured now."""
     held = {row.key: row for row in read_journal(_journal(folder))} if folder is not None else {}
-    tasks = []
-    for number, one, view in views:
-        frame = _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number})
-        tasks.append((frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]))
+    tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
     tick = _ticker(progress, sum(_num_renders(missing, repeats) for _, missing in tasks))
     plans: Plans = {}
     for frame, missing in tasks:

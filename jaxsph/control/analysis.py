@@ -14,14 +14,14 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.compaction import fullest_first
 from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows
-from jaxsph.control.bounds import Footprint, sample_bounds, spheres, sum_rounding
-from jaxsph.control.errors import CANDIDATES, EXPONENTIAL, cell_errors, fits
+from jaxsph.control.bounds import Footprint, SampleBounds, Spheres, sample_bounds, spheres, sum_rounding
+from jaxsph.control.errors import CANDIDATES, EXPONENTIAL, CellErrors, cell_errors, fits
 from jaxsph.control.ranges import RangeTables
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.fusion import fusion_barrier
@@ -64,65 +64,118 @@ def analyse(
         slab_samples: samples of each slab of the grid's cells.
         coverage_subdivisions: sub-rectangles on each side of a footprint, for the test of coverage.
     """
-    ordered, rank = grid.ordered, grid.lists.rank
     slabs, bundles = grid.windows.count.shape
-    dtype = ordered.x.dtype
-    per_cell = CELL_SAMPLES // slab_samples
-    num_cells = -(-slabs // per_cell)
+    num_cells = -(-slabs * slab_samples // CELL_SAMPLES)
     chunk = min(cells_at_once, -(-num_cells * bundles // 16) * 16)
-    balls = spheres(ordered)
-    missing = ((0, num_cells * per_cell - slabs), (0, 0))
-    count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
-    fullest, count = count.max(1), count.sum(1)
-    filled = jnp.pad(grid.windows.count > 0, missing)
-    order, number = fullest_first(wanted.ravel(), fullest.ravel(), chunk)
-    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
-    reference_quantity = jnp.pad(reference_quantity, missing)
-    quantities = _extremes(ordered.quantity, ordered.live)
-    borders = grid.borders(num_cells * CELL_SAMPLES)
+    band = _band(grid, beside, camera, reference_quantity, tables, slab_samples)
+    order, number = fullest_first(wanted.ravel(), band.fullest.ravel(), chunk)
 
     def analyse_chunk(step: Array, table: Array) -> Array:
         at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
-        cell, bundle, real = at // bundles, at % bundles, step * chunk + jnp.arange(chunk) < number
-        u, v = grid.rays(camera, bundle)
-        slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
-        across, alive = jnp.tile(bundle, per_cell), jnp.tile(real, per_cell)
-        window = begin[:, slab, across], jnp.where(alive, length[:, slab, across], 0)
-        edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
-        footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
-        places = _extremes(*(value[slab, across].reshape(per_cell, chunk) for value in (reference_quantity, filled)))
-        places = jnp.tile(places[0], per_cell), jnp.tile(places[1], per_cell)
-        look = functools.partial(
-            sample_bounds, tables=tables, perspective=camera.is_perspective, subdivisions=coverage_subdivisions
-        )
-        of_slabs = look(balls, rank, window, footprint, edges, places)
-        bounds = jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), of_slabs)
-        edges = borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1, dtype=jnp.int32)[:, None]]
-        paths = jnp.ones((BUNDLE, BUNDLE, chunk), dtype)
-        if camera.is_perspective:
-            paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
-        misplaced = sum_rounding(count.ravel()[at], dtype) * (quantities[1] - quantities[0])
-        # a look-up changes by no more than its channel has, even at a jump, and by nothing where all quantities are one
-        merging = jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0)
-        errors = functools.partial(cell_errors, fitting=fits(slab_samples))
-        path = paths.min((0, 1)), paths.max((0, 1))
-        found = fusion_barrier(step >= 0, errors, bounds, edges, *path, (merging[:3].max(0), merging[3]), relax)
-        entry = jnp.concatenate([found.error, found.strict, found.paint, found.thin[None]])
+        real = step * chunk + jnp.arange(chunk) < number
+        found = band.errors(at, real, relax, coverage_subdivisions)
+        entry = jnp.concatenate([found.error, found.strict, found.paint, found.tau_lo[None]])
         return table.at[:, jnp.where(real, at, table.shape[1])].set(entry, mode="drop", unique_indices=True)
 
     # what is not analysed stays at level 0: the only candidate without an infinite error
-    blank = jnp.full(2 * CANDIDATES + 5, jnp.inf, dtype).at[jnp.asarray([0, CANDIDATES, -1])].set(0)[:, None]
+    blank = jnp.full(2 * CANDIDATES + 5, jnp.inf, grid.ordered.x.dtype).at[jnp.asarray([0, CANDIDATES, -1])].set(0)[:, None]
     table = jnp.broadcast_to(blank, (blank.shape[0], num_cells * bundles))
     table = lax.fori_loop(0, (number + chunk - 1) // chunk, analyse_chunk, table).reshape(-1, num_cells, bundles)
-    error, strict, paint, thin = jnp.split(table, [CANDIDATES, 2 * CANDIDATES, 2 * CANDIDATES + 4])
-    front = _transmitted(thin[0])
+    error, strict, paint, tau_lo = jnp.split(table, [CANDIDATES, 2 * CANDIDATES, 2 * CANDIDATES + 4])
+    front = _transmitted(tau_lo[0])
     return Analysis(front * error, front * strict, paint)
 
 
-def _transmitted(thin: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
+@dataclasses.dataclass(frozen=True)
+class _Band:
+    """What the cells of a band are bounded by; slabs are padded to whole cells.
+
+    Attributes:
+        begin, length: windows of slabs with their borders.
+        count, fullest: particles of a cell's slabs in all, and of the fullest.
+        filled, reference_quantity: of slabs.
+        quantities: least and greatest of all particles.
+        borders: of samples.
+    """
+
+    grid: Grid
+    camera: Camera
+    balls: Spheres
+    tables: RangeTables
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+    count: Int[Array, "cells bundles"]
+    fullest: Int[Array, "cells bundles"]
+    filled: Bool[Array, "slabs bundles"]
+    reference_quantity: Float[Array, "slabs bundles"]
+    quantities: tuple[Array, Array]
+    borders: Float[Array, " samples_and_one"]
+    slab_samples: int
+
+    @property
+    def per_cell(self) -> int:
+        """Slabs of a cell."""
+        return CELL_SAMPLES // self.slab_samples
+
+    def errors(self, at: Array, real: Array, relax: Array, subdivisions: int) -> CellErrors:
+        """Errors of some cells' candidates."""
+        bundles = self.grid.windows.count.shape[1]
+        cell, bundle = at // bundles, at % bundles
+        u, v = self.grid.rays(self.camera, bundle)
+        bounds = self._bounds(cell, bundle, real, (u, v), subdivisions)
+        edges = self.borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1, dtype=jnp.int32)[:, None]]
+        paths = jnp.ones((BUNDLE, BUNDLE, at.shape[0]), edges.dtype)
+        if self.camera.is_perspective:
+            paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
+        path = paths.min((0, 1)), paths.max((0, 1))
+        errors = functools.partial(cell_errors, fitting=fits(self.slab_samples))
+        return fusion_barrier(at[0] >= 0, errors, bounds, edges, *path, self._merging(at), relax)
+
+    def _bounds(self, cell: Array, bundle: Array, real: Array, rays: tuple[Array, Array], subdivisions: int) -> SampleBounds:
+        """Bounds of all samples of cells."""
+        per_cell, (u, v) = self.per_cell, rays
+        slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
+        across, alive = jnp.tile(bundle, per_cell), jnp.tile(real, per_cell)
+        window = self.begin[:, slab, across], jnp.where(alive, self.length[:, slab, across], 0)
+        edges = self.borders[slab * self.slab_samples + jnp.arange(self.slab_samples + 1, dtype=jnp.int32)[:, None]]
+        footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
+        of_slabs = (value[slab, across].reshape(per_cell, -1) for value in (self.reference_quantity, self.filled))
+        references = _extremes(*of_slabs)
+        references = jnp.tile(references[0], per_cell), jnp.tile(references[1], per_cell)
+        look = functools.partial(sample_bounds, perspective=self.camera.is_perspective, subdivisions=subdivisions)
+        found = look(self.balls, self.grid.lists.rank, window, footprint, edges, references, self.tables)
+        return jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), found)
+
+    def _merging(self, at: Array) -> tuple[Array, Array]:
+        """By how much colour and extinction of a sample can be rounded otherwise when cells are merged.
+
+        A look-up changes by no more than its channel has, even at a jump, and by nothing where all quantities are one.
+        """
+        tables, dtype = self.tables, self.borders.dtype
+        misplaced = sum_rounding(self.count.ravel()[at], dtype) * (self.quantities[1] - self.quantities[0])
+        merging = jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0)
+        return merging[:3].max(0), merging[3]
+
+
+def _band(
+    grid: Grid, beside: SlabWindows, camera: Camera, reference_quantity: Array, tables: RangeTables, slab_samples: int
+) -> _Band:
+    slabs, bundles = grid.windows.count.shape
+    per_cell = CELL_SAMPLES // slab_samples
+    num_cells = -(-slabs // per_cell)
+    missing = ((0, num_cells * per_cell - slabs), (0, 0))
+    begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
+    count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
+    filled, reference = jnp.pad(grid.windows.count > 0, missing), jnp.pad(reference_quantity, missing)
+    quantities, borders = _extremes(grid.ordered.quantity, grid.ordered.live), grid.borders(num_cells * CELL_SAMPLES)
+    of_cells, balls = (count.sum(1), count.max(1)), spheres(grid.ordered)
+    return _Band(grid, camera, balls, tables, begin, length, *of_cells, filled, reference, quantities, borders, slab_samples)
+
+
+def _transmitted(tau_lo: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
     """At least what the cells in front let through, as computed: the sum is rounded down, the result up."""
-    eps, cells = jnp.finfo(thin.dtype).eps, thin.shape[0]
-    total = lax.associative_scan(jnp.add, thin) * (1 - (cells + 2) * eps)
+    eps, cells = jnp.finfo(tau_lo.dtype).eps, tau_lo.shape[0]
+    total = lax.associative_scan(jnp.add, tau_lo) * (1 - (cells + 2) * eps)
     # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
     return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * (
         1 + (EXPONENTIAL + 1) * CELL_SAMPLES * cells * eps

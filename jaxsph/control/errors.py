@@ -53,13 +53,13 @@ class CellErrors:
             ascends with the level.
         strict: the same without relaxation.
         paint: red, green, blue and extinction of the super-pixel.
-        thin: least optical thickness.
+        tau_lo: least optical thickness.
     """
 
     error: Float[Array, "candidates bundles"]
     strict: Float[Array, "candidates bundles"]
     paint: Float[Array, "4 bundles"]
-    thin: Float[Array, " bundles"]
+    tau_lo: Float[Array, " bundles"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +69,10 @@ class _Optics:
     color: list[tuple[Array, Array]]
     extinction: tuple[Array, Array]
     steps: Array
-    thin: Array
-    before: Array
-    dark_lo: Array
-    dark_hi: Array
+    tau_lo: Array
+    front: Array
+    absorbed_lo: Array
+    absorbed_hi: Array
 
 
 def cell_errors(
@@ -100,7 +100,7 @@ def cell_errors(
     outward = 1 + EVALUATION * jnp.finfo(borders.dtype).eps
     paint, lateral = _super_pixel(optics, longest)
 
-    rounding = merging[0] * optics.dark_hi.sum(0) + merging[1] * optics.steps.sum(0) * longest
+    rounding = merging[0] * optics.absorbed_hi.sum(0) + merging[1] * optics.steps.sum(0) * longest
     whole = (bounds.covered | ~bounds.touched).all(0)
 
     def of_levels(share: Array) -> Array:
@@ -112,7 +112,7 @@ def cell_errors(
 
     strict = of_levels(jnp.zeros_like(relax))
     error = jnp.where(whole, lax.cond(relax > 0, of_levels, lambda _: strict, relax), strict)
-    return CellErrors(error, strict, paint, optics.thin.sum(0))
+    return CellErrors(error, strict, paint, optics.tau_lo.sum(0))
 
 
 def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Array) -> _Optics:
@@ -120,10 +120,10 @@ def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Arra
     extinction = jnp.where(bounds.covered, bounds.lo[3], 0), jnp.where(bounds.touched, bounds.hi[3], 0)
     color = [_filled(lo, hi, bounds.touched) for lo, hi in zip(bounds.lo[:3], bounds.hi[:3], strict=True)]
     rounding = DEPTH_ROUNDING * jnp.finfo(borders.dtype).eps
-    thin, thick = extinction[0] * steps * shortest * (1 - rounding), extinction[1] * steps * longest * (1 + rounding)
-    before_hi, before_lo = (jnp.exp(-_sum_in_front(depth)) for depth in (thin, thick))
-    dark_hi, dark_lo = before_hi * _opacity(thick), before_lo * jnp.maximum(_opacity(thin) - 2 * _rounding(thin), 0)
-    return _Optics(color, extinction, steps, thin, before_hi, dark_lo, dark_hi)
+    tau_lo, tau_hi = extinction[0] * steps * shortest * (1 - rounding), extinction[1] * steps * longest * (1 + rounding)
+    front_hi, front_lo = (jnp.exp(-_sum_in_front(depth)) for depth in (tau_lo, tau_hi))
+    absorbed_hi, absorbed_lo = front_hi * _opacity(tau_hi), front_lo * jnp.maximum(_opacity(tau_lo) - 2 * _rounding(tau_lo), 0)
+    return _Optics(color, extinction, steps, tau_lo, front_hi, absorbed_lo, absorbed_hi)
 
 
 def _filled(lo: Array, hi: Array, touched: Array) -> tuple[Array, Array]:
@@ -170,13 +170,13 @@ def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax
         return jnp.minimum(strict, jnp.maximum(union - relax * (hi - lo), 0))
 
     steps, least = windows(optics.steps), windows(optics.extinction[0])
-    off = jnp.stack([(deviation(*channel) * windows(optics.dark_hi)).sum(1) for channel in optics.color]).max(0)
+    off = jnp.stack([(deviation(*channel) * windows(optics.absorbed_hi)).sum(1) for channel in optics.color]).max(0)
     off_depth = (deviation(*optics.extinction) * steps).sum(1) * longest
     coarse = least[:, middle].max(1) * steps.sum(1) * shortest * (1 - DEPTH_ROUNDING * jnp.finfo(steps.dtype).eps)
-    thinnest = jnp.minimum(windows(optics.thin).sum(1), coarse)
+    thinnest = jnp.minimum(windows(optics.tau_lo).sum(1), coarse)
     lost = jnp.exp(-thinnest) * _opacity(off_depth)
     rounding = (width + 1) * _rounding(steps) * (windows(optics.extinction[1]).max(1) > 0)
-    return (off + windows(optics.before)[:, 0] * (lost + rounding)).sum(0)
+    return (off + windows(optics.front)[:, 0] * (lost + rounding)).sum(0)
 
 
 def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
@@ -190,16 +190,16 @@ def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
     depth = optics.steps.sum(0)
     extinction = (0.5 * (lo + hi) * optics.steps).sum(0) / jnp.where(depth > 0, depth, 1)
     off_depth = ((0.5 * (hi - lo) * optics.steps).sum(0) + DEPTH_ROUNDING * eps * extinction * depth) * longest
-    dark, unsure = 0.5 * (optics.dark_lo + optics.dark_hi), 0.5 * (optics.dark_hi - optics.dark_lo)
-    total = dark.sum(0)
+    absorbed, unsure = 0.5 * (optics.absorbed_lo + optics.absorbed_hi), 0.5 * (optics.absorbed_hi - optics.absorbed_lo)
+    total = absorbed.sum(0)
     paint, off = [], []
     for lo, hi in optics.color:
         middle = 0.5 * (lo + hi)
-        chosen = jnp.clip((middle * dark).sum(0) / jnp.where(total > 0, total, 1), 0, 1)
+        chosen = jnp.clip((middle * absorbed).sum(0) / jnp.where(total > 0, total, 1), 0, 1)
         paint.append(chosen)
-        uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * dark)
-        off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.dark_hi + uneven).sum(0))
-    lost = jnp.exp(-optics.thin.sum(0)) * _opacity(off_depth)
+        uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * absorbed)
+        off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.absorbed_hi + uneven).sum(0))
+    lost = jnp.exp(-optics.tau_lo.sum(0)) * _opacity(off_depth)
     rounding = (CELL_SAMPLES + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
     return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding
 
