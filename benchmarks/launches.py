@@ -1,0 +1,120 @@
+"""Claim: tuned for accelerators, a frame of a million particles at 1024 x 1024 x 256 samples starts at most 3,000 kernels.
+
+An accelerator takes microseconds to start a kernel, however little it does. Counted is what XLA's CPU backend executes for the
+same programs, by its profiler: every kernel, copy and sort, also those of a loop's counter. What holds kernels (loops,
+branches) is counted apart. Another backend fuses otherwise, but goes through the same loops.
+The same frame with the tuning for CPUs is counted with --both. Writes `results/launches.json`.
+
+    python benchmarks/launches.py [--particles 1000000] [--size 1024] [--samples 256] [--both]
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import json
+import pathlib
+import re
+import tempfile
+import time
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import workloads
+
+import jaxsph as js
+from jaxsph.frame import Frame
+from jaxsph.layers import develop
+from jaxsph.numerics.tuning import ACCELERATOR, CPU, Tuning
+from jaxsph.planning import see
+from jaxsph.provenance import of_this_run
+
+MOST = 3_000
+MEMORY = 16 << 30  # bytes that a plan may take: in one band
+UNWRITTEN = 0.1  # seconds after which the profiler has the last kernels of a program
+HOLDS = re.compile(r"(while|cond|conditional|call)\b")
+RESULTS = pathlib.Path(__file__).with_name("results") / "launches.json"
+
+
+class Counted:
+    """Runs stages as they are and counts what each executes, by name."""
+
+    def __init__(self) -> None:
+        self.kernels: dict[str, collections.Counter[str]] = {}
+
+    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        def program(*arguments: Any) -> Any:
+            return function.__wrapped__(*arguments, **static)
+
+        compiled = jax.jit(program).lower(*arguments).compile()
+        instructions = set(re.findall(r"%([\w.\-]+) = ", compiled.as_text()))
+        result, executed = traced(lambda: compiled(*arguments), instructions)
+        self.kernels.setdefault(function.__name__, collections.Counter()).update(executed)
+        return result
+
+    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        return [self.one(stage, function, arguments, **static) for arguments in inputs]
+
+    def may_hold(self, flag: jax.Array) -> bool:
+        return bool(flag)
+
+
+def traced(run: Callable[[], Any], instructions: set[str]) -> tuple[Any, collections.Counter[str]]:
+    """A program's result, and how often it executed each of its instructions, on whatever threads."""
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            result = jax.block_until_ready(run())
+            time.sleep(UNWRITTEN)
+        (path,) = pathlib.Path(folder).rglob("*.xplane.pb")
+        planes = jax.profiler.ProfileData.from_file(str(path)).planes
+        names = [event.name for plane in planes for line in plane.lines for event in line.events]
+    return result, collections.Counter(name for name in names if name in instructions)
+
+
+def frame(scene: js.Scene, camera: js.Camera, samples: int, tuning: Tuning) -> dict[str, Any]:
+    """Launches of each stage of a frame at full rate, all bundles in one shard."""
+    plan = js.plan(scene, camera, js.Settings(samples=samples, memory_limit=MEMORY), tuning=tuning)
+    run = Counted()
+    seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
+    drawn = Frame.begun(seen, camera, None, plan, scene.particles.kernel, 1, run)
+    bands = tuple(drawn.band(jnp.int32(band * plan.band_height), run).of_shards for band in range(plan.bands))
+    run.one("image", develop, (bands,), plan=plan)
+    stages = {stage: counts(executed) for stage, executed in run.kernels.items()}
+    total = {kind: sum(stage[kind] for stage in stages.values()) for kind in ("launches", "containers")}
+    return {"tuning": dataclasses.asdict(tuning), "bands": plan.bands, **total, "stages": stages}
+
+
+def counts(executed: collections.Counter[str]) -> dict[str, Any]:
+    """Launches, containers, and how many kernels are launched how often."""
+    kernels = {name: number for name, number in executed.items() if not HOLDS.match(name)}
+    times = collections.Counter(kernels.values())
+    launches = sum(kernels.values())
+    return {"launches": launches, "containers": executed.total() - launches, "kernels_by_times": dict(sorted(times.items()))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--particles", type=int, default=1_000_000)
+    parser.add_argument("--size", type=int, default=1024, help="pixels on a side")
+    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--both", action="store_true", help="count the same with the tuning for CPUs")
+    arguments = parser.parse_args()
+    work = workloads.cube(round(arguments.particles ** (1 / 3)), size=arguments.size, samples=arguments.samples)
+    scene, camera = work.scene("poly6"), work.camera()
+    frames = {}
+    for name, tuning in {"accelerator": ACCELERATOR, **({"cpu": CPU} if arguments.both else {})}.items():
+        frames[name] = frame(scene, camera, arguments.samples, tuning)
+        each = "  ".join(f"{stage} {found['launches']}" for stage, found in frames[name]["stages"].items())
+        print(f"{name}: {frames[name]['launches']} launches, {frames[name]['containers']} containers; {each}", flush=True)
+    size = {"particles": scene.particles.num_particles, "size": arguments.size, "samples": arguments.samples}
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps({"run": of_this_run(), "workload": work.name, **size, "frames": frames}, indent=1) + "\n")
+    launches = frames["accelerator"]["launches"]
+    assert launches <= MOST, f"{launches} launches"
+
+
+if __name__ == "__main__":
+    main()
