@@ -31,10 +31,11 @@ import workloads
 import jaxsph as js
 from jaxsph.access.grid import Grid
 from jaxsph.access.ordering import rank_particles
-from jaxsph.access.slab_windows import SlabWindows, slab_windows_with_borders
+from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows, slab_windows_with_borders
 from jaxsph.access.view import view_particles
-from jaxsph.cast.march import gather
-from jaxsph.field.schedule import CELL_SAMPLES, full_rate, reference_quantities
+from jaxsph.field.gather import gather
+from jaxsph.field.schedule import full_rate, reference_quantities
+from jaxsph.field.tasks import SlabTask
 from jaxsph.model.transfer import Segments, look_up
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
@@ -128,14 +129,16 @@ def light_of_candidates(grid: Grid, beside: SlabWindows, scene: js.Scene, camera
     u, v = (rays.T for rays in grid.rays(camera, bundle))
     half = jnp.minimum(2 * CELL_SAMPLES * cell[:, None] + jnp.arange(2 * CELL_SAMPLES + 1), grid.half_steps.shape[0] - 1)
     depth = grid.half_steps[half]
-    work = full_rate(beside, reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity))
-    item = jax.tree.map(lambda leaf: leaf[..., cell, bundle], work)
-    sums = gather(grid.ordered, grid.lists.rank, item, (u, v, depth[:, 1:-1]), camera.is_perspective, kernel)
-    weight, weighted = (value.reshape(*value.shape[:2], 64) for value in (sums.real, sums.imag))
+    schedule = full_rate(beside, reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity))
+    entry = jax.tree.map(lambda leaf: leaf[..., cell, bundle], schedule)
+    border = 0.5 * (depth[:, 1:] + depth[:, :-1])
+    task = SlabTask(entry, cell, bundle, u, v, depth[:, 1:-1], border, camera.is_perspective)
+    sums = gather(grid.ordered, grid.lists.rank, task, kernel)
+    weight, weighted = (value.reshape(*value.shape[:2], 64) for value in sums.all)
     slant = jnp.ones((at.shape[0], 1, 64), depth.dtype)
     if camera.is_perspective:
         slant = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, 64)
-    segments, origin = scene.transfer.segments(), item.origin[:, None, None]
+    segments, reference = scene.transfer.segments(), entry.reference_quantity[:, None, None]
 
     def light_of(candidate: Candidate) -> Array:
         step = 1 << candidate.level
@@ -147,17 +150,17 @@ def light_of_candidates(grid: Grid, beside: SlabWindows, scene: js.Scene, camera
         if candidate.field:
             sums = [jnp.einsum("pr,csr->csp", across, value) for value in sums]
         path = slant * jnp.diff(depth[:, :: 2 * step])[:, :, None]
-        light = shaded(sums, origin, path, segments)
+        light = shaded(sums, reference, path, segments)
         return light if candidate.field else jnp.einsum("pr,xcr->xcp", across, light)
 
     return jnp.stack([light_of(candidate) for candidate in CANDIDATES])
 
 
-def shaded(sums: list[Array], origin: Array, path: Array, segments: Segments) -> Array:
+def shaded(sums: list[Array], reference: Array, path: Array, segments: Segments) -> Array:
     """Light of cells of samples with these sums over particles, (4, cells, 64)."""
     weight, weighted = sums
     inside = weight > 0
-    *color, extinction = look_up(segments, origin + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0))
+    *color, extinction = look_up(segments, reference + jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0))
     left = jnp.exp(-jnp.cumsum(jnp.where(inside, extinction * path, 0), 1))
     before = jnp.concatenate([jnp.ones_like(left[:, :1]), left[:, :-1]], 1)
     return jnp.stack([*((channel * (before - left)).sum(1) for channel in color), left[:, -1]])
@@ -179,7 +182,7 @@ def cut(scene: js.Scene, camera: js.Camera) -> Cut:
     usual = js.plan(scene, camera, js.Settings())
     deep = js.plan(scene, camera, js.Settings(), slab_samples=CELL_SAMPLES)
     assert usual.bands == deep.bands == 1, "the image is too large to be compared in one piece"
-    slabs = np.asarray(grid_of(scene, camera, usual).cells.count)
+    slabs = np.asarray(grid_of(scene, camera, usual).windows.count)
     per_cell = CELL_SAMPLES // usual.cast.slab_samples
     slabs = np.pad(slabs, ((0, -len(slabs) % per_cell), (0, 0))).reshape(-1, per_cell, slabs.shape[1])
     work = slabs.sum(1) * usual.cast.slab_samples
@@ -201,7 +204,8 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Grid:
     ordered = rank_particles(
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
-    return make_grid(ordered, camera, jnp.int32(0), plan=plan).of(ordered)
+    sizes = {"lists": plan.lists, "samples": plan.samples, "halo": 0, "tuning": plan.cast.tuning}
+    return make_grid(ordered, camera, jnp.int32(0), **sizes).of(ordered)
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -250,11 +254,11 @@ def best(frame: Cut, errors: np.ndarray, families: tuple[str, ...], tolerance: f
     chosen = (saving - high[frame.bundle] * errors).argmax(0)
     light = frame.light[np.asarray(offered)[chosen], :, every].swapaxes(0, 1)
     error = np.abs(composited(frame, light)[0] - composited(frame, frame.light[0])[0]).max()
-    held = np.bincount(chosen, frame.work, len(offered)) / frame.work.sum()
+    taken = np.bincount(chosen, frame.work, len(offered)) / frame.work.sum()
     return {
         "saved": float(frame.work.sum() / (frame.work * share[chosen]).sum()),
         "max_error": float(error),
-        "share_of_work": {CANDIDATES[k].name: round(float(part), 4) for k, part in zip(offered, held, strict=True) if part},
+        "share_of_work": {CANDIDATES[k].name: round(float(part), 4) for k, part in zip(offered, taken, strict=True) if part},
     }
 
 
