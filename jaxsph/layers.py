@@ -18,7 +18,7 @@ from jaxsph.access.shards import unshard
 from jaxsph.cast.march import RayResult
 from jaxsph.model import registry
 from jaxsph.model.image import Image
-from jaxsph.numerics.programs import light
+from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.plan import Plan
 from jaxsph.stages import Cast, Verdict
 
@@ -47,7 +47,7 @@ class Layers(NamedTuple):
     levels: Int[Array, "bundle_rows bundle_columns cells"] | None
 
 
-@light
+@compiled_quickly
 @functools.partial(jax.jit, static_argnames="plan")
 def develop(bands: tuple[OfShards, ...], *, plan: Plan) -> Layers:
     """The image, of all of its bands."""

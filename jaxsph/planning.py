@@ -25,7 +25,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
-from jaxsph.numerics.programs import light
+from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class, require_controllable
 from jaxsph.viewing import Seen, view_scene
@@ -83,7 +83,7 @@ def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: 
     return seen
 
 
-@light
+@compiled_quickly
 @functools.partial(jax.jit, static_argnames="capacity")
 def pad(particles: Particles, *, capacity: int) -> Particles:
     """`Particles.padded` as a stage."""

@@ -40,7 +40,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.fusion import barriers
-from jaxsph.numerics.programs import light
+from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning
 from jaxsph.viewing import half_steps
 
@@ -55,7 +55,7 @@ def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]],
                 return function(*arguments, tuning=tuning, **static)
 
         jitted = jax.jit(tuned, static_argnames=(*static, "tuning"))
-        return light(jitted) if quickly else jitted
+        return compiled_quickly(jitted) if quickly else jitted
 
     return made
 
@@ -156,11 +156,11 @@ def sum_shard(
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
     slab_samples, room = cast.slab_samples, control.room or lists.bundles
     wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
-    amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
-    amid = amid.astype(grid.half_steps.dtype)
+    reference = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
+    reference = reference.astype(grid.half_steps.dtype)
     region = region_of(grid, *room, control.nodes)
     of_shard = shard_of_grid(grid, nth, shards)
-    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, amid, tuning.cells_of_nodes, wanted)
+    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, reference, tuning.cells_of_nodes, wanted)
 
 
 @stage(quickly=True)

@@ -21,7 +21,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import faults
-from jaxsph.numerics.programs import light
+from jaxsph.numerics.programs import compiled_quickly
 
 
 class Seen(NamedTuple):
@@ -32,7 +32,7 @@ class Seen(NamedTuple):
     media: tuple[Medium, ...]
 
 
-@light
+@compiled_quickly
 @functools.partial(jax.jit, static_argnames=("samples", "num_classes"))
 def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""

@@ -1,1 +1,1 @@
-"""Where particles are: which of them can touch a ray bundle, a cell, a sample."""
+"""Where particles are: which of them can touch a ray bundle, a slab, a sample."""

@@ -1,10 +1,10 @@
 """Compact what is filled along each bundle, so that empty space costs nothing.
 
-Flow: cells -> [compaction] -> control, cast.
+Flow: slab windows -> [compaction] -> control, cast.
 
 Layer n of the compacted slabs holds every bundle's n-th filled item, front to back without gaps. With bundles in order of
 height, the bundles of a layer are the first so many of all: the layers, one after the other, are a list of items in which those
-that are near in depth are near each other, and any stretch of it can be put in front of what follows.
+that are near in depth are near each other, and any part of it can be put in front of what follows.
 """
 
 from __future__ import annotations

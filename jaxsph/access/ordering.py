@@ -52,11 +52,6 @@ class Ordered:
     first_beside: Int[Array, "classes slabs"]
     last_beside: Int[Array, "classes slabs"]
 
-    @property
-    def quantities(self) -> tuple[Float[Array, " particles"], ...]:
-        """All that is summed up of particles besides their weights."""
-        return (self.quantity,)
-
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Ordered))[:12]
 

@@ -1,9 +1,10 @@
-"""The sparse perspective grid: for every cell, the windows of its bundle's list that can touch it.
+"""The sparse perspective grid: for every slab of a bundle, the windows of its list that can touch it.
 
-Flow: lists -> [cells] -> cast -> image.
+Flow: lists -> [slab_windows] -> control, schedule.
 
-A cell is a bundle of 8 x 8 rays times a slab of samples. Nothing is copied along depth: a particle that touches ten cells of
-a bundle is listed once and lies in ten windows. There is a window for each class of supports.
+A slab is some samples of all rays of a bundle, a cell as many slabs as have `CELL_SAMPLES` samples. Nothing is copied along
+depth: a particle that touches ten slabs of a bundle is listed once and lies in ten windows. There is a window for each class
+of supports.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ CELL_SAMPLES = 1 << MAX_LEVEL  # fine samples of a cell along depth: D_z of Hoch
 class SlabWindows:
     """Windows `rank[begin : begin + length]` of a bundle's list, and their sum over classes.
 
-    A cell with `count` 0 is empty: no particle can touch it.
+    A slab with `count` 0 is empty: no particle can touch it.
     """
 
     begin: Int[Array, "classes slabs bundles"]
@@ -42,15 +43,6 @@ def find_slab_windows(ordered: Ordered, lists: BundleLists) -> SlabWindows:
 def slab_windows_with_borders(ordered: Ordered, lists: BundleLists) -> SlabWindows:
     """The same for slabs with all that lies between their samples and those of the next: for samples of any spacing."""
     return _windows(lists, ordered.first_beside, ordered.last_beside)
-
-
-def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], length: Int[Array, "classes *any"]) -> Array:
-    """Where the `index`-th particle of each cell stands in the lists: the cell's windows, one class after the other."""
-    place, before = begin[0] + index, length[0]
-    for k in range(1, begin.shape[0]):
-        place = jnp.where(index >= before, (begin[k] - before) + index, place)
-        before = before + length[k]
-    return place
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Along rays: from particles near a cell to colour and transmittance."""
+"""Along rays: from the optics of media at samples to colour and transmittance, and back for gradients."""

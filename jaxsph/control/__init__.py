@@ -1,1 +1,1 @@
-"""How much work is enough: bounds, levels, merging, and the list of work that is left for the cast."""
+"""How much work is enough: bounds, estimates, levels and merging, and the schedule that follows."""

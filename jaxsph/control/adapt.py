@@ -1,6 +1,6 @@
 """Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
 
-Flow: cells -> [look -> adapt: analysis -> levels -> merge] -> worklist -> cast -> image.
+Flow: slab windows -> [screen_cells -> adapt: analysis -> levels -> merge] -> schedule -> cast -> image.
 """
 
 from __future__ import annotations
@@ -124,6 +124,6 @@ def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundle
 
 
 def _nowhere(cells: SlabWindows, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
-    """SlabWindows that no particle can touch."""
+    """Cells that no particle can touch."""
     count = jnp.pad(cells.count, ((0, num_cells * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
     return count.reshape(num_cells, -1, count.shape[1]).sum(1) == 0

@@ -2,7 +2,7 @@
 
 Flow: cells -> probe -> [analysis: bounds -> errors] -> levels -> merge -> cast -> image.
 
-SlabWindows are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So
+Cells are analysed one by one, as if nothing lay in front of them; what does is then a product along the bundle. So
 promising cells can be taken in any order: fullest first, some at a time, wherever they are.
 """
 

@@ -29,8 +29,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
-from jaxsph.access.slab_windows import position
 from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
@@ -100,12 +100,12 @@ def sample_bounds(
         reference_quantity: least and greatest quantity that the sums of these samples may be taken relative to.
         subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
     """
-    spread = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
+    lateral_scales = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
     total = window[1].sum(0)
     samples, bundles = borders.shape[0] - 1, borders.shape[1]
     dtype = borders.dtype
-    box = _boxes(footprint.columns, spread, 1), _boxes(footprint.rows, spread, 1)
-    boxes = _boxes(footprint.columns, spread, subdivisions), _boxes(footprint.rows, spread, subdivisions)
+    box = _boxes(footprint.columns, lateral_scales, 1), _boxes(footprint.rows, lateral_scales, 1)
+    boxes = _boxes(footprint.columns, lateral_scales, subdivisions), _boxes(footprint.rows, lateral_scales, subdivisions)
     sides = jnp.asarray([-1, 1], dtype)[:, None, None]
     one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
@@ -145,10 +145,12 @@ def sum_rounding(terms: Array, dtype: Any) -> Array:
     return (terms + 6) * jnp.finfo(dtype).eps
 
 
-def _boxes(rays: Array, spread: tuple[Array, Array], parts: int) -> tuple[Array, Array]:
+def _boxes(rays: Array, lateral_scales: tuple[Array, Array], parts: int) -> tuple[Array, Array]:
     """Least and greatest view coordinate of each part of the footprint, (parts, bundles)."""
     first, last = rays[:: BUNDLE // parts], rays[BUNDLE // parts - 1 :: BUNDLE // parts]
-    return jnp.minimum(spread[0] * first, spread[1] * first), jnp.maximum(spread[0] * last, spread[1] * last)
+    return jnp.minimum(lateral_scales[0] * first, lateral_scales[1] * first), jnp.maximum(
+        lateral_scales[0] * last, lateral_scales[1] * last
+    )
 
 
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:

@@ -1,6 +1,6 @@
 """A budget shared out: what to take so that most is gained and the variances of what is taken add up to no more.
 
-Flow: interpolation_error -> [budget] -> worklist.
+Flow: interpolation_error -> [knapsack] -> schedule.
 """
 
 from __future__ import annotations

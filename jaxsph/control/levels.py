@@ -85,9 +85,9 @@ def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Arr
     best, taken, chosen = saving[0], error[0], jnp.zeros(saving.shape[1:], jnp.int32)
     for candidate in range(1, CANDIDATES):
         possible = error[candidate] < jnp.inf
-        worth = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
-        better = possible & (worth > best)
-        best, taken = jnp.where(better, worth, best), jnp.where(better, error[candidate], taken)
+        net = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
+        better = possible & (net > best)
+        best, taken = jnp.where(better, net, best), jnp.where(better, error[candidate], taken)
         chosen = jnp.where(better, candidate, chosen)
     return chosen, taken
 

@@ -1,6 +1,6 @@
 """Turn choices into a schedule: coarse slabs with the particles that they need, cells merged until they are full.
 
-Flow: levels -> [merge] -> worklist -> cast -> image.
+Flow: levels -> [merge] -> schedule -> cast -> image.
 
 A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
 one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as

@@ -1,6 +1,6 @@
 r"""The pilot estimator: which slabs are interpolated, from the lattice or between some of their rays, and how widely they sample.
 
-Flow: lattice -> interpolation_error -> [pilot] -> worklist -> cast -> image.
+Flow: lattice -> interpolation_error -> [pilot] -> schedule -> cast -> image.
 
 Errors are treated as noise whose variances add up along a bundle, and `DEVIATIONS` standard deviations are the estimate: not a
 bound. The budget goes to interpolation first (`interpolation_error`): wherever it is taken, the price of an evaluation saved is

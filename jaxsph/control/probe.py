@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.compaction import compact
 from jaxsph.access.grid import Grid
-from jaxsph.access.slab_windows import CELL_SAMPLES, position
+from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
 
 PROBES = 8  # particles of each slab, from the middle half of its window
@@ -58,7 +59,7 @@ def probe(
     slab_samples: int,
     cells_at_once: int,
 ) -> Probe:
-    """SlabWindows whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
+    """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
     What is promising grows with `tolerance`.

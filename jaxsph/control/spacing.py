@@ -1,6 +1,6 @@
 r"""Wider spaced samples in interpolated slabs: where light bends little along the rays, fewer samples tell as much.
 
-Flow: interpolation_error -> [spacing] -> worklist -> cast.
+Flow: interpolation_error -> [spacing] -> schedule -> cast.
 
 Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
 for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean, and twice w also resolves a kink of g that much worse. The nodes

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.ordering import Ordered
-from jaxsph.access.slab_windows import position
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +32,26 @@ class Block:
     quantities: tuple[Float[Array, "..."], ...]
 
 
+def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], length: Int[Array, "classes *any"]) -> Array:
+    """Where the `index`-th particle of each slab stands in the lists: the slab's windows, one class after the other."""
+    place, before = begin[0] + index, length[0]
+    for k in range(1, begin.shape[0]):
+        place = jnp.where(index >= before, (begin[k] - before) + index, place)
+        before = before + length[k]
+    return place
+
+
 def particle_at(
     rank: Int[Array, " pairs"], begin: Int[Array, "classes ..."], length: Int[Array, "classes ..."], index: Int[Array, "..."]
 ) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
     """The `index`-th particle of windows, and whether there are so many; if not, it is any."""
     place = position(index, begin, length)
     return rank[jnp.clip(place, 0, rank.shape[0] - 1)], index < length.sum(0)
+
+
+def quantities_of(ordered: Ordered) -> tuple[Float[Array, " particles"], ...]:
+    """All that is summed up of particles besides their weights."""
+    return (ordered.quantity,)
 
 
 def fetch(
@@ -51,7 +64,7 @@ def fetch(
     """The `index`-th particles of windows (`begin`, `length`), by rank and as such; shapes are those that broadcasting gives."""
     particle, inside = particle_at(rank, *windows, index)
     x, y, z, scale, size, *quantities = (
-        column[particle] for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *ordered.quantities)
+        column[particle] for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *quantities_of(ordered))
     )
     relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
     return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.access.ordering import Ordered
-from jaxsph.field.fetch import fetch
+from jaxsph.field.fetch import fetch, quantities_of
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model import kernels
@@ -54,4 +54,4 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
 
     zero = jnp.zeros((*su.shape[:2], task.v.shape[1], task.u.shape[1]), su.dtype)
     blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-    return lax.fori_loop(0, blocks, add_block, sums_of([zero] * (1 + len(ordered.quantities))))
+    return lax.fori_loop(0, blocks, add_block, sums_of([zero] * (1 + len(quantities_of(ordered)))))

@@ -9,6 +9,7 @@ taken. No ray outside the bundle is needed, for which its lists would lack parti
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax.numpy as jnp
@@ -16,10 +17,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE
-from jaxsph.access.ordering import Ordered
 from jaxsph.field.lattice import REACH, Lattice, Spacing
-from jaxsph.field.nodes import NodeRays, gather_nodes
 from jaxsph.field.schedule import SUBSAMPLE
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
@@ -50,6 +50,14 @@ def interpolate(
         return jnp.matmul(_in_depth(nodes, step, spacing, slab_samples), lateral, precision=lax.Precision.HIGHEST)
 
     return sums_of([spread(channel) for channel in nodes.all])
+
+
+def interpolate_slabs(lattice: Lattice, grid: Grid, task: SlabTask, *, level: int) -> Sums:
+    """Sums (tasks, samples, 8, 8) of slabs whose samples are `2**level` fine samples apart."""
+    row, column = (side[task.bundle] * lattice.region.spacing.across for side in lattice.region.place(grid)[:2])
+    found = interpolate(lattice, task.slab, (row, column), task.depth.shape[1], level)
+    shape = (*found.packed[0].shape[:2], BUNDLE, BUNDLE)
+    return dataclasses.replace(found, packed=tuple(value.reshape(shape) for value in found.packed))
 
 
 def _near(lattice: Lattice, first: Int[Array, "tasks 3"], *, layers: int) -> Sums:
@@ -93,22 +101,24 @@ def cubic(t: float) -> tuple[float, float, float, float]:
     return -t * (t - 1) * (t - 2) / 6, (t + 1) * (t - 1) * (t - 2) / 2, -(t + 1) * t * (t - 2) / 2, (t + 1) * t * (t - 1) / 6
 
 
-def gather_subsampled(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
-    """What `field.gather` sums up at every ray of a bundle, by the tensor product of cubics through its `SUBSAMPLE` rays."""
-    few, entry = np.asarray(SUBSAMPLE), task.entry
-    rays = NodeRays(task.u.T[few], task.v.T[few], task.depth.T)
-    windows, reference = (entry.begin, entry.length), (entry.reference_quantity,)
-    sums = gather_nodes(ordered, rank, windows, rays, reference, task.perspective, kernel)
-    by_slab = fusion_barrier(entry.count[0] >= 0, _slabs_first, sums)
+def spread_subsamples(
+    sums: Float[Array, "channels samples 4 4 tasks"], witness: Array
+) -> Float[Array, "channels tasks samples 8 8"]:
+    """Sums at every ray of a bundle, by the tensor product of cubics through its `SUBSAMPLE` rays.
+
+    Args:
+        sums: at those.
+        witness: see `fusion_barrier`.
+    """
+    by_slab = fusion_barrier(witness, _slabs_first, sums)
     lateral = jnp.asarray(np.kron(between_subsamples(), between_subsamples()).T, by_slab.dtype)
     spread = jnp.matmul(by_slab, lateral, precision=lax.Precision.HIGHEST)
-    return sums_of([channel.reshape(*channel.shape[:2], BUNDLE, BUNDLE) for channel in spread])
+    return spread.reshape(*spread.shape[:3], BUNDLE, BUNDLE)
 
 
-def _slabs_first(sums: Sums) -> Float[Array, "channels tasks samples rays"]:
+def _slabs_first(sums: Array) -> Float[Array, "channels tasks samples rays"]:
     """Moved while they are few."""
-    stacked = jnp.stack(sums.all)
-    return jnp.moveaxis(stacked.reshape(*stacked.shape[:2], -1, stacked.shape[-1]), 3, 1)
+    return jnp.moveaxis(sums.reshape(*sums.shape[:2], -1, sums.shape[-1]), 3, 1)
 
 
 def between_subsamples() -> Float[np.ndarray, "8 4"]:

@@ -1,4 +1,4 @@
-"""Sums over particles at the nodes of a lattice.
+"""Sums over particles at the nodes of a lattice, or at a few rays of bundles.
 
 Flow: grid -> [nodes] -> lattice -> control, media.
 
@@ -11,6 +11,7 @@ import dataclasses
 import math
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -19,9 +20,12 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.access.slab_windows import CELL_SAMPLES, coarser_windows
-from jaxsph.field.fetch import Block, fetch
+from jaxsph.field.fetch import Block, fetch, quantities_of
+from jaxsph.field.interpolation import spread_subsamples
 from jaxsph.field.lattice import GAP, REACH, Lattice, Region, node_at
+from jaxsph.field.schedule import SUBSAMPLE
 from jaxsph.field.sums import Sums, sums_of
+from jaxsph.field.tasks import SlabTask
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.fusion import fusion_barrier
@@ -86,7 +90,7 @@ def sum_at_nodes(
         return tuple(old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found.all, strict=True))
 
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
-    start = (nothing,) * (1 + len(grid.ordered.quantities))
+    start = (nothing,) * (1 + len(quantities_of(grid.ordered)))
     weight, *weighted = (value.reshape(shape) for value in lax.fori_loop(0, (number + chunk - 1) // chunk, march, start))
     spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
     return Lattice(weight, tuple(weighted), reference_quantity, region, spent)
@@ -139,5 +143,14 @@ def gather_nodes(
         return sums_of(channels)
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)
-    start = sums_of([zero] * (1 + len(ordered.quantities)))
+    start = sums_of([zero] * (1 + len(quantities_of(ordered))))
     return lax.fori_loop(0, (total.max() + BLOCK - 1) // BLOCK, add_block, start)
+
+
+def gather_subsampled(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
+    """What `field.gather` sums up at every ray of a bundle, from its `SUBSAMPLE` rays; see `interpolation`."""
+    few, entry = np.asarray(SUBSAMPLE), task.entry
+    rays = NodeRays(task.u.T[few], task.v.T[few], task.depth.T)
+    windows, reference = (entry.begin, entry.length), (entry.reference_quantity,)
+    sums = gather_nodes(ordered, rank, windows, rays, reference, task.perspective, kernel)
+    return sums_of(list(spread_subsamples(jnp.stack(sums.all), entry.count[0] >= 0)))

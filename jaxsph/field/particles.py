@@ -9,6 +9,7 @@ nothing. Sums are gathered in loops, and a table is read for each sample: those 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
 from jaxsph.field.lattice import Lattice
-from jaxsph.field.methods import sums_by_schedule
+from jaxsph.field.methods import methods_of
 from jaxsph.field.sums import Sums
 from jaxsph.field.tasks import SlabTask
 from jaxsph.field.transposed import COLUMNS, WIDTH, pull_gather
@@ -75,8 +76,13 @@ class ParticleMedium(Medium):
         return self.grid.windows.count > 0
 
     def gather(self, task: SlabTask) -> Sums:
-        """Sums over particles (tasks, samples, rows, columns)."""
-        return sums_by_schedule(self.grid, self.kernel, self.lattice, task)
+        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule."""
+        methods = methods_of(self.grid, self.kernel, self.lattice)
+        if len(methods) == 1 or task.entry.method is None:
+            return methods[0](task)
+        # a dummy has any method, and drops what it finds
+        method = jnp.where(task.slab < self.grid.windows.count.shape[0], task.entry.method, 0).max()
+        return lax.switch(method, [functools.partial(one, task) for one in methods])
 
     def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
         """Extinction, and places in the transfer function."""

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.lists import BUNDLE
-from jaxsph.access.slab_windows import SlabWindows, position
+from jaxsph.access.slab_windows import SlabWindows
+from jaxsph.field.fetch import position
 
 SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that a subsampled slab is marched at
 MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs

@@ -78,9 +78,9 @@ class SlabTask:
 
     def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """View coordinates x, y, z of all samples."""
-        spread = self.depth if self.perspective else jnp.ones_like(self.depth)
-        x = (self.u[:, None, None, :] * spread[..., None, None]) * jnp.ones_like(self.v)[:, None, :, None]
-        y = (self.v[:, None, :, None] * spread[..., None, None]) * jnp.ones_like(self.u)[:, None, None, :]
+        lateral_scale = self.depth if self.perspective else jnp.ones_like(self.depth)
+        x = (self.u[:, None, None, :] * lateral_scale[..., None, None]) * jnp.ones_like(self.v)[:, None, :, None]
+        y = (self.v[:, None, :, None] * lateral_scale[..., None, None]) * jnp.ones_like(self.u)[:, None, None, :]
         z = jnp.broadcast_to(self.depth[..., None], self.shape)
         return x.reshape(self.shape), y.reshape(self.shape), z
 

@@ -157,15 +157,15 @@ def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -
     places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
     place = places.pop() if len(places) == 1 else None
     result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
-    return Program(result, _threads().submit(_compile, traced.lower(), function in _LIGHT))
+    return Program(result, _threads().submit(_compile, traced.lower(), function in _QUICKLY))
 
 
-_LIGHT: set[Any] = set()
+_QUICKLY: set[Any] = set()
 
 
-def light(function: Function) -> Function:
+def compiled_quickly(function: Function) -> Function:
     """Mark a jitted function as one that takes longer to compile than to run."""
-    _LIGHT.add(function)
+    _QUICKLY.add(function)
     return function
 
 

@@ -54,7 +54,7 @@ def linear_map(
         return right[0], jax.tree.map(jnp.add, right[1], push(right[0]))
 
     def solve_transposed(_: object, right: tuple[list[Array], Result]) -> tuple[list[Array], Result]:
-        return [value + owed for value, owed in zip(right[0], pull(right[1]), strict=True)], right[1]
+        return [value + pulled for value, pulled in zip(right[0], pull(right[1]), strict=True)], right[1]
 
     found: Result = lax.custom_linear_solve(matrix, (moves, tied(moves, [])), solve, solve_transposed)[1]
     return found

@@ -11,7 +11,7 @@ import pytest
 
 from jaxsph.numerics import memory_maps
 from jaxsph.numerics.executors import Clock, Forecast, Unforeseen
-from jaxsph.numerics.programs import Programs, light, shapes_of
+from jaxsph.numerics.programs import Programs, compiled_quickly, shapes_of
 
 traces = []
 
@@ -22,7 +22,7 @@ def double(value):
     return 2 * value
 
 
-@light
+@compiled_quickly
 @jax.jit
 def settle(value):
     """Some kernels, in a loop, so that memory maps are seen to come and go."""
