@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 HERE = pathlib.Path(__file__).parent
 RESULTS, PAGE = HERE / "results", HERE.parent / "docs" / "how_accurate_how_fast.md"
 
-# Hochstetter et al. 2016, table 2 (GTX Titan, frame means) and table 3 (most of a sequence): particles, error, time over full rate
+# Hochstetter et al. 2016, table 2 (GTX Titan, means) and table 3 (most of a sequence): particles, error, time to full rate
 PAPER = {
     ("flubber", 0.004): (0.5, "7.2e-4", 1.3),
     ("checker_board", 0.001): (1.2, "3.3e-5", 1.08),
