@@ -1,12 +1,15 @@
 """Similar frames share a plan, and with it what is compiled; whatever was rendered before, an image is the same."""
 
 import dataclasses
+import functools
 
 import jax
 import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.model import registry
+from jaxsph.model.medium import Medium
 from jaxsph.model.particles import capacity_class
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.plan import next_class
@@ -132,6 +135,62 @@ def test_a_plan_checks_its_own_choices_no_less_than_those_of_the_frame():
             js.render(scene, camera, dataclasses.replace(settings, **change), plan=plan)
     with pytest.raises(ValueError, match=r"full rate"):
         js.render(scene, camera, dataclasses.replace(settings, tolerance=None), plan=plan)
+
+
+@dataclasses.dataclass(frozen=True)
+class Nothing(Medium):
+    """A medium that is nowhere."""
+
+    def occupied(self, slabs):
+        return slabs.z_upper < slabs.z_lower
+
+    def extinction(self, gathered, task):
+        return 0 * task.depth[..., None], ()
+
+    def colors(self, samples, task, channels):
+        return [0 * task.depth[..., None]] * len(range(3)[channels])
+
+
+jax.tree_util.register_dataclass(Nothing, data_fields=[], meta_fields=[])
+
+
+@pytest.mark.parametrize("estimator", ["interval", "pilot"])
+def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypatch, estimator):
+    """By whatever is asked first: a plan, an image with one, or without."""
+    scene, camera = snapshot(100)
+    plan = js.plan(scene, camera, dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator))
+    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    with_medium = dataclasses.replace(scene, media=(Nothing(),))
+    for changed, choices, name in (
+        (with_medium, {}, r"`Scene\(media=\.\.\.\)`"),
+        (scene, {"screen": "again"}, "`screen='again'`"),
+        (scene, {"integrator": "again"}, "`integrator='again'`"),
+    ):
+        asked = dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator, **choices)
+        for attempt in (
+            js.plan,
+            js.render,
+            functools.partial(js.render, plan=plan),
+            jax.jit(functools.partial(js.render, plan=plan)),
+        ):
+            with pytest.raises(ValueError, match=f"`tolerance` does not cover {name} yet; give `tolerance=None`"):
+                attempt(changed, camera, asked)
+
+
+def test_at_full_rate_media_screens_and_integrators_are_free_to_choose(monkeypatch):
+    scene, camera = snapshot(100)
+    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    usual = js.render(scene, camera, SETTINGS)
+    other = dataclasses.replace(SETTINGS, screen="again", integrator="again")
+    plan = js.plan(scene, camera, other)
+    assert (plan.screen, plan.integrator) == ("again", "again")
+    image = js.render(dataclasses.replace(scene, media=(Nothing(),)), camera, other, plan=plan)
+    np.testing.assert_allclose(image.color, usual.color, atol=1e-6)
+    for choice in ({"screen": "pixels"}, {"integrator": "samples"}):
+        with pytest.raises(ValueError, match=f"`plan` was made for settings.{next(iter(choice))} = again, got"):
+            js.render(scene, camera, dataclasses.replace(other, **choice), plan=plan)
 
 
 @pytest.mark.parametrize("count", [1, 5, 100, 4097, 10**6])

@@ -3,6 +3,7 @@
 import io
 
 import numpy as np
+import pytest
 from PIL import Image as Pillow
 
 import jaxsph as js
@@ -22,6 +23,16 @@ def test_a_notebook_shows_it_as_png_of_its_size():
     shown = Pillow.open(io.BytesIO(image(np.full((3, 5, 3), 0.5))._repr_png_()))
     assert shown.size == (5, 3)
     assert shown.getpixel((0, 0)) == (128, 128, 128)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".exr"])
+def test_an_image_writes_itself_as_what_its_path_says(tmp_path, suffix):
+    given, path = image(np.full((3, 5, 3), 0.25)), tmp_path / f"image{suffix}"
+    given.save(path)
+    if suffix == ".png":
+        assert np.asarray(Pillow.open(path)).tolist() == given.to_uint8().tolist()
+    else:
+        np.testing.assert_array_equal(js.io.read_image(path).color, given.color)
 
 
 def test_alpha_is_what_is_not_transmitted():

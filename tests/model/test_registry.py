@@ -1,0 +1,34 @@
+"""What is chosen by name is found, and is one object: so that it may be static in what is compiled."""
+
+import pytest
+
+import jaxsph as js
+from jaxsph.cast.integrator import Integrator
+from jaxsph.model import registry
+from jaxsph.screen.sampler import ScreenSampler
+
+
+@pytest.mark.parametrize("name", registry.INTEGRATORS)
+def test_integrators_are_found(name):
+    found = registry.integrator(name)
+    assert isinstance(found, Integrator) and found is registry.integrator(name)
+    assert js.Settings(integrator=name).integrator == name
+
+
+@pytest.mark.parametrize("name", registry.SCREENS)
+def test_screens_are_found(name):
+    found = registry.screen(name)
+    assert isinstance(found, ScreenSampler) and found is registry.screen(name)
+    assert js.Settings(screen=name).screen == name
+
+
+@pytest.mark.parametrize(("choice", "known"), [("integrator", registry.INTEGRATORS), ("screen", registry.SCREENS)])
+def test_unknown_names_are_refused_with_those_that_are_known(choice, known):
+    with pytest.raises(ValueError, match=f"`{choice}` must be one of {', '.join(known)}, got 'none such'"):
+        js.Settings(**{choice: "none such"})
+
+
+def test_what_is_entered_can_be_chosen(monkeypatch):
+    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
+    assert js.Settings(screen="again").screen == "again"
+    assert registry.screen("again") is registry.screen("pixels")
