@@ -1,14 +1,21 @@
-"""Nodes hold the sums of full rate."""
+"""Nodes hold the sums of full rate, and so do the rays at which slabs are subsampled."""
 
 from __future__ import annotations
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.cast.batches import batches_of
+from jaxsph.field.gather import gather
 from jaxsph.field.lattice import FINEST, GAP, REACH, Region, Spacing, region_of
-from jaxsph.field.nodes import sum_at_nodes
+from jaxsph.field.nodes import gather_subsampled, sum_at_nodes
+from jaxsph.field.schedule import SUBSAMPLE, full_rate
+from jaxsph.field.tasks import RayPackets
 from jaxsph.model import kernels
 
 WIDER = Spacing(8, 4)
@@ -71,3 +78,35 @@ def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     row, column = int(some.row) // FINEST.pixels, int(some.column) // FINEST.pixels
     np.testing.assert_array_equal(part, whole[:, row : row + part.shape[1], column : column + part.shape[2]])
     assert part.shape[1:] == (4, 6) and (part > 0).any()
+
+
+EYE, TARGET, SIZE = (1.5, 1.1, -2.2), (0.5, 0.5, 0.5), {"width": 230, "height": 197}
+CAMERAS = {
+    "perspective": lambda: js.Camera.look_at(EYE, TARGET, near=1.0, far=5.0, **SIZE),
+    "orthographic": lambda: js.Camera.orthographic(EYE, TARGET, near=1.0, far=5.0, **SIZE),
+}
+
+
+@pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
+def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x64, stages, projection):
+    rng, camera = np.random.default_rng(4), CAMERAS[projection]()
+    position = rng.uniform(0, 1, (2000, 3))
+    particles = js.Particles.from_arrays(position, 0.2, position[:, 0])
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 1], [1, 0, 0]], [1.0, 1.0])
+    plan = js.plan(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=96))
+    grid, reference = stages(particles, camera, plan=plan)
+    schedule = full_rate(grid.windows, reference)
+    packets = RayPackets(*grid.rays(camera, jnp.arange(plan.lists.num_bundles)))
+    batches = batches_of(grid, schedule, packets, plan.cast, camera.is_perspective)
+    fullest = np.argsort(np.asarray(schedule.count).ravel())[-plan.cast.chunk :]
+    task = batches.task(jnp.asarray(fullest, jnp.int32))
+
+    def sums_by(how):
+        sums = jax.jit(functools.partial(how, kernel=particles.kernel))(grid.ordered, grid.lists.rank, task)
+        return np.asarray(sums.weight) + 1j * np.asarray(*sums.weighted)
+
+    every, few = sums_by(gather), sums_by(gather_subsampled)
+    at = np.ix_(range(len(few)), range(few.shape[1]), SUBSAMPLE, SUBSAMPLE)
+    np.testing.assert_allclose(few[at], every[at], rtol=1e-12, atol=1e-12 * np.abs(every).max())
+    assert np.sqrt((np.abs(few - every) ** 2).mean()) < 0.02 * np.sqrt((np.abs(every) ** 2).mean())
+    assert np.abs(few - every).max() > 0

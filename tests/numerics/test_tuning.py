@@ -1,4 +1,4 @@
-"""How much is done at once suits the machine and changes no image; sizes that make no sense are refused."""
+"""Sizes suit the machine, change no bit of an image, and are refused where they make no sense."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import jaxsph as js
 from jaxsph.numerics.tuning import ACCELERATOR, CPU, MAX_SHARDS, MEMORY, memory_for, shards_at_hand, tuning_for
 
 SIZES = [field.name for field in dataclasses.fields(CPU) if field.name != "fusion_barriers"]
-ROUNDING = 64 * np.finfo(np.float32).eps
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -54,18 +53,15 @@ def test_what_is_on_an_accelerator_is_tuned_for_one_and_may_take_half_of_it():
     assert memory_for(Held("cpu", 1 << 30)) == memory_for(Held("gpu")) == MEMORY
 
 
-@pytest.mark.parametrize("asked", [
-    {}, pytest.param({"tolerance": 0.02}, marks=pytest.mark.slow), {"tolerance": 0.02, "estimator": "pilot"},
-])  # fmt: skip
-def test_any_tuning_makes_the_same_image_but_for_rounding(asked):
+@pytest.mark.parametrize("asked", [{}, {"tolerance": 0.02, "estimator": "pilot"}])
+def test_how_much_is_done_at_once_changes_no_bit(asked):
     scene, camera = js.scenes.load("radial", 2000, width=72, height=60)
     settings, images = js.Settings(samples=64, **asked), []
     small = {"samples_at_once": 64, "samples_held": 256, "bundles_composited": 8, "half_depths_found": 4, "cells_of_nodes": 16}
-    for tuning in (CPU, dataclasses.replace(CPU, **small), dataclasses.replace(ACCELERATOR, samples_at_once=1 << 12)):
+    for tuning in (CPU, dataclasses.replace(CPU, **small)):
         plan = js.plan(scene, camera, settings, tuning=tuning)
         assert plan.cast.tuning == tuning
         images.append(js.render(scene, camera, settings, plan=plan))
     assert float(images[0].alpha.max()) > 0.1
-    for layer in ("color", "transmittance"):
-        np.testing.assert_array_equal(getattr(images[1], layer), getattr(images[0], layer))
-        np.testing.assert_allclose(getattr(images[2], layer), getattr(images[0], layer), atol=ROUNDING)
+    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
