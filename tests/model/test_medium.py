@@ -87,14 +87,6 @@ def test_media_that_share_samples_add_up(frames):
     assert several.stats["evaluations"] == none.stats["evaluations"]
 
 
-def test_what_lets_all_light_through_changes_nothing(frames):
-    rng = np.random.default_rng(1)
-    scene, camera = frames.scene(rng), frames.camera(rng)
-    clear, none = drawn(frames, camera, scene, fog(0.0)), drawn(frames, camera, scene)
-    for layer in ("color", "transmittance", "depth"):
-        np.testing.assert_allclose(getattr(clear, layer), getattr(none, layer), atol=1e-6)
-
-
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_a_medium_that_is_somewhere_is_marched_only_there_and_missed_nowhere(frames, projection):
     """A ball that says so, and one that says it may be anywhere, are the same to the last bit."""
@@ -113,6 +105,7 @@ def test_a_medium_that_is_somewhere_is_marched_only_there_and_missed_nowhere(fra
         np.testing.assert_array_equal(getattr(found, layer), getattr(wanted, layer))
 
 
+@pytest.mark.slow
 def test_a_medium_has_derivatives_in_both_modes(frames, x64):
     rng, plan = np.random.default_rng(3), frames.plan()
     scene, camera = frames.scene(rng, dtype=np.float64), frames.camera(rng, dtype=np.float64)
