@@ -19,9 +19,9 @@ from jaxsph.access.ordering import rank_particles
 from jaxsph.control import pilot
 from jaxsph.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
 from jaxsph.field.gather import gather
-from jaxsph.field.interpolation import gather_subsampled, interpolate
+from jaxsph.field.interpolation import interpolate
 from jaxsph.field.lattice import REACH, Lattice, region_of
-from jaxsph.field.nodes import sum_at_nodes
+from jaxsph.field.nodes import gather_subsampled, sum_at_nodes
 from jaxsph.field.schedule import (
     DENSE,
     INTERPOLATED,
