@@ -30,10 +30,10 @@ LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4)), strict=True))
 BASELINE_COLORS = {"samples": "#8a8a8a", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
-LEAST = 1e-7
+MIN_SHOWN = 1e-7
 """Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
 
-MOST_TICKS = 12
+MAX_TICKS = 12
 SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
 
 
@@ -138,19 +138,19 @@ def _legend(figure: Any, axis: Any, **options: Any) -> None:
 
 
 def _shown(error: float) -> float:
-    return max(error, LEAST)
+    return max(error, MIN_SHOWN)
 
 
 def _label_zero(axis: Any, errors: Iterable[float], which: str) -> None:
     """Name the place where errors that are too small for the scale are drawn."""
-    if min(errors, default=1.0) < LEAST:
-        getattr(axis, f"set_{which}lim")(LEAST / 2)
+    if min(errors, default=1.0) < MIN_SHOWN:
+        getattr(axis, f"set_{which}lim")(MIN_SHOWN / 2)
         line = axis.axhline if which == "y" else axis.axvline
-        line(LEAST, color="#999999", linewidth=0.8, zorder=0)
-        place = (1.0, LEAST) if which == "y" else (LEAST, 0.02)
+        line(MIN_SHOWN, color="#999999", linewidth=0.8, zorder=0)
+        place = (1.0, MIN_SHOWN) if which == "y" else (MIN_SHOWN, 0.02)
         transform = axis.get_yaxis_transform() if which == "y" else axis.get_xaxis_transform()
         words = {"ha": "right", "va": "bottom"} if which == "y" else {"ha": "right", "va": "bottom", "rotation": 90}
-        axis.text(*place, f" at most {LEAST:g}", transform=transform, color="#777777", fontsize="x-small", **words)
+        axis.text(*place, f" at most {MIN_SHOWN:g}", transform=transform, color="#777777", fontsize="x-small", **words)
 
 
 def _error(points: Sequence[Point], title: str) -> Any:
@@ -271,7 +271,7 @@ def _frames(rows: Sequence[Measurement], title: str) -> Any:
     _label_zero(errors, [row.max_error for row in rows if row.method != FULL_RATE], "y")
     times.set_ylim(bottom=0)
     shown = sorted({row.frame or 0.0 for row in rows})
-    if len(shown) <= MOST_TICKS:
+    if len(shown) <= MAX_TICKS:
         times.set_xticks(shown, [f"{moment:g}" for moment in shown])
     _legend(figure, times)
     return figure

@@ -25,11 +25,11 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
 
-LARGEST_CAPACITY = 1 << 30
+MAX_CAPACITY = 1 << 30
 MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
-NODES_REACHED = 2.5, 3  # by a support to every side, across and in depth: with fewer, wider nodes save less than they cost less
+MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -195,7 +195,7 @@ def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: C
     while True:
         made = _in_bands(measures, shape, settings, choices, bands)
         slabs = made.lists.num_bundles * -(-shape.samples // choices.slab_samples)
-        fits = made.bytes <= limit and made.lists.list_capacity <= LARGEST_CAPACITY and slabs < MAX_SLABS
+        fits = made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and slabs < MAX_SLABS
         if fits:
             return made
         if made.lists.tile_rows == 1:
@@ -279,8 +279,8 @@ def _choose_subdivisions(diameter: float) -> int:
 
 def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:
     """As far apart as supports of the median size, in samples and in pixels, reach enough of them."""
-    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * NODES_REACHED[0] * n), default=FINEST.pixels)
-    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * NODES_REACHED[1] * n), default=FINEST.samples)
+    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * MIN_NODES_REACHED[0] * n), default=FINEST.pixels)
+    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * MIN_NODES_REACHED[1] * n), default=FINEST.samples)
     return Spacing(pixels, min(samples, slab_samples))
 
 

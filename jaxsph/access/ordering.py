@@ -16,44 +16,30 @@ import math
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.access.resolution import ROUNDING
-from jaxsph.access.view import DEPTH_BITS, Viewed, depth_key
+from jaxsph.access.view import DEPTH_BITS, Columns, Viewed, depth_key
 from jaxsph.model.camera import Camera
 
 KEY_MARGIN = 8  # keys that a window is wider on either side: a key is at most an ulp of its depth, a logarithm errs by a few
 
 
 @dataclasses.dataclass(frozen=True)
-class Ordered:
-    """Particles in view space, in rank order (class, then depth); those that no sample can meet come last and are not `live`.
-
-    Columns are those of `Viewed`.
+class Ordered(Columns):
+    """Particles in rank order (class, then depth); those that no sample can meet come last.
 
     Ranks from `first_rank` up to `last_rank` can touch a sample of the slab; from `first_beside` up to `last_beside` any point
     between the samples before and after it, where samples of wider spacing lie.
     """
 
-    x: Float[Array, " particles"]
-    y: Float[Array, " particles"]
-    z: Float[Array, " particles"]
-    reach: Float[Array, " particles"]
-    scale: Float[Array, " particles"]
-    size: Float[Array, " particles"]
-    quantity: Float[Array, " particles"]
-    live: Bool[Array, " particles"]
-    left: Int[Array, " particles"]
-    right: Int[Array, " particles"]
-    top: Int[Array, " particles"]
-    bottom: Int[Array, " particles"]
     first_rank: Int[Array, "classes slabs"]
     last_rank: Int[Array, "classes slabs"]
     first_beside: Int[Array, "classes slabs"]
     last_beside: Int[Array, "classes slabs"]
 
 
-COLUMNS = tuple(field.name for field in dataclasses.fields(Ordered))[:12]
+COLUMNS = tuple(field.name for field in dataclasses.fields(Columns))
 
 
 def rank_particles(viewed: Viewed, camera: Camera, depths: Float[Array, " samples"], slab_samples: int) -> Ordered:

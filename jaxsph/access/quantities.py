@@ -17,10 +17,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.transfer import SMALLEST, TransferFunction
+from jaxsph.model.transfer import MIN_NORMALS, TransferFunction
 from jaxsph.numerics import exponents
 
-FARTHEST = 2.0**60  # in units of the largest control point: quantities beyond it are clipped to it, as a mean that holds one is
+MAX_QUANTITY = (
+    2.0**60
+)  # in units of the largest control point: quantities beyond it are clipped to it, as a mean that holds one is
 
 
 def rescaled(
@@ -34,7 +36,7 @@ def rescaled(
     largest = jnp.abs(values).max()
     unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
     unit = lax.stop_gradient(jnp.where(largest > 0, jnp.maximum(unit, jnp.finfo(unit.dtype).tiny), 1))
-    scaled, values = jnp.clip(quantity * unit, -FARTHEST, FARTHEST), values * unit
+    scaled, values = jnp.clip(quantity * unit, -MAX_QUANTITY, MAX_QUANTITY), values * unit
     quantity = jnp.where(jnp.isfinite(quantity), scaled, quantity)  # what is no number is to be found as such
     first, last = values[0], values[-1]
     narrow = (first * last > 0) & (last - first <= jnp.minimum(jnp.abs(first), jnp.abs(last)))
@@ -45,4 +47,4 @@ def rescaled(
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:
     """Whether control points are (nearly) subnormal numbers, and quantities among them would be taken for zero."""
     largest = jnp.abs(values).max()
-    return ((largest > 0) | exponents.is_subnormal(values).any()) & (largest < SMALLEST * jnp.finfo(values.dtype).tiny)
+    return ((largest > 0) | exponents.is_subnormal(values).any()) & (largest < MIN_NORMALS * jnp.finfo(values.dtype).tiny)

@@ -17,12 +17,12 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.camera import Camera
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
-LIFT = 30  # binary digits by which strengths are lifted, so that weights far below the largest are no underflow; of 3, 5 and 6
+LIFT = 30  # binary digits by which strengths are lifted, so that weak ones do not underflow; kernels' degrees divide it
 OFF = 2  # eps of its distance from the eye that a view coordinate may be off
 SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
 MIN_STEP = 16  # eps of its depth that a sample must be away from the next
 RANGE = 0.4  # power of the largest number that lengths may reach, so that products of two and their quotients stay finite
-THINNEST = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
+MAX_SHELL_BITS = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
 
 
 def longest(dtype: Any) -> float:
@@ -34,10 +34,10 @@ def weakest(degree: int, dtype: Any) -> float:
     r"""Least strength, as a share of the largest, of a particle that is seen right up to its edge.
 
     Where $1 - q = \delta$ a weight is about $\delta^k$ times the strength, with k = 3 or 4 by the kernel. It must be a normal
-    number at $\delta$ = 2^-THINNEST.
+    number at $\delta$ = 2^-MAX_SHELL_BITS.
     """
     power = 4 if degree == 5 else 3
-    return 2.0 ** (int(jnp.finfo(dtype).minexp) + power * THINNEST - LIFT)
+    return 2.0 ** (int(jnp.finfo(dtype).minexp) + power * MAX_SHELL_BITS - LIFT)
 
 
 def too_fine(camera: Camera, samples: int) -> Bool[Array, ""]:

@@ -26,8 +26,8 @@ DEAD_CLASS = 255
 
 
 @dataclasses.dataclass(frozen=True)
-class Viewed:
-    """Particles in view space, in their own order; those that no sample can meet are not `live`, and their numbers are 0.
+class Columns:
+    """Particles in view space; those that no sample can meet are not `live`, and their numbers are 0.
 
     Attributes:
         x, y, z: view coordinates, length units.
@@ -38,9 +38,6 @@ class Viewed:
         live: whether any sample can meet the particle.
         left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
             `left > right` or `top > bottom`.
-        key: class of support above depth, what they are ranked by.
-        widest: largest reach of each class.
-        faults: fault word.
     """
 
     x: Float[Array, " particles"]
@@ -55,6 +52,18 @@ class Viewed:
     right: Int[Array, " particles"]
     top: Int[Array, " particles"]
     bottom: Int[Array, " particles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Viewed(Columns):
+    """Particles in their own order.
+
+    Attributes:
+        key: class of support above depth, what they are ranked by.
+        widest: largest reach of each class.
+        faults: fault word.
+    """
+
     key: Int[Array, " particles"]
     widest: Float[Array, " classes"]
     faults: Int[Array, ""]

@@ -22,7 +22,7 @@ from jaxsph.field.schedule import MAX_SPACING_LEVEL
 DEVIATION_PER_BEND = (
     3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
 )
-LEAST = 8  # eps: what they differ by, at least
+MIN_DEVIATION = 8  # eps: what they differ by, at least
 
 
 def second_differences(
@@ -71,7 +71,7 @@ def choose_spacing(
         Level of each slab; and the variance.
     """
     level, spent = jnp.zeros(taken.shape, jnp.int32), jnp.zeros_like(budget)
-    least = LEAST * jnp.finfo(budget.dtype).eps
+    least = MIN_DEVIATION * jnp.finfo(budget.dtype).eps
     for coarse in range(MAX_SPACING_LEVEL, 0, -1):
         share = 1 << coarse
         whole = taken.shape[0] // share * share

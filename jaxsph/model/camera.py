@@ -22,7 +22,7 @@ from jaxsph.model.particles import Particles
 from jaxsph.numerics.checks import is_traced, require_finite
 
 PROJECTIONS = ("perspective", "orthographic")
-LARGEST_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
+MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,8 +218,8 @@ def _axes(forward: Any, up: Any, xp: Any) -> Any:
 
 def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str) -> Camera:
     for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= LARGEST_SIDE:
-            raise ValueError(f"`{name}` must be an integer from 1 to {LARGEST_SIDE} pixels, got {size!r}")
+        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= MAX_SIDE:
+            raise ValueError(f"`{name}` must be an integer from 1 to {MAX_SIDE} pixels, got {size!r}")
     parts = (eye, target, up, half, near, far)
     xp: Any = jnp
     if not is_traced(*parts):

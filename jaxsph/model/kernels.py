@@ -17,7 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SMALLEST_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
+MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
 NOTHING = 1e-37  # the same for particles of no size, which pad blocks: the least that float32 holds in full
 
 
@@ -88,7 +88,7 @@ def _margin(part: Any, size: Any) -> Any:
 
 
 def _under_root(part: Any, size: Any) -> Any:
-    return part + (SMALLEST_SQUARE * (size * size) + NOTHING)
+    return part + (MIN_SQUARE * (size * size) + NOTHING)
 
 
 KERNELS = {

@@ -103,7 +103,7 @@ class TransferFunction:
 def _require_apart(given: np.ndarray, packed: Array) -> None:
     """Refuse values that rounding moves by a share of what they span, or takes for (nearly) nothing."""
     span, largest = given[-1] - given[0], np.abs(given).max()
-    moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), SMALLEST * np.finfo(packed.dtype).tiny
+    moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), MIN_NORMALS * np.finfo(packed.dtype).tiny
     if moved > MOVED * span:
         raise ValueError(
             f"`values` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
@@ -117,7 +117,7 @@ def _require_apart(given: np.ndarray, packed: Array) -> None:
 
 
 MOVED = 2.0**-12  # of the span of its values that a transfer function's values may be moved by rounding
-SMALLEST = 2.0**16  # smallest normal numbers that values must reach: quantities among them are then not taken for zero
+MIN_NORMALS = 2.0**16  # smallest normal numbers that values must reach: quantities among them are then not taken for zero
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
 from jaxsph.scenes.view import looking_at_box
 
 PARTICLES = 100_000
-SECONDS_A_FRAME = 0.1
+SECONDS_PER_FRAME = 0.1
 GRAVITY = 9.81
 
 BASIN = ((-1.0, 0.0, -0.5), (1.0, 0.2, 0.5))
@@ -57,7 +57,7 @@ def letters(
     volumes = [float((upper - lower).prod()), *(area(name) * HEIGHT**2 * THICKNESS for name in GLYPHS)]
     spacing = (sum(volumes) / count) ** (1 / 3)
     parts = np.diff(np.round(np.cumsum([0.0, *volumes]) / sum(volumes) * count).astype(int))
-    now, generator = moment * SECONDS_A_FRAME, np.random.default_rng(seed)
+    now, generator = moment * SECONDS_PER_FRAME, np.random.default_rng(seed)
     drops = [letter(number, int(part), seed + 1 + number) for number, part in enumerate(parts[1:])]
     water = scatter(lower, upper, int(parts[0]), seed)
     dropped = [fallen(drop, left, now, generator) for drop, left in zip(drops, SUBSAMPLE_VARIANCE, strict=True)]

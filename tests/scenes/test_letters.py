@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsph import scenes
-from jaxsph.scenes.letters import BASIN, GLYPHS, GRAVITY, SECONDS_A_FRAME, STROKE, area, distance
+from jaxsph.scenes.letters import BASIN, GLYPHS, GRAVITY, SECONDS_PER_FRAME, STROKE, area, distance
 
 
 def columns(frame, count=4000):
@@ -24,7 +24,7 @@ def test_letters_fall_freely_until_they_meet_the_water():
     start, dye = columns(0)
     for frame in (0.5, 1.5, 2.0):
         place, _ = columns(frame)
-        drop = GRAVITY / 2 * (frame * SECONDS_A_FRAME) ** 2
+        drop = GRAVITY / 2 * (frame * SECONDS_PER_FRAME) ** 2
         dry = (dye > 0) & (start[:, 1] - drop > BASIN[1][1] + 0.02)
         assert dry.sum() > 500 and place[dry] == pytest.approx(start[dry] - (0, drop, 0), abs=1e-5)
 
