@@ -12,7 +12,7 @@ Why the bounds hold in floating point: a sphere counts as meeting the slab with 
 zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle
 is `SOLID` enough for that not to underflow. Boxes are made of the very numbers that the cast multiplies, and rounding is
 monotone. Sums are taken of quantities relative to that of a particle near by: a quotient of two computed sums of n terms is
-off by less than (n + 6) eps of how far quantities are from that reference_quantity, and adding it rounds once more.
+off by less than (n + 6) eps of how far quantities are from that reference, and adding it rounds once more.
 
 Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises.
 """

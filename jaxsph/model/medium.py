@@ -56,7 +56,7 @@ class Medium(abc.ABC):
 
     @abc.abstractmethod
     def colors(self, samples: Any, task: Any, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Some of red, green and blue at the samples of slabs; of no meaning where extinction is 0."""
+        """Those of red, green and blue that `channels` selects, at the samples of slabs; of no meaning where extinction is 0."""
 
     def no_cotangents(self) -> Any:
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""

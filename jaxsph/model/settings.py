@@ -23,8 +23,8 @@ class Settings:
         tolerance: largest absolute difference to the reference image that any colour channel or alpha of any pixel may have;
             `None` renders that reference image, at full rate.
         estimator: how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections 4 and 5), `"pilot"`
-        estimates them
-            from a coarse lattice of rays, and saves several times as many evaluations. It uses none of the choices below.
+            estimates them from a coarse lattice of rays, and saves several times as many evaluations. It uses none of `relax`,
+            `super_pixels`, `merge` and `allocation`.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
