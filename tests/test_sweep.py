@@ -278,7 +278,7 @@ def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, 
     wrong = [row if row.tolerance is None else dataclasses.replace(row, max_error=least, max_bound=0.001) for row in rows]
     (axis,) = figures._error(figures.summary(wrong), "a title").axes
     bottom, top = axis.get_ylim()
-    lowest = max(least, figures.LEAST)
+    lowest = max(least, figures.MIN_SHOWN)
     assert lowest / 10 < bottom < lowest < max(CHOSEN["tolerances"]) < top
 
 

@@ -25,7 +25,7 @@ def test_a_plan_is_tuned_for_the_device_that_holds_the_particles():
     "settings",
     [
         {},
-        {"tolerance": 0.05},
+        pytest.param({"tolerance": 0.05}, marks=pytest.mark.slow),
         {"tolerance": 0.02, "estimator": "pilot"},
         pytest.param({"tolerance": 0.3, "relax": 0.5}, marks=pytest.mark.slow),
     ],

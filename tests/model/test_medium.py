@@ -133,6 +133,7 @@ def test_a_medium_has_derivatives_in_both_modes(frames, x64):
     assert slope == pytest.approx(float(ahead - behind) / (2 * STEP), rel=CLOSE)
 
 
+@pytest.mark.slow
 def test_fog_alone_has_derivatives_by_how_wide_the_view_is(frames, x64):
     """Rays are the longer the wider the view: a cotangent that a medium has by where its samples are, and by their paths."""
     rng, plan = np.random.default_rng(3), frames.plan()
