@@ -26,7 +26,7 @@ def test_a_plan_is_tuned_for_the_device_that_holds_the_particles():
     [
         {},
         pytest.param({"tolerance": 0.05}, marks=pytest.mark.slow),
-        {"tolerance": 0.02, "estimator": "pilot"},
+        pytest.param({"tolerance": 0.02, "estimator": "pilot"}, marks=pytest.mark.slow),
         pytest.param({"tolerance": 0.3, "relax": 0.5}, marks=pytest.mark.slow),
     ],
     ids=str,
