@@ -88,10 +88,8 @@ def test_media_share_a_ray_and_are_sorted_in_depth(added):
     assert float(both.depth[middle]) <= float(alone.depth[middle])
 
 
-@pytest.mark.slow  # tests/model/test_medium.py does the same for a fog
-def test_a_ball_is_differentiated_by_what_it_is_made_of(added, x64):
-    view, settings = camera(19, 17), js.Settings(samples=64)
-    fluid = particles(20)
+def test_a_ball_is_differentiated_by_what_it_is_made_of(added):
+    view, settings, fluid = camera(9, 8), js.Settings(samples=16), particles(20)
     plan = js.plan(js.Scene(**fluid, media=(ball(added),)), view, settings)
 
     def light(density, color):
@@ -99,15 +97,15 @@ def test_a_ball_is_differentiated_by_what_it_is_made_of(added, x64):
         image = js.render(scene, view, settings, plan=plan)
         return (image.color * jnp.arange(3.0)).sum() + image.transmittance.sum()
 
+    both, step = jax.jit(jax.value_and_grad(light, (0, 1))), 1e-2
     density, color = jnp.float32(DENSITY), jnp.asarray(COLOR, jnp.float32)
-    found = jax.grad(light, (0, 1))(density, color)
-    pushed = jax.jvp(light, (density, color), (jnp.float32(1), jnp.zeros(3, jnp.float32)))[1]
-    step = 1e-2
-    wanted = (light(density + step, color) - light(density - step, color)) / (2 * step)
-    np.testing.assert_allclose(found[0], wanted, rtol=2e-3)
-    np.testing.assert_allclose(pushed, found[0], rtol=1e-4)
-    of_red = (light(density, color + step * jnp.eye(3)[2]) - light(density, color - step * jnp.eye(3)[2])) / (2 * step)
-    np.testing.assert_allclose(found[1][2], of_red, rtol=2e-3)
+    of_density, of_color = both(density, color)[1]
+    wanted = (both(density + step, color)[0] - both(density - step, color)[0]) / (2 * step)
+    np.testing.assert_allclose(of_density, wanted, rtol=5e-3)
+    blue = step * jnp.eye(3, dtype=jnp.float32)[2]
+    wanted = (both(density, color + blue)[0] - both(density, color - blue)[0]) / (2 * step)
+    np.testing.assert_allclose(of_color[2], wanted, rtol=5e-3)
+    assert float(of_color[0]) == 0 != float(wanted)
 
 
 def test_trapezoids_integrate_what_point_samples_do_and_better(added):

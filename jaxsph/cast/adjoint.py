@@ -34,7 +34,7 @@ from jaxsph.field.schedule import SlabSchedule
 from jaxsph.field.tasks import RayPackets, SlabTask
 from jaxsph.field.transposed import COLUMNS
 from jaxsph.model.camera import Camera
-from jaxsph.model.medium import COLORS, Medium, mixed_colors, mixed_extinction
+from jaxsph.model.medium import Medium, mixed
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import linear_map
@@ -212,7 +212,7 @@ def _pull(
         tuple(medium.no_cotangents() for medium in media), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype)
     )
     with barriers(plan.tuning.fusion_barriers):
-        found = _pull_batches(batches, media, method.integrator, image, cotangent, start)
+        found = _Backward(batches, media, method.integrator, wanted.field).pull(image, cotangent, start)
     particles, *others = found.media
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
@@ -221,94 +221,86 @@ def _pull(
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
-def _pull_batches(
-    batches: Batches, media: tuple[Medium, ...], integrator: Integrator, image: Layers, cotangent: Layers, start: Accumulated
-) -> Accumulated:
-    """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
-    together = Together.of(batches.num_packets, batches.plan.tuning)
+@dataclasses.dataclass(frozen=True)
+class _Backward:
+    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are, too."""
 
-    def march_slabs(items: Array) -> tuple[tuple[Array, ...], tuple[Any, ...]]:
+    batches: Batches
+    media: tuple[Medium, ...]
+    integrator: Integrator
+    geometry: bool
+
+    def pull(self, image: Layers, cotangent: Layers, start: Accumulated) -> Accumulated:
+        """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
+        batches, items = self.batches, jnp.zeros(self.batches.plan.chunk, jnp.int32)
+        together = Together.of(batches.num_packets, batches.plan.tuning)
+        light, gathered = jax.tree.map(
+            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.march, items)
+        )
+        light = (*light[:3], jnp.ones_like(light[3]))
+
+        def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
+            rays, held, total = carry
+            batch = batches.batch(nth)
+
+            def march_chunk(chunk: Array, held: Any) -> Any:
+                items, begin = batches.chunk(batch, chunk)
+                put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
+                return jax.tree.map(put, held, self.march(items))
+
+            light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
+            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together)
+
+            def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
+                items, begin = batches.chunk(batch, chunk)
+                here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
+                return self.pull_slabs(items, here, lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1), total)
+
+            return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+
+        rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
+        return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
+
+    def march(self, items: Array) -> tuple[tuple[Array, ...], tuple[Any, ...]]:
         """Red, green, blue and transmittance of slabs, and what media gather there."""
-        task = batches.task(items)
-        gathered = tuple(medium.gather(task) for medium in media)
-        light = integrator(media, gathered, task)
+        task = self.batches.task(items)
+        gathered = tuple(medium.gather(task) for medium in self.media)
+        light = self.integrator(self.media, gathered, task)
         return (*light.color, light.transmittance), gathered
 
-    def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
-        rays, held, total = carry
-        batch = batches.batch(nth)
+    def pull_slabs(
+        self, items: Array, gathered: tuple[Any, ...], of_slabs: Float[Array, "4 tasks rays"], total: Accumulated
+    ) -> Accumulated:
+        """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
+        task = self.batches.task(items)
+        through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
+        of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
+        of_media, of_depth, of_factor = [], jnp.zeros_like(task.depth), total.factor
+        for medium, so_far, found, cotangents in zip(self.media, total.media, gathered, of_optics, strict=True):
+            added, (depth, factor) = medium.pull(so_far, found, task, cotangents)
+            of_media.append(added)
+            of_depth, of_factor = of_depth + depth, of_factor + factor
+        if not self.geometry:
+            return dataclasses.replace(total, media=tuple(of_media))
 
-        def march_chunk(chunk: Array, held: Any) -> Any:
-            items, begin = batches.chunk(batch, chunk)
-            put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
-            return jax.tree.map(put, held, march_slabs(items))
+        def path(border: Array, factor: Array) -> Array:
+            return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
 
-        light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
-        rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together)
+        of_border, factor = jax.vjp(path, task.border, jnp.ones_like(of_factor))[1](of_path)
+        pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
+        (of_half_steps,) = pull_depths((of_depth, of_border))
+        return Accumulated(tuple(of_media), total.half_steps + of_half_steps, of_factor + factor)
 
-        def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
-            items, begin = batches.chunk(batch, chunk)
-            here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
-            of_chunk = lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1)
-            return _pull_slabs(batches, items, media, integrator, here, of_chunk, total)
+    def pull_integrator(self, gathered: tuple[Any, ...], task: SlabTask, of_slabs: Array) -> tuple[list[Optics], Array]:
+        """Cotangents of each medium's red, green, blue and extinction at samples, and of path lengths."""
 
-        return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+        def light(optics: list[Optics], path: Array) -> tuple[Optics, Array]:
+            return self.integrator.segment(mixed(optics), path)
 
-    items = jnp.zeros(batches.plan.chunk, jnp.int32)
-    held = jax.tree.map(
-        lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(march_slabs, items)
-    )
-    held = ((*held[0][:3], jnp.ones_like(held[0][3])), held[1])
-    rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
-    return lax.fori_loop(0, batches.number, pull_batch, (rays, held, start))[2]
-
-
-def _pull_slabs(
-    batches: Batches,
-    items: Array,
-    media: tuple[Medium, ...],
-    integrator: Integrator,
-    gathered: tuple[Any, ...],
-    of_slabs: Float[Array, "4 tasks rays"],
-    total: Accumulated,
-) -> Accumulated:
-    """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
-    task = batches.task(items)
-    through = functools.partial(_pull_integrator, media, integrator, gathered, task, of_slabs)
-    of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
-    of_media, of_depth, of_factor = [], jnp.zeros_like(task.depth), total.factor
-    for medium, so_far, found, cotangents in zip(media, total.media, gathered, of_optics, strict=True):
-        added, (depth, factor) = medium.pull(so_far, found, task, cotangents)
-        of_media.append(added)
-        of_depth, of_factor = of_depth + depth, of_factor + factor
-
-    def path(border: Array, factor: Array) -> Array:
-        return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
-
-    of_border, factor = jax.vjp(path, task.border, jnp.ones_like(of_factor))[1](of_path)
-    pull_depths = jax.vjp(functools.partial(batches.depths, items), batches.half_steps)[1]
-    (of_half_steps,) = pull_depths((of_depth, of_border))
-    return Accumulated(tuple(of_media), total.half_steps + of_half_steps, of_factor + factor)
-
-
-def _pull_integrator(
-    media: tuple[Medium, ...], integrator: Integrator, gathered: tuple[Any, ...], task: SlabTask, of_slabs: Array
-) -> tuple[list[Optics], Array]:
-    """Cotangents of each medium's red, green, blue and extinction at samples, and of path lengths."""
-
-    def light(optics: list[Optics], path: Array) -> tuple[Optics, Array]:
-        extinctions = [of_one[3] for of_one in optics]
-        mixed = [*mixed_colors([of_one[:3] for of_one in optics], extinctions), mixed_extinction(extinctions)]
-        return integrator.segment(mixed, path)
-
-    optics = []
-    for medium, found in zip(media, gathered, strict=True):
-        extinction, samples = medium.extinction(found, task)
-        colors = medium.colors(samples, task, COLORS)
-        optics.append([jnp.broadcast_to(value, task.shape) for value in (*colors, extinction)])
-    (_, thickness), pull = jax.vjp(light, optics, task.path())
-    of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
-    return of_optics, of_path
+        optics = [medium.optics(found, task) for medium, found in zip(self.media, gathered, strict=True)]
+        (_, thickness), pull = jax.vjp(light, optics, task.path())
+        of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
+        return of_optics, of_path
 
 
 for _kind in (DiffInputs, NonDiffInputs, Accumulated):

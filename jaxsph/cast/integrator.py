@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.field.tasks import SlabTask
-from jaxsph.model.medium import COLORS, Medium, mixed_colors, mixed_extinction
+from jaxsph.model.medium import Medium, mixed
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
 
@@ -57,19 +57,9 @@ class Integrator(abc.ABC):
 
     def __call__(self, media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Segment:
         """Light of slabs, by what media have gathered there; for an integrator that wants its passes over memory otherwise."""
-        color, thickness = self.segment(optics_of(media, gathered, task), task.path())
+        optics = [medium.optics(found, task) for medium, found in zip(media, gathered, strict=True)]
+        color, thickness = self.segment(mixed(optics), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
-
-
-def optics_of(media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Optics:
-    """Optics at samples, of all media together."""
-    extinctions, colors = [], []
-    for medium, found in zip(media, gathered, strict=True):
-        extinction, samples = medium.extinction(found, task)
-        extinctions.append(extinction)
-        colors.append(medium.colors(samples, task, COLORS))
-    optics = [*mixed_colors(colors, extinctions), mixed_extinction(extinctions)]
-    return [jnp.broadcast_to(value, task.shape) for value in optics]
 
 
 jax.tree_util.register_dataclass(Segment, data_fields=["color", "transmittance", "thickness"], meta_fields=[])

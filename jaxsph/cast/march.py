@@ -59,8 +59,10 @@ def march(
             found = segments_of(batches, items, media, integrator)
             return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
 
+        def borders(place: Array) -> Array:
+            return batches.borders(batch.items[place])
+
         light = lax.fori_loop(0, batch.chunks, march_chunk, light)
-        borders = lambda place: batches.borders(batch.items[place])  # noqa: E731
         return composite(rays, light, batch, borders, batches.compacted.start, together), light
 
     dtype = grid.half_steps.dtype

@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.ranges import RangeTables, transfer_ranges
-from jaxsph.field.fetch import position
+from jaxsph.field.fetch import particle_at
 from jaxsph.numerics.fusion import fusion_barrier
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
@@ -155,10 +155,8 @@ def _boxes(rays: Array, lateral_scales: tuple[Array, Array], parts: int) -> tupl
 
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
     """A block of particles of each bundle's windows; past the last they do not count."""
-    place = jnp.clip(position(index, *window), 0, rank.shape[0] - 1)
-    particle = fusion_barrier(index[0, 0] >= 0, lambda at: rank.at[at].get(mode="promise_in_bounds"), place)
+    particle, inside = fusion_barrier(index[0, 0] >= 0, particle_at, rank, *window, index)
     found = jax.tree.map(lambda column: column.at[particle].get(mode="promise_in_bounds"), balls)
-    inside = index < window[1].sum(0)
     outer, inner = (jnp.where(inside, inverse, jnp.inf) for inverse in (found.outer, found.inner))
     return dataclasses.replace(found, outer=outer, inner=inner)
 

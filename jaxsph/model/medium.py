@@ -58,6 +58,11 @@ class Medium(abc.ABC):
     def colors(self, samples: Any, task: Any, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Those of red, green and blue that `channels` selects, at the samples of slabs; of no meaning where extinction is 0."""
 
+    def optics(self, gathered: Any, task: Any) -> list[Float[Array, "tasks samples rays"]]:
+        """Red, green, blue and extinction at the samples of slabs, by `extinction` and `colors`."""
+        extinction, samples = self.extinction(gathered, task)
+        return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
+
     def no_cotangents(self) -> Any:
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)
@@ -77,9 +82,7 @@ class Medium(abc.ABC):
 
         def optics(medium: Medium, depth: Array, factor: Array) -> list[Array]:
             moved = dataclasses.replace(task, depth=depth, u=task.u * factor, v=task.v * factor)
-            extinction, samples = medium.extinction(medium.gather(moved), moved)
-            found = [*medium.colors(samples, moved, COLORS), extinction]
-            return [jnp.broadcast_to(value, task.shape) for value in found]
+            return medium.optics(medium.gather(moved), moved)
 
         of_medium, of_depth, of_factor = jax.vjp(optics, self, task.depth, jnp.ones_like(task.depth[0, 0]))[1](cotangents)
         added = [
@@ -87,6 +90,12 @@ class Medium(abc.ABC):
             for value, more in zip(jax.tree.leaves(total), jax.tree.leaves(of_medium), strict=True)
         ]
         return jax.tree.unflatten(jax.tree.structure(total), added), (of_depth, of_factor)
+
+
+def mixed(optics: list[list[Float[Array, "..."]]]) -> list[Float[Array, "..."]]:
+    """Red, green, blue and extinction of all media that share samples, from those of each."""
+    extinctions = [of_one[3] for of_one in optics]
+    return [*mixed_colors([of_one[:3] for of_one in optics], extinctions), mixed_extinction(extinctions)]
 
 
 def mixed_extinction(extinctions: list[Float[Array, "..."]]) -> Float[Array, "..."]:
@@ -98,9 +107,16 @@ def mixed_extinction(extinctions: list[Float[Array, "..."]]) -> Float[Array, "..
 
 
 def mixed_colors(colors: list[list[Float[Array, "..."]]], extinctions: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
-    """Of all media that share samples: colours weigh by extinction, which is exact for constant ones. By medium, then channel."""
+    """Of all media that share samples: colours weigh by extinction, which is exact for constant ones. By medium, then channel.
+
+    Raises:
+        ValueError: where media give different channels.
+    """
     if len(colors) == 1:
         return colors[0]
+    given = [len(of_one) for of_one in colors]
+    if len(set(given)) > 1:
+        raise ValueError(f"`Medium.colors` must give the channels that it is asked for, but media gave {given} of them")
     total = mixed_extinction(extinctions)
     inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
     shares = [extinction * inverse for extinction in extinctions]

@@ -150,6 +150,12 @@ def test_fog_alone_has_derivatives_by_how_wide_the_view_is(frames, x64):
     assert abs(slope) > 0.1 and slope == pytest.approx((ahead - behind) / (2 * STEP), rel=CLOSE)
 
 
+def test_media_that_give_different_channels_are_refused():
+    one = jnp.ones((2, 3))
+    with pytest.raises(ValueError, match=r"`Medium.colors` must give the channels .* gave \[1, 3\]"):
+        mixed_colors([[one], [one] * 3], [one, one])
+
+
 def test_colours_weigh_by_extinction_and_nothing_has_no_weight():
     extinctions = [np.float32([1, 0, 0]), np.float32([3, 2, 0])]
     colors = [[np.float32([1, 1, 1])], [np.float32([0, 0.5, 0.5])]]
