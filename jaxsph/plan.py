@@ -345,7 +345,9 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         "`Scene(media=...)`": bool(scene.media),
     }
     if settings.screen == "quadtree":
-        return dataclasses.replace(settings, tolerance=None) if any(beyond.values()) else settings
+        pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
+        return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     for what, asked in beyond.items():
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
+    return settings

@@ -137,8 +137,7 @@ def paint(canvas: Canvas, shots: tuple[Shot, ...], *, tuning: Tuning) -> Canvas:
 @stage("coarsest", "estimator", quickly=True)
 def finish(canvas: Canvas, bound: Array, full: Array, *, coarsest: int, estimator: str, tuning: Tuning) -> Layers:
     """The layers of the image."""
-    color, transmittance, depth = canvases.finished(canvas, coarsest)
-    error = canvases.largest_errors(canvas, coarsest, ESTIMATORS[estimator])
+    color, transmittance, depth, error = canvases.finished(canvas, coarsest, ESTIMATORS[estimator])
     return Layers(color, transmittance, depth, canvas.spent, bound + error, full, None, canvas.rays)
 
 

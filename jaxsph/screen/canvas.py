@@ -6,24 +6,25 @@ Flow: cast -> [canvas: paint] -> estimators -> [canvas: wanted] -> packets -> ca
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.screen.estimators import Estimator, allowed, spread
+from jaxsph.screen.estimators import Estimator, allowed
 from jaxsph.screen.pyramid import (
     at_nodes,
     lattices,
     nodes_of_leaves,
     over_pixels,
+    of_corners,
     pixels_of_nodes,
     places,
-    reconstructed,
 )
 
 LIGHT = 4  # red, green, blue and transmittance: what errors are told from
+TWICE = 2.0  # times what is allowed, beyond which all pixels of a leaf are cast at once: it would be split again
 CHANNELS = 6  # and depth where it is finite, and whether it is
 
 
@@ -89,36 +90,38 @@ def wanted_by_tolerance(
     canvas: Canvas, side: int, coarsest: int, estimator: Estimator, tolerance: Array, bound: Float[Array, "height width"]
 ) -> Bool[Array, "height width"]:
     """Pixels to cast that splitting all leaves of one side asks for, whose error may be over what is allowed."""
-    light = jax.lax.stop_gradient(canvas.light)
+    light = lax.stop_gradient(canvas.light)
     coarser, corners = lattices(light, canvas.known, side, coarsest)[-2:]
     errors = estimator(coarser, corners, canvas.shape, side)
-    split = errors.largest > allowed(tolerance, bound, side)
+    room = allowed(tolerance, bound, side)
+    split = (errors.largest > room) | _unseen(canvas, corners, side)
     wanted = pixels_of_nodes(nodes_of_leaves(split, canvas.shape, side // 2), canvas.shape, side // 2)
+    if side > 2:
+        wanted |= over_pixels(errors.largest > TWICE * room, canvas.shape, side)
     return wanted & ~canvas.known
 
 
-def largest_errors(canvas: Canvas, coarsest: int, estimator: Estimator) -> Float[Array, "height width"]:
-    """The error that each pixel is expected to have: that of the smallest leaf that has a corner which was not interpolated."""
-    light, shape = jax.lax.stop_gradient(canvas.light), canvas.shape
-    found = lattices(light, canvas.known, 1, coarsest)
-    error = jnp.zeros(shape, light.dtype)
-    side = coarsest // 2
-    for coarser, corners in zip(found[:-2], found[1:-1], strict=True):
-        here = estimator(coarser, corners, shape, side)
-        finer = at_nodes(canvas.known, side)
-        made = functools.reduce(jnp.logical_and, (finer[i : finer.shape[0] - 1 + i, j : finer.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1)))
-        error = jnp.where(over_pixels(made, shape, side), spread(here.largest, shape, side), error) if min(made.shape) else error
-        side //= 2
-    return jnp.where(canvas.known, 0, error)
+def _unseen(canvas: Canvas, corners: Float[Array, "4 rows columns"], side: int) -> Bool[Array, "rows columns"]:
+    """Leaves that look empty, though rays between their corners may meet something."""
+    empty = of_corners(corners[3] == 1, jnp.logical_and)
+    pads = [(0, count * side - size) for count, size in zip(empty.shape, canvas.shape, strict=True)]
+    inside = jnp.pad(~canvas.known, [(0, max(pad, 0)) for _, pad in pads])[: empty.shape[0] * side, : empty.shape[1] * side]
+    return empty & inside.reshape(empty.shape[0], side, empty.shape[1], side).any((1, 3))
 
 
-def finished(canvas: Canvas, coarsest: int) -> tuple[Array, Array, Array]:
-    """Colour, transmittance and depth of all pixels."""
-    red, green, blue, transmittance, depth, seen = reconstructed(
-        jnp.moveaxis(canvas.value, -1, 0), canvas.known, 1, coarsest
-    )
+def finished(canvas: Canvas, coarsest: int, estimator: Estimator) -> tuple[Array, Array, Array, Array]:
+    """Colour, transmittance, depth and expected error of all pixels: that of the smallest leaf whose corners are all known."""
+    found = lattices(jnp.moveaxis(canvas.value, -1, 0), canvas.known, 1, coarsest)
+    red, green, blue, transmittance, depth, seen = found[-1]
     half = (seen > 0) & (transmittance <= 0.5)
-    return jnp.stack([red, green, blue], -1), transmittance, jnp.where(half, depth / jnp.where(half, seen, 1), jnp.inf)
+    depth = jnp.where(half, depth / jnp.where(half, seen, 1), jnp.inf)
+    error, side = jnp.zeros(canvas.shape, transmittance.dtype), coarsest // 2
+    for coarser, corners in zip(found[:-2], found[1:-1], strict=True):
+        here = estimator(*(lax.stop_gradient(lattice[:LIGHT]) for lattice in (coarser, corners)), canvas.shape, side)
+        made = over_pixels(of_corners(at_nodes(canvas.known, side), jnp.logical_and), canvas.shape, side)
+        error = jnp.where(made, over_pixels(here.largest, canvas.shape, side), error)
+        side //= 2
+    return jnp.stack([red, green, blue], -1), transmittance, depth, jnp.where(canvas.known, 0, error)
 
 
 jax.tree_util.register_dataclass(

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsph.screen.pyramid import at_nodes, halved, num_leaves, over_pixels
+from jaxsph.screen.pyramid import at_nodes, corners_of, halved, num_leaves, of_corners
 
 CAUTION = 1.0  # of the largest difference around, how much a leaf may yet be wrong by: `benchmarks/calibrate_screen.py`
 GAUSS = np.polynomial.legendre.leggauss(3)
@@ -74,7 +74,7 @@ class CornerVariance(Estimator):
         self, coarser: Float[Array, "channels ..."], corners: Float[Array, "channels rows columns"], shape: tuple[int, int], side: int
     ) -> LeafErrors:
         """See `Estimator`."""
-        four = jnp.stack(_four(corners, _leaves(shape, side)))
+        four = jnp.stack(corners_of(corners))
         return LeafErrors(side * jnp.sqrt(four.var(0).sum(0)), (four.max(0) - four.min(0)).max(0) / 2)
 
 
@@ -96,15 +96,9 @@ def _leaves(shape: tuple[int, int], side: int) -> tuple[int, int]:
     return num_leaves(shape[0], side), num_leaves(shape[1], side)
 
 
-def _four(nodes: Array, leaves: tuple[int, int]) -> list[Array]:
-    """What the four corners of leaves have; in an image of one row or column, two of them are the others."""
-    nodes = jnp.pad(nodes, [(0, 0), *((0, count + 1 - have) for count, have in zip(leaves, nodes.shape[1:], strict=True))], mode="edge")
-    return [nodes[:, i : i + leaves[0], j : j + leaves[1]] for i in (0, 1) for j in (0, 1)]
-
-
 def _mean_square(gain: Float[Array, "channels rows columns"], leaves: tuple[int, int]) -> Float[Array, "rows columns"]:
     """Of the bilinear function with those values at the corners: by three points of Gauss along either side."""
-    upper_left, upper_right, lower_left, lower_right = _four(gain, leaves)
+    upper_left, upper_right, lower_left, lower_right = corners_of(gain)
     place, weight = (GAUSS[0] + 1) / 2, GAUSS[1] / 2
     total = jnp.zeros(leaves, gain.dtype)
     for y, wy in zip(place, weight, strict=True):
@@ -122,10 +116,4 @@ def _largest_around(value: Float[Array, "rows columns"], leaves: tuple[int, int]
 
 def allowed(tolerance: Array, bound: Float[Array, "height width"], side: int) -> Float[Array, "rows columns"]:
     """What rays leave of a tolerance to the leaves, if they can be wrong by `bound`, a pixel."""
-    four = _four(at_nodes(bound, side)[None], _leaves(bound.shape, side))
-    return tolerance - jnp.maximum(jnp.maximum(four[0], four[1]), jnp.maximum(four[2], four[3]))[0]
-
-
-def spread(largest: Float[Array, "rows columns"], shape: tuple[int, int], side: int) -> Float[Array, "height width"]:
-    """Errors of leaves, at all of their pixels."""
-    return over_pixels(largest, shape, side)
+    return tolerance - of_corners(at_nodes(bound, side), jnp.maximum)

@@ -12,6 +12,9 @@ Arrays of pixels are (channels, height, width), of nodes (channels, rows, column
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -35,6 +38,17 @@ def at_nodes(value: Array, stride: int) -> Array:
 def num_leaves(size: int, stride: int) -> int:
     """Leaves that so many pixels have side by side; a single pixel is one."""
     return max(num_nodes(size, stride) - 1, 1)
+
+
+def corners_of(nodes: Array) -> list[Array]:
+    """What the four corners of leaves have, of nodes (..., rows, columns); of one row or column, two of them are the others."""
+    nodes = jnp.pad(nodes, [(0, 0)] * (nodes.ndim - 2) + [(0, int(size == 1)) for size in nodes.shape[-2:]], mode="edge")
+    return [nodes[..., i : nodes.shape[-2] - 1 + i, j : nodes.shape[-1] - 1 + j] for i in (0, 1) for j in (0, 1)]
+
+
+def of_corners(nodes: Array, join: Callable[[Array, Array], Array]) -> Array:
+    """What the corners of leaves have in common, joined two by two."""
+    return functools.reduce(join, corners_of(nodes))
 
 
 def halved(value: Float[Array, "channels rows columns"], shape: tuple[int, int], stride: int) -> Float[Array, "channels ..."]:
@@ -61,17 +75,10 @@ def _halved(value: Array, axis: int, size: int, stride: int) -> Array:
     return jnp.take(both, jnp.arange(count), axis)
 
 
-def reconstructed(
-    value: Float[Array, "channels height width"], known: Bool[Array, "height width"], stride: int, coarsest: int
-) -> Float[Array, "channels rows columns"]:
-    """The image at nodes `stride` apart, of what is known; all nodes `coarsest` apart must be."""
-    return lattices(value, known, stride, coarsest)[-1]
-
-
 def lattices(
     value: Float[Array, "channels height width"], known: Bool[Array, "height width"], stride: int, coarsest: int
 ) -> list[Float[Array, "channels rows columns"]]:
-    """The same at nodes `coarsest`, `coarsest / 2`, ... `stride` apart."""
+    """The image at nodes `coarsest`, `coarsest / 2`, ... `stride` apart; all nodes `coarsest` apart must be known."""
     found = [at_nodes(value, coarsest)]
     while coarsest > stride:
         coarsest //= 2
