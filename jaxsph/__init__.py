@@ -1,7 +1,7 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
 from jaxsph import io, reference, scenes
-from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
+from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.render import CapacityError, render
@@ -17,6 +17,7 @@ __all__ = [
     "Scene",
     "Settings",
     "TransferFunction",
+    "Volume",
     "__version__",
     "io",
     "plan",

@@ -241,12 +241,13 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
         scene, camera = scenes.load(name, options.particles, options.frame, width=width, height=height)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.to_numpy()['support'])}")
+    particles = scene.particle_set
+    say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     if options.command != "info":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
-            scene = dataclasses.replace(scene, transfer=_transfer(scene.particles, options, "concentration"))
+            scene = dataclasses.replace(scene, transfer=_transfer(particles, options, "concentration"))
         if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):
-            camera = _camera(scene.particles, options)
+            camera = _camera(particles, options)
     return scene, camera
 
 
@@ -311,7 +312,7 @@ def _info(options: argparse.Namespace) -> None:
         raise UsageError("a particle file or scene:NAME is needed, or --cache")
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
-        say("quantity", f"concentration, {span(scene.particles.to_numpy()['quantity'])}")
+        say("quantity", f"concentration, {span(scene.particle_set.to_numpy()['quantity'])}")
         say("camera", camera_line(camera))
         return
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for particle files")
@@ -358,7 +359,7 @@ def _demo(options: argparse.Namespace) -> None:
     truth, some = truth_of.result(), slice(every // 2, None, every)
     seen = dataclasses.replace(full, color=full.color[some, some], transmittance=full.transmittance[some, some])
     rounding = largest_difference(seen, truth)
-    say("scene", f"mixer, {scene.particles.num_particles:,} particles")
+    say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
     for output in outputs:
         say("image", str(output.resolve()))
     say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {largest(image.error_bound):.2g}")

@@ -81,9 +81,10 @@ class Plan:
         """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
         require_controllable(scene, settings)
         self.check_image(camera, settings)
-        if scene.particles.capacity > self.num_particles:
+        capacity = scene.particle_set.capacity
+        if capacity > self.num_particles:
             raise ValueError(
-                f"`plan` was made for scene.particles.capacity = {self.num_particles} at most, got {scene.particles.capacity}; "
+                f"`plan` was made for scene.particles.capacity = {self.num_particles} at most, got {capacity}; "
                 "make a new one with `jaxsph.plan`, or grow this one by its `like=`"
             )
 
@@ -305,13 +306,15 @@ def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) ->
 
 
 def require_controllable(scene: Scene, settings: Settings) -> None:
-    """Raise `ValueError` where a tolerance is asked for that no estimator can keep."""
+    """Raise `ValueError` where a scene lacks a part, or a tolerance is asked for that no estimator can keep."""
+    scene.check()
     if settings.tolerance is None:
         return
     beyond = {
         f"`integrator={settings.integrator!r}`": settings.integrator != "samples",
         f"`screen={settings.screen!r}`": settings.screen != "pixels",
         "`Scene(media=...)`": bool(scene.media),
+        "`Scene(volume=...)`": scene.volume is not None,
     }
     for what, asked in beyond.items():
         if asked:
