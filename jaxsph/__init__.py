@@ -1,6 +1,7 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
 from jaxsph import io, reference, scenes
+from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
@@ -12,6 +13,7 @@ __all__ = [
     "Camera",
     "CapacityError",
     "Image",
+    "IsoSurface",
     "Particles",
     "Plan",
     "Scene",

@@ -67,7 +67,8 @@ class Volume:
             )
         if not is_traced(given):
             _require_finite_values(given, "repair them, or give them a number that the transfer function does not show")
-        packed = jnp.asarray(given, _kept_dtype(given.dtype))
+        with np.errstate(over="ignore"):  # what overflows is refused by name
+            packed = jnp.asarray(given, _kept_dtype(given.dtype))
         if not is_traced(given) and packed.dtype != given.dtype:
             _require_finite_values(packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32

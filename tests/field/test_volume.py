@@ -16,6 +16,7 @@ from jaxsph.access.extents import SlabExtents
 from jaxsph.access.macrocells import MACROCELL, MacrocellRanges, Occupancy
 from jaxsph.field.volume import VolumeMedium
 from jaxsph.field.volume_grid import VolumeGrid
+from jaxsph.numerics import faults
 
 SETTINGS = js.Settings(samples=32)
 FIELD = np.random.default_rng(4).uniform(0, 1, (9, 7, 12)).astype(np.float32)
@@ -106,10 +107,12 @@ def test_derivatives_are_those_of_differences(x64):
 
 def test_values_that_are_no_numbers_are_a_fault_under_jit():
     shown, view = scene(), camera()
-    plan = js.plan(shown, view, SETTINGS)
-    broken = dataclasses.replace(shown.volume, values=shown.volume.values.at[3, 2, 1].set(jnp.nan))
-    draw = jax.jit(lambda volume: js.render(dataclasses.replace(shown, volume=volume), view, SETTINGS, plan=plan))
-    assert draw(shown.volume).faults == 0 != draw(broken).faults
+    broken = dataclasses.replace(shown.volume, values=jnp.asarray(np.where(FIELD[3, 2, 1] == FIELD, np.nan, FIELD)))
+    words = [int(FAULTS(volume, shown.volume_transfer, view)) for volume in (shown.volume, broken)]
+    assert words == [0, faults.BAD_VOLUME]
+    for volume in (broken, dataclasses.replace(shown.volume, spacing=jnp.zeros(3))):
+        with pytest.raises(ValueError, match="a volume holds values that are not finite"):
+            js.render(dataclasses.replace(shown, volume=volume), view, SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -157,6 +160,11 @@ def EXAMPLES(volume, looks, view):
 
 
 @jax.jit
+def FAULTS(volume, looks, view):
+    return VolumeMedium.seen(volume, looks, view).faults()
+
+
+@jax.jit
 def OCCUPIED(medium, slabs):
     return medium.occupied(slabs)
 
@@ -172,11 +180,12 @@ def test_empty_space_is_skipped():
     values = np.zeros((33, 33, 33), np.float32)
     values[20:24, 20:24, 20:24] = 1.0
     volume = js.Volume.from_array(values, 0 * np.ones(3), 1 / 32)
-    ranges = MacrocellRanges.of(volume.values)
+    ranges = jax.jit(MacrocellRanges.of)(volume.values)
     assert ranges.lo.shape == (8, 8, 8) == tuple(32 // MACROCELL for _ in range(3))
-    shown = ranges.shown_by(js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [0.0, 1.0]))
+    shown = jax.jit(MacrocellRanges.shown_by)(ranges, js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [0.0, 1.0]))
     assert int(shown.sum()) == 8
     grid = VolumeGrid(volume.values, jnp.zeros(3), jnp.eye(3) * 32)
-    ends = [jnp.asarray([[low], [low + 0.05]]) for low in (0.1, 0.65)]
-    boxes = [SlabExtents(*(edge[i : i + 1] for _ in range(3) for i in range(2))) for edge in ends]
-    assert [bool(grid.touched(Occupancy.of(shown), box)[0, 0]) for box in boxes] == [False, True]
+    ends = [np.float32([[low], [low + 0.05]]) for low in (0.1, 0.65)]
+    boxes = [SlabExtents(*(jnp.asarray(edge[i : i + 1]) for _ in range(3) for i in range(2))) for edge in ends]
+    touched = jax.jit(lambda box: grid.touched(Occupancy.of(shown), box))
+    assert [bool(touched(box)[0, 0]) for box in boxes] == [False, True]
