@@ -6,6 +6,7 @@ from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunc
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.render import CapacityError, render
+from jaxsph.resample import resample
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
@@ -25,6 +26,7 @@ __all__ = [
     "plan",
     "reference",
     "render",
+    "resample",
     "scenes",
     "sweep",
 ]
