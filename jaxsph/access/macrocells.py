@@ -10,7 +10,6 @@ running sums, however large the box is.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import jax
@@ -22,6 +21,7 @@ from jaxsph.model.transfer import EVEN, SELECT_ALL, TransferFunction, look_up
 from jaxsph.numerics.sums import running_sum
 
 MACROCELL = 4
+Reduction = Callable[..., Array]
 ROUNDING = 8  # eps that interpolation between two values, or their look-up, may be off by
 
 
@@ -38,7 +38,7 @@ class MacrocellRanges:
         values = lax.stop_gradient(values)
         lo, hi = values, values
         for axis in range(3):
-            lo, hi = _reduced(lo, jnp.minimum, axis), _reduced(hi, jnp.maximum, axis)
+            lo, hi = _reduced(lo, jnp.minimum, jnp.min, axis), _reduced(hi, jnp.maximum, jnp.max, axis)
         return cls(lo, hi)
 
     def finite(self) -> Bool[Array, ""]:
@@ -65,7 +65,9 @@ class MacrocellRanges:
             lo = jnp.where((lo > values[0]) & (lo < values[-1]), lo - off, lo)
             hi = jnp.where((hi > values[0]) & (hi < values[-1]), hi + off, hi)
         up_to = jnp.concatenate([jnp.zeros(1, jnp.int32), running_sum((transfer.extinction > 0).astype(jnp.int32))])
-        first, last = jnp.searchsorted(values, lo, side="left"), jnp.searchsorted(values, hi, side="right")
+        method = "compare_all" if values.shape[0] <= SELECT_ALL else "scan"  # as look-ups do
+        first = jnp.searchsorted(values, lo, side="left", method=method)
+        last = jnp.searchsorted(values, hi, side="right", method=method)
         segments = transfer.segments()
         at_ends = (look_up(segments, lo)[3] > 0) | (look_up(segments, hi)[3] > 0)
         return at_ends | (up_to[last] > up_to[first])
@@ -103,16 +105,16 @@ class Occupancy:
         return at[x, y1, z1] - at[x, y0, z1] - at[x, y1, z0] + at[x, y0, z0]
 
 
-def _reduced(values: Array, of_two: Callable[[Array, Array], Array], axis: int) -> Array:
+def _reduced(values: Array, of_two: Reduction, of_all: Reduction, axis: int) -> Array:
     """Least or greatest of the points of macrocells along an axis, both ends included."""
-    points = values.shape[axis]
-    macrocells = -(-(points - 1) // MACROCELL)
+    points, before_axis, behind = values.shape[axis], values.shape[:axis], values.shape[axis + 1 :]
+    number = -(-(points - 1) // MACROCELL)
     last = lax.slice_in_dim(values, points - 1, points, axis=axis)
-    missing = macrocells * MACROCELL + 1 - points
+    missing = number * MACROCELL + 1 - points
     padded = jnp.concatenate([values, *[last] * missing], axis) if missing else values
-    behind = (macrocells - 1) * MACROCELL + 1
-    parts = [lax.slice_in_dim(padded, offset, offset + behind, MACROCELL, axis) for offset in range(MACROCELL + 1)]
-    return functools.reduce(of_two, parts)
+    own = lax.slice_in_dim(padded, 0, number * MACROCELL, axis=axis).reshape(*before_axis, number, MACROCELL, *behind)
+    of_next = lax.slice_in_dim(padded, MACROCELL, number * MACROCELL + 1, MACROCELL, axis)
+    return of_two(of_all(own, axis=axis + 1), of_next)
 
 
 jax.tree_util.register_dataclass(MacrocellRanges, data_fields=["lo", "hi"], meta_fields=[])
