@@ -10,6 +10,7 @@ a few steps of false position (the Illinois form: Dahlquist & Bjoerck 1974, sect
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -117,38 +118,44 @@ class IsoSurface(Medium):
             Shading has derivatives by values and level, through where the surface is met. Which samples meet it has none.
         """
         grid, _ = self._viewed()
-        inside, front, back = _clipped(grid, *(grid.coordinates(place) for place in _ends(task)))
+        ends = _ends(task)
+        inside, front, back = _clipped(grid, *(grid.coordinates(place) for place in ends))
         begin, end = (grid.interpolate(place) - self.level for place in (front, back))
         met = inside & ((begin >= 0) != (end >= 0))
-        front, back, begin, end = jax.tree.map(lambda of_samples: _first(met, of_samples), (front, back, begin, end))
+        pieces = front, back, begin, end, lax.stop_gradient(_ray(ends))
+        front, back, begin, end, ray = jax.tree.map(lambda of_samples: _first(met, of_samples), pieces)
         found = lax.stop_gradient(_crossing(grid, self.level, front, back, begin, end))
         slope = lax.stop_gradient(end - begin)
         place = _between(front, back, found)
         off = grid.interpolate(place) - self.level  # one step of Newton's: it moves with values and level as the surface does
         place = _between(front, back, jnp.clip(found - off / jnp.where(slope != 0, slope, 1), 0, 1))
-        return met, self._shade(grid.directions(_gradient(grid, place)), task)
+        return met, self._shade(grid.directions(_gradient(grid, place)), ray)
 
     def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, Array]:
         """Opaque samples, and how brightly they shine."""
         met, shade = gathered
-        ends = lax.stop_gradient(_ends(task))
-        length = jnp.linalg.norm(jnp.stack([end - begin for begin, end in zip(*ends, strict=True)]), axis=0)
+        length = jnp.sqrt(_square(lax.stop_gradient(_ray(_ends(task)))))
         return jnp.where(met & (length > 0), OPAQUE / jnp.where(length > 0, length, 1), 0), shade
 
     def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """The colour, shaded."""
         return [jnp.broadcast_to(color * samples, task.shape) for color in list(self.color)[channels]]
 
-    def _shade(self, normal: Coordinates, task: SlabTask) -> Float[Array, "tasks samples rays"]:
+    def _shade(self, normal: Coordinates, ray: tuple[Array, ...]) -> Float[Array, "tasks 1 rays"]:
         """Ambient light, and the light from the eye that the surface faces; where it faces nowhere, all of it."""
-        u, v = task.u[:, None, None, :], task.v[:, None, :, None]
-        whole = task.shape[0], 1, task.shape[2]
-        spread = jnp.broadcast_arrays(u, v) if task.perspective else [jnp.zeros((task.shape[0], 1, v.shape[2], u.shape[3]))] * 2
-        x, y = (side.reshape(whole) for side in spread)
-        along = normal[0] * x + normal[1] * y + normal[2]
-        square = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
-        facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1) * (1 + x * x + y * y)), 1)
+        along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
+        square = _square(normal) * _square(ray)
+        facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
         return self.ambient + (1 - self.ambient) * facing
+
+
+def _square(vector: Sequence[Array]) -> Array:
+    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
+
+
+def _ray(ends: tuple[tuple[Array, ...], tuple[Array, ...]]) -> tuple[Array, ...]:
+    """From the beginning to the end of pieces, in view space."""
+    return tuple(end - begin for begin, end in zip(*ends, strict=True))
 
 
 def _first(met: Bool[Array, "tasks samples rays"], of_samples: Array) -> Float[Array, "tasks 1 rays"]:
