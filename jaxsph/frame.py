@@ -9,9 +9,10 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.access.grid import Grid
+from jaxsph.access.lists import ListPlan
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
@@ -23,6 +24,8 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Executor
 from jaxsph.plan import Plan
 from jaxsph.stages import (
+    BandGrid,
+    Cast,
     Decided,
     Limits,
     add_lattices,
@@ -37,6 +40,9 @@ from jaxsph.stages import (
     wanted_cells,
 )
 from jaxsph.viewing import Seen
+
+
+RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
 
 
 class Band(NamedTuple):
@@ -56,7 +62,10 @@ class Band(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What all bands of a frame have in common; `shards` of each are cast side by side."""
+    """What all bands of a frame have in common; `shards` of each are cast side by side.
+
+    `limits` are what rays keep to, of which each may take a share of what is `allowed` where pixels are interpolated too.
+    """
 
     ordered: Ordered
     camera: Camera
@@ -66,6 +75,7 @@ class Frame:
     plan: Plan
     kernel: str
     shards: int
+    allowed: Float[Array, ""] | None
 
     @classmethod
     def begun(
@@ -74,22 +84,35 @@ class Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
         ordered = run.one("grid", order, (seen.viewed, camera), **static)
-        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards)
+        allowed = None if limits is None else limits.tolerance
+        if limits is not None and plan.quadtree is not None:
+            limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards, allowed)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
-        plan = self.plan
-        sizes = {"lists": plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
-        made = run.one("grid", make_grid, (self.ordered, self.camera, first_row), **sizes)
+        made = self.grid(first_row, run)
         grid = made.of(self.ordered)
-        decided, lattice = self._decide(grid, run)
-        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
-        scene = (grid, self.camera, self.transfer, self.media)
-        inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
-        method = {"cast_plan": plan.cast, "integrator": plan.integrator, "screen": plan.screen, "kernel": self.kernel}
-        rays = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        decided, lattice = self.decide(grid, run)
+        rays = self.cast(grid, decided, lattice, run)
         of_shards = OfShards(tuple(rays), tuple(one.verdict for one in decided))
         return Band(of_shards, made.lists.faults, made.filled, made.pairs)
+
+    def grid(self, first_row: Int[Array, ""], run: Executor, camera: Camera | None = None, lists: ListPlan | None = None) -> BandGrid:
+        """Of the band that begins at a row of pixels, or of another camera's nodes."""
+        plan = self.plan
+        sizes = {"lists": lists or plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
+        made: BandGrid = run.one("grid", make_grid, (self.ordered, camera or self.camera, first_row), **sizes)
+        return made
+
+    def cast(self, grid: Grid, decided: list[Decided], lattice: Lattice | None, run: Executor, camera: Camera | None = None) -> list[Cast]:
+        """What the rays of all packets of a grid meet, shard by shard."""
+        plan = self.plan
+        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
+        scene = (grid, camera or self.camera, self.transfer, self.media)
+        inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
+        method = {"cast_plan": plan.cast, "integrator": plan.integrator, "screen": plan.screen, "kernel": self.kernel}
+        return run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
 
     @property
     def _each(self) -> list[Int[Array, ""]]:
@@ -104,16 +127,17 @@ class Frame:
         """What most stages are compiled for."""
         return {"cast": self.plan.cast, "tuning": self.plan.cast.tuning}
 
-    def _decide(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice | None]:
+    def decide(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice | None]:
         """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
         if self.limits is None or self.plan.control is None:
-            return self._leave(grid, run, with_levels=False), None
+            return self.leave(grid, run, with_levels=False), None
         if isinstance(self.plan.control, PilotPlan):
             return self._ask_pilot(grid, self.plan.control, run)
         return self._bound(grid, run), None
 
-    def _leave(self, grid: Grid, run: Executor, *, with_levels: bool) -> list[Decided]:
-        inputs = [(grid, self.camera, self.transfer, self.media, nth) for nth in self._each]
+    def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
+        """All slabs at full rate, shard by shard."""
+        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth) for nth in self._each]
         static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
         return run.each("adapt", decide_full_rate, inputs, **static)
 
@@ -132,7 +156,7 @@ class Frame:
         probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in self._each], **static)
         pays, wanted = run.one("adapt", wanted_cells, (tuple(probes),), tuning=self.plan.cast.tuning)
         if not run.may_hold(pays):
-            return self._leave(grid, run, with_levels=True)
+            return self.leave(grid, run, with_levels=True)
         view = (grid, self.camera, self.transfer, self.limits)
         inputs = [(*view, of_shard, nth) for of_shard, nth in zip(wanted, self._each, strict=True)]
         return run.each("adapt", decide_by_bounds, inputs, **static)

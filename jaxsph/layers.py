@@ -36,6 +36,7 @@ class Layers(NamedTuple):
     Attributes:
         full: evaluations that full rate takes.
         levels: what error control gave each cell, if there is any that gives levels.
+        rays: how many were cast, where pixels are interpolated.
     """
 
     color: Float[Array, "rows columns 3"]
@@ -45,6 +46,7 @@ class Layers(NamedTuple):
     bound: Float[Array, "rows columns"]
     full: Float[Array, "rows columns"]
     levels: Int[Array, "bundle_rows bundle_columns cells"] | None
+    rays: Float[Array, ""] | None = None
 
 
 @compiled_quickly

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxsph.access.lists import BUNDLE, TILE
+from jaxsph.access.lists import BUNDLE, TILE, nodes_between
 from jaxsph.access.view import Viewed
 from jaxsph.model.camera import Camera
 
@@ -26,6 +26,7 @@ class Measures:
         rows, columns: of bundles, from the first to the last that any particle is seen in; at least 1.
         depth_extent: median diameter along depth, in samples; NaN where nothing is seen.
         diameter: median diameter across, in pixels; NaN where nothing is seen.
+        of_lattice: (particle, tile) and (particle, bundle) pairs of the bundles of a lattice of rays.
     """
 
     tile_pairs: np.ndarray
@@ -34,10 +35,11 @@ class Measures:
     columns: int
     depth_extent: float
     diameter: float
+    of_lattice: tuple[int, int] = (0, 0)
 
 
-def measure(viewed: Viewed, camera: Camera, samples: int) -> Measures:
-    """Measure particles in the view of a camera with `samples` along each ray."""
+def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Measures:
+    """Measure particles in the view of a camera with `samples` along each ray; and for a lattice of rays, if its stride is given."""
     left, right, top, bottom = (np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom))
     seen = np.flatnonzero((right >= left) & (bottom >= top))
     some = seen[:: max(1, len(seen) // MAX_MEDIAN_OF)]
@@ -50,7 +52,19 @@ def measure(viewed: Viewed, camera: Camera, samples: int) -> Measures:
     ends = (top, bottom), (left, right)
     reached = [int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1) for first, last in ends]
     medians = [float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters)]
-    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians)
+    of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
+    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians, of_lattice)
+
+
+def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int) -> tuple[int, int]:
+    """How many tiles and bundles of nodes all particles can touch."""
+    left, right = nodes_between(sides[0], sides[1], camera.width, stride)
+    top, bottom = nodes_between(sides[2], sides[3], camera.height, stride)
+    met = (right >= left) & (bottom >= top)
+    ranges = [side[met] for side in (left, right, top, bottom)]
+    rows = -(-camera.strided(stride).nodes[0] // TILE)
+    tiles, bundles = (int(_pairs_in_rows(tuple(ranges), size, rows * TILE // size).sum()) for size in (TILE, BUNDLE))
+    return tiles, bundles
 
 
 def _extents(z: np.ndarray, reach: np.ndarray, camera: Camera, samples: int) -> np.ndarray:

@@ -19,12 +19,14 @@ from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import FINEST, Spacing
 from jaxsph.measures import Measures
 from jaxsph.memory_estimate import frame_bytes
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera import Camera, num_nodes
 from jaxsph.model.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
+from jaxsph.screen.quadtree import QuadtreePlan
 
+MIN_PACKETS = 64  # bundles cast together, by a quadtree
 MAX_CAPACITY = 1 << 30
 MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
@@ -48,6 +50,7 @@ class Plan:
         bytes: estimate of the working memory, in bytes; of no matter to what is compiled, so plans are equal whatever it is.
         control: static choices of error control; None renders at full rate.
         integrator, screen: names of how samples become light, and of which rays are cast.
+        quadtree: sizes of its refinement, where rays are chosen by one.
     """
 
     width: int
@@ -62,6 +65,7 @@ class Plan:
     control: ControlPlan | PilotPlan | None = None
     integrator: str = "samples"
     screen: str = "pixels"
+    quadtree: QuadtreePlan | None = None
 
     @property
     def band_height(self) -> int:
@@ -79,8 +83,7 @@ class Plan:
 
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
-        require_controllable(scene, settings)
-        self.check_image(camera, settings)
+        self.check_image(camera, along_rays(scene, settings))
         capacity = scene.particle_set.capacity
         if capacity > self.num_particles:
             raise ValueError(
@@ -97,6 +100,9 @@ class Plan:
             "settings.integrator": (settings.integrator, self.integrator),
             "settings.screen": (settings.screen, self.screen),
         }
+        if self.quadtree is not None:
+            given["settings.leaf_pixels"] = (settings.leaf_pixels, self.quadtree.leaf)
+            given["settings.leaf_estimator"] = (settings.leaf_estimator, self.quadtree.estimator)
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
@@ -111,7 +117,12 @@ class Plan:
         """Whether this plan has room for all that another was made for, and is the same in what is no room."""
         mine, theirs = (
             dataclasses.replace(
-                one, num_particles=1, num_classes=1, lists=_without_room(one.lists), control=_roomless(one.control)
+                one,
+                num_particles=1,
+                num_classes=1,
+                lists=_without_room(one.lists),
+                control=_roomless(one.control),
+                quadtree=None if one.quadtree is None else one.quadtree.with_room(1, 1),
             )
             for one in (self, needed)
         )
@@ -131,12 +142,16 @@ class Plan:
             lists = dataclasses.replace(lists, tile_capacity=rooms[2], list_capacity=rooms[3])
         if isinstance(control, PilotPlan) and self.bands == needed.bands:
             control = dataclasses.replace(control, room=(rooms[4], rooms[5]))
-        return dataclasses.replace(needed, num_particles=rooms[0], num_classes=rooms[1], lists=lists, control=control)
+        quadtree = None if needed.quadtree is None else needed.quadtree.with_room(rooms[6], rooms[7])
+        return dataclasses.replace(
+            needed, num_particles=rooms[0], num_classes=rooms[1], lists=lists, control=control, quadtree=quadtree
+        )
 
     def _rooms(self) -> tuple[int, ...]:
         """All that may be larger than needed."""
         room = (self.control.room if isinstance(self.control, PilotPlan) else None) or (0, 0)
-        return self.num_particles, self.num_classes, self.lists.tile_capacity, self.lists.list_capacity, *room
+        coarse = (0, 0) if self.quadtree is None else (self.quadtree.lists.tile_capacity, self.quadtree.lists.list_capacity)
+        return self.num_particles, self.num_classes, self.lists.tile_capacity, self.lists.list_capacity, *room, *coarse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,7 +235,19 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
     needed = frame_bytes(size, shape.num_classes, lists, cast, control, shape.number)
-    return Plan(*size, shape.num_classes, bands, lists, cast, needed, control, settings.integrator, settings.screen)
+    quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
+    method = control, settings.integrator, settings.screen, quadtree
+    return Plan(*size, shape.num_classes, bands, lists, cast, needed, *method)
+
+
+def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, lists: ListPlan) -> QuadtreePlan:
+    """Sizes of the first lattice, and of what is cast after that at a time."""
+    stride = settings.leaf_pixels // 2
+    rows, columns = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
+    tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in measures.of_lattice)
+    coarse = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
+    packets = max(lists.num_bundles // shape.tuning.turns, min(lists.num_bundles, MIN_PACKETS))
+    return QuadtreePlan(settings.leaf_pixels, settings.leaf_estimator, coarse, packets)
 
 
 def _fullest_band(counts: np.ndarray, rows: int, bands: int) -> int:
@@ -305,17 +332,24 @@ def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) ->
     return CastPlan(chunk, slab_samples, min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk), tuning)
 
 
-def require_controllable(scene: Scene, settings: Settings) -> None:
-    """Raise `ValueError` where a scene lacks a part, or a tolerance is asked for that no estimator can keep."""
+def along_rays(scene: Scene, settings: Settings) -> Settings:
+    """Settings of error control along rays: without a tolerance where only the screen can keep it.
+
+    Raises:
+        ValueError: where a scene lacks a part, or a tolerance is asked for that nothing can keep.
+    """
     scene.check()
     if settings.tolerance is None:
-        return
+        return settings
     beyond = {
         f"`integrator={settings.integrator!r}`": settings.integrator != "samples",
-        f"`screen={settings.screen!r}`": settings.screen != "pixels",
+        f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
     }
+    if settings.screen == "quadtree":
+        return dataclasses.replace(settings, tolerance=None) if any(beyond.values()) else settings
     for what, asked in beyond.items():
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
+    return settings

@@ -27,7 +27,7 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, memory_for, tuning_for
-from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class, require_controllable
+from jaxsph.plan import FrameShape, Plan, along_rays, choose, fitted, next_class
 from jaxsph.viewing import Seen, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -60,7 +60,7 @@ def plan(
     settings = settings or Settings()
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
-    require_controllable(scene, settings)
+    settings = along_rays(scene, settings)
     shape = dataclasses.replace(shape_of(scene.particle_set, camera, settings), headroom=1.0)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
@@ -69,7 +69,7 @@ def plan(
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
     seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, Clock())
-    measures = measure(seen.viewed, camera, shape.samples)
+    measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     return made if like is None else like.grown(made)
@@ -99,11 +99,11 @@ class Plans:
 
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
-        require_controllable(scene, settings)
+        settings = along_rays(scene, settings)
         shape = self._similar(shape_of(scene.particle_set, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
-        measures = measure(seen.viewed, camera, shape.samples)
+        measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
         made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)
@@ -150,6 +150,11 @@ class Plans:
 
 
 PLANS = Plans()
+
+
+def stride_of(settings: Settings) -> int:
+    """Pixels between the rays of the first lattice; 1 where every pixel has its own."""
+    return settings.leaf_pixels // 2 if settings.screen == "quadtree" else 1
 
 
 def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameShape:

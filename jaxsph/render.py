@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,7 @@ from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
+from jaxsph.refinement import refined
 from jaxsph.stages import limits_of
 from jaxsph.version import __version__
 from jaxsph.viewing import Seen
@@ -103,7 +105,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     draw = functools.partial(_draw, seen, camera, settings, plan, scene.particle_set.kernel)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
-    word = functools.reduce(lambda a, b: a | b, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
+    word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
     _raise(word, planned)
     image = assemble(layers, word)
     stats = {
@@ -113,6 +115,8 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         "pairs": sum(int(band.pairs) for band in bands),
         "seconds": clock.seconds,
     }
+    if layers.rays is not None:
+        stats["rays"] = int(layers.rays)
     clock.mark("image")
     certified = _certifies(plan) and (plan.control is None or float(settings.relax) == 0)
     metadata = _metadata(camera, settings, certified)
@@ -131,6 +135,8 @@ def _draw(
     """All bands one by one, and the layers of the image."""
     limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
     frame, bands = Frame.begun(seen, camera, limits, plan, kernel, shards, run), []
+    if plan.quadtree is not None:
+        return refined(frame, run, progress)
     for band in range(plan.bands):
         bands.append(frame.band(jnp.int32(band * plan.band_height), run))
         if progress is not None:
@@ -145,6 +151,8 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
     limits = limits_of(settings, seen.viewed.x.dtype)
     frame = Frame.begun(seen, camera, limits, plan, scene.particle_set.kernel, 1, run)
+    if plan.quadtree is not None:
+        return _refined_traced(frame, seen, run)
 
     def one_band(band: Int[Array, ""]) -> Any:
         found = frame.band(band * plan.band_height, run)
@@ -167,9 +175,18 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
+def _refined_traced(frame: Frame, seen: Seen, run: Traced) -> Image:
+    bands, layers = refined(frame, run, None)
+    word = functools.reduce(operator.or_, [band.faults for band in bands]) | seen.viewed.faults
+    image = blank_if(word & faults.UNUSABLE != 0, assemble(layers, word))
+    counts = {"cells": sum(band.filled for band in bands), "pairs": sum(band.pairs for band in bands)}
+    stats = {"evaluations": image.evaluations.sum(), "evaluations_full": layers.full.sum(), **counts, "rays": layers.rays}
+    return dataclasses.replace(image, certified=jnp.asarray(False), stats=stats)
+
+
 def _certifies(plan: Plan) -> bool:
     """Whether the error can be bounded at all."""
-    return not isinstance(plan.control, PilotPlan)
+    return not isinstance(plan.control, PilotPlan) and plan.quadtree is None
 
 
 def _raise(word: int, planned: bool) -> None:

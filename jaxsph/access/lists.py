@@ -102,11 +102,26 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
 
 
 def build_lists(ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
-    """The lists of all bundles of the band that starts at pixel row `first_row`."""
+    """The lists of all bundles of the band that starts at pixel row `first_row`; of a strided camera, by its nodes."""
+    ordered = on_nodes(ordered, camera)
     ranges = bundle_ranges(ordered, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
     touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
     return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
+
+
+def on_nodes(ordered: Ordered, camera: Camera) -> Ordered:
+    """With the nodes that a strided camera's rays go through counted instead of pixels."""
+    if camera.stride == 1:
+        return ordered
+    left, right = nodes_between(ordered.left, ordered.right, camera.width, camera.stride)
+    top, bottom = nodes_between(ordered.top, ordered.bottom, camera.height, camera.stride)
+    return dataclasses.replace(ordered, left=left, right=right, top=top, bottom=bottom)
+
+
+def nodes_between(first: Any, last: Any, size: int, stride: int) -> tuple[Any, Any]:
+    """First and last node of those in a range of pixels; none where the range is empty, or lies between two nodes."""
+    return -(-first // stride), last // stride + (first <= last) * (last == size - 1) * ((size - 1) % stride > 0)
 
 
 def _run_by_run(always: Array, function: Callable[[Any], Array], runs: Any) -> Array:

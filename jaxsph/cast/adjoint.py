@@ -51,7 +51,11 @@ class CastMethod:
     kernel: str
     plan: CastPlan
     integrator: Integrator
-    packets_of: Callable[[Grid, Camera], RayPackets]
+    packets_of: Callable[..., RayPackets]
+
+    def packets(self, grid: Grid, camera: Camera, chosen: Any) -> RayPackets:
+        """Of a grid and a camera, and of what was chosen if anything was."""
+        return self.packets_of(grid, camera) if chosen is None else self.packets_of(grid, camera, chosen)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +77,7 @@ class NonDiffInputs:
     schedule: SlabSchedule
     camera: Camera
     lattice: Lattice | None
+    chosen: Any
 
 
 def cast(
@@ -83,8 +88,9 @@ def cast(
     media: tuple[Medium, ...],
     method: CastMethod,
     lattice: Lattice | None = None,
+    chosen: Any = None,
 ) -> RayResult:
-    """`march.march`, differentiable in both modes.
+    """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
     Differentiation:
         Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
@@ -97,7 +103,7 @@ def cast(
     """
     columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
-    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice))
+    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen))
     return _cast(method, inputs, fixed)
 
 
@@ -109,7 +115,7 @@ def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayRe
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
     grid, camera = _seen(inputs, fixed)
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
-        media, packets = _media(method, inputs, fixed, Wanted()), method.packets_of(grid, camera)
+        media, packets = _media(method, inputs, fixed, Wanted()), method.packets(grid, camera, fixed.chosen)
         return march(grid, fixed.schedule, packets, media, method.integrator, method.plan, camera.is_perspective)
 
 
@@ -206,7 +212,7 @@ def _pull(
     """Cotangents of `inputs`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
     plan = method.plan.of_shard(2)  # as twice as much is held of each slab
     grid, camera = _seen(inputs, fixed)
-    packets, media = method.packets_of(grid, camera), _media(method, inputs, fixed, wanted)
+    packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
     on_borders = bool(method.integrator.halo)
     batches = batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, on_borders)
     dtype = grid.half_steps.dtype

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.compaction import CompactedSlabs, compact
 from jaxsph.access.grid import Grid
+from jaxsph.access.lists import BUNDLE
 from jaxsph.access.slab_windows import MAX_LEVEL
 from jaxsph.field.gather import BLOCK
 from jaxsph.field.schedule import NUM_METHODS, SlabSchedule
@@ -51,6 +52,12 @@ class CastPlan:
     def of_shard(self, shards: int) -> CastPlan:
         """The plan of one of so many shards: all together they hold as much light as the plan for all does."""
         return dataclasses.replace(self, batch_slabs=max(self.batch_slabs // (shards * self.chunk), 1) * self.chunk)
+
+
+    def for_rays(self, rays: int) -> CastPlan:
+        """The plan of packets of fewer rays than a bundle has: as much light as it holds, of more slabs."""
+        times = BUNDLE * BUNDLE // rays
+        return dataclasses.replace(self, chunk=times * self.chunk, batch_slabs=times * self.batch_slabs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +153,7 @@ class Batches:
         depth, border = self._depths(entry, slab, self.half_steps)
         u, v = self.packets.u[:, packet].T, self.packets.v[:, packet].T
         bundle = packet if self.packets.list_id is None else self.packets.list_id[packet]
-        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective)
+        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective, self.packets.scattered)
 
     def borders(self, items: Int[Array, " some"]) -> Float[Array, "some samples_and_one"]:
         """Depths of the borders of items' samples."""
@@ -186,7 +193,7 @@ def batches_of(
     grid: Grid, schedule: SlabSchedule, packets: RayPackets, plan: CastPlan, perspective: bool, on_borders: bool = False
 ) -> Batches:
     """The batches that a `schedule` of bundles is marched in, by packets that read the bundles' lists."""
-    schedule = jax.tree.map(packets.reading, schedule)
+    schedule = packets.schedule_of(schedule)
     slabs, num_packets = schedule.count.shape
     compacted = compact(schedule.filled)
     order = jnp.pad(compacted.item, (0, plan.batch_slabs), constant_values=slabs * num_packets)

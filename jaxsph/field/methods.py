@@ -15,6 +15,7 @@ from jaxsph.field.gather import gather
 from jaxsph.field.interpolation import interpolate_slabs
 from jaxsph.field.lattice import Lattice
 from jaxsph.field.nodes import gather_subsampled
+from jaxsph.field.scattered import gather_scattered
 from jaxsph.field.schedule import MAX_SPACING_LEVEL
 from jaxsph.field.sums import Sums
 from jaxsph.field.tasks import SlabTask
@@ -30,9 +31,13 @@ class SlabMethod(Protocol):
 
 def methods_of(grid: Grid, kernel: str, lattice: Lattice | None) -> list[SlabMethod]:
     """In the order of `schedule.DENSE`, `SUBSAMPLED`, `INTERPOLATED` and on; without a lattice, the first alone."""
-    dense = functools.partial(gather, grid.ordered, grid.lists.rank, kernel=kernel)
+    dense = functools.partial(_from_all_particles, grid, kernel=kernel)
     if lattice is None:
         return [dense]
     subsampled = functools.partial(gather_subsampled, grid.ordered, grid.lists.rank, kernel=kernel)
     interpolated = functools.partial(interpolate_slabs, lattice, grid)
     return [dense, subsampled, *(functools.partial(interpolated, level=level) for level in range(MAX_SPACING_LEVEL + 1))]
+
+
+def _from_all_particles(grid: Grid, task: SlabTask, *, kernel: str) -> Sums:
+    return (gather_scattered if task.scattered else gather)(grid.ordered, grid.lists.rank, task, kernel)

@@ -9,37 +9,49 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.field.schedule import SlabSchedule
 
 
 @dataclasses.dataclass(frozen=True)
 class RayPackets:
-    """Rays in tensor products: of a packet, through all pairs of a column and a row.
+    """Rays in tensor products: of a packet, through all pairs of a column and a row; or one by one.
 
     Attributes:
         u, v: ray coordinates of columns and rows: a ray's view coordinates at depth 1 (perspective) or any depth.
         list_id: bundle whose list of particles a packet reads, and whose schedule it keeps; None where packet k reads list k.
+        real: packets that are cast, others are room; None where all are.
+        scattered: whether ray k goes through (u[k], v[k]), such that there are as many "rows" as "columns", and rays.
     """
 
     u: Float[Array, "columns packets"]
     v: Float[Array, "rows packets"]
     list_id: Int[Array, " packets"] | None = None
+    real: Bool[Array, " packets"] | None = None
+    scattered: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a packet."""
-        return self.v.shape[0], self.u.shape[0]
+        """Rows and columns of a packet; scattered rays are one row."""
+        return 1 if self.scattered else self.v.shape[0], self.u.shape[0]
 
     @property
     def num_rays(self) -> int:
         """Rays of a packet."""
-        return self.u.shape[0] * self.v.shape[0]
+        rows, columns = self.shape
+        return rows * columns
 
     def reading(self, of_bundles: Array) -> Array:
         """Of an array whose last axis is bundles, those that packets read."""
         return of_bundles if self.list_id is None else of_bundles[..., self.list_id]
+
+    def schedule_of(self, of_bundles: SlabSchedule) -> SlabSchedule:
+        """That of packets, of the one of bundles: packets that are room have nothing to march."""
+        schedule = jax.tree.map(self.reading, of_bundles)
+        if self.real is None:
+            return schedule
+        return dataclasses.replace(schedule, filled=schedule.filled & self.real)
 
     def per_pixel(self, per_ray: Float[Array, " bundles"], pixels: int) -> Float[Array, " bundles"]:
         """Of what every ray of a bundle takes, what its rays take in all, a pixel of the bundle."""
@@ -60,6 +72,7 @@ class SlabTask:
         depth: view depths of the samples: in the middle between borders or, where an integrator asks for it, on them.
         border: view depths of the borders of what samples stand for.
         perspective: whether rays spread with depth.
+        scattered: whether u and v are of rays, see `RayPackets`.
     """
 
     entry: SlabSchedule
@@ -70,32 +83,38 @@ class SlabTask:
     depth: Float[Array, "tasks samples"]
     border: Float[Array, "tasks samples_and_one"]
     perspective: bool
+    scattered: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Tasks, samples of each, and rays."""
-        return self.depth.shape[0], self.depth.shape[1], self.u.shape[1] * self.v.shape[1]
+        rows = 1 if self.scattered else self.v.shape[1]
+        return self.depth.shape[0], self.depth.shape[1], rows * self.u.shape[1]
 
     def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """View coordinates x, y, z of all samples."""
         lateral_scale = self.depth if self.perspective else jnp.ones_like(self.depth)
+        z = jnp.broadcast_to(self.depth[..., None], self.shape)
+        if self.scattered:
+            return self.u[:, None] * lateral_scale[..., None], self.v[:, None] * lateral_scale[..., None], z
         x = (self.u[:, None, None, :] * lateral_scale[..., None, None]) * jnp.ones_like(self.v)[:, None, :, None]
         y = (self.v[:, None, :, None] * lateral_scale[..., None, None]) * jnp.ones_like(self.u)[:, None, None, :]
-        z = jnp.broadcast_to(self.depth[..., None], self.shape)
         return x.reshape(self.shape), y.reshape(self.shape), z
 
     def path(self) -> Float[Array, "tasks samples rays"]:
         """Path lengths between borders; of one ray for all where rays do not spread."""
         step = (self.border[:, 1:] - self.border[:, :-1])[:, :, None]
-        if self.perspective:
-            slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
-            step = step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
-        return step
+        if not self.perspective:
+            return step
+        if self.scattered:
+            return step * jnp.sqrt(1 + self.u**2 + self.v**2)[:, None]
+        slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
+        return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
 
-jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id"], meta_fields=[])
+jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])
 jax.tree_util.register_dataclass(
     SlabTask,
     data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border"],
-    meta_fields=["perspective"],
+    meta_fields=["perspective", "scattered"],
 )

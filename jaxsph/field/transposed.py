@@ -57,11 +57,12 @@ def pull_gather(
     u, v, s, entry = task.u.T, task.v.T, task.depth.T, task.entry
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     sides = u * lateral_scale[:, None], v * lateral_scale[:, None], s
-    shape = (s.shape[1], s.shape[0], v.shape[0], u.shape[0])
+    shape = (s.shape[1], s.shape[0], 1 if task.scattered else v.shape[0], u.shape[0])
     of_sums = fusion_barrier(entry.begin[0, 0] >= 0, functools.partial(_slabs_last, shape=shape), of_sums)
     windows, reference = (entry.begin[:, None], entry.length[:, None]), (entry.reference_quantity,)
     smooth = kernels.by_name(kernel)
-    sum_up, finish = functools.partial(_moments, smooth=smooth), functools.partial(_cotangents, degree=smooth.degree)
+    moments_of = _moments_of_scattered if task.scattered else _moments
+    sum_up, finish = functools.partial(moments_of, smooth=smooth), functools.partial(_cotangents, degree=smooth.degree)
 
     def fetched(index: Array) -> tuple[Array, list[Array]]:
         particle, block = fetch(ordered, rank, windows, index, reference)
@@ -98,6 +99,24 @@ def _moments(
     operands = x_off, across, along, size, quantity, of_sums
     in_rows = fusion_barrier(always, functools.partial(_along_columns, smooth=smooth), *operands)
     return fusion_barrier(always, _along_rows, in_rows, y_off)
+
+
+def _moments_of_scattered(
+    particles: list[Array], sides: tuple[Array, ...], of_sums: list[Array], *, smooth: kernels.Kernel
+) -> tuple[Array, ...]:
+    """The same over rays that are no tensor product."""
+    x, y, z, scale, size, quantity = particles
+    depth_off = ((sides[2] - z) * scale) ** 2
+
+    def part(r: int) -> list[Array]:
+        x_off, y_off = sides[0][:, r] - x, sides[1][:, r] - y
+        along, across = depth_off + (y_off * scale) ** 2, (x_off * scale) ** 2
+        prepared, of_weight, of_weighted = smooth.prepare(along, size), of_sums[0][:, 0, r], of_sums[1][:, 0, r]
+        weight, value = smooth.weigh(prepared, across, size, jnp), of_weight + quantity * of_weighted
+        slope = value * smooth.slope(prepared, across, size, jnp)
+        return [slope, slope * x_off, slope * (along + across), value * weight, weight * of_weighted, slope * y_off]
+
+    return _in_halves([part(r) for r in range(of_sums[0].shape[2])])
 
 
 def _along_columns(

@@ -40,6 +40,7 @@ class Camera:
         height: rows.
         projection: `"perspective"` or `"orthographic"`.
         eye_rest: what rounding a float64 eye to `eye` has left, length units; None is nothing.
+        stride: rays go through every so many pixels of either direction, and through the last: see `strided`.
     """
 
     eye: Float[Array, "3"]
@@ -51,6 +52,7 @@ class Camera:
     height: int = 512
     projection: str = "perspective"
     eye_rest: Float[Array, "3"] | None = None
+    stride: int = 1
 
     @classmethod
     def look_at(
@@ -182,13 +184,27 @@ class Camera:
             return self.near * jnp.exp(part * jnp.log(self.far / self.near))
         return self.near + (self.far - self.near) * part
 
+    def strided(self, stride: int) -> Camera:
+        """The same view with a ray for every `stride`-th pixel of a row and a column, and for the last: node k at k + 1/2."""
+        return dataclasses.replace(self, stride=stride)
+
+    @property
+    def nodes(self) -> tuple[int, int]:
+        """Rows and columns of rays."""
+        return num_nodes(self.height, self.stride), num_nodes(self.width, self.stride)
+
     def column(self, c: Float[Array, "..."]) -> Float[Array, "..."]:
         """Lateral ray coordinate u of image-space abscissa `c` in [0, width]; pixel c has its ray at c + 1/2."""
+        c = self._pixel(c, self.width)
         return self.half_height * (self.width / self.height) * (2 * c / self.width - 1)
 
     def row(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
         """Vertical ray coordinate v of image-space ordinate `r` in [0, height], from the top; pixel r sits at r + 1/2."""
+        r = self._pixel(r, self.height)
         return self.half_height * (1 - 2 * r / self.height)
+
+    def _pixel(self, place: Float[Array, "..."], size: int) -> Float[Array, "..."]:
+        return place if self.stride == 1 else jnp.minimum((place - 0.5) * self.stride, size - 1) + 0.5
 
     def exact_eye(self) -> np.ndarray:
         """The eye in float64, (3,), with what float32 could not hold (host side)."""
@@ -203,6 +219,11 @@ class Camera:
         )
         size = f"{self.width}x{self.height}"
         return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={float(self.near):.9g} far={float(self.far):.9g}"
+
+
+def num_nodes(size: int, stride: int) -> int:
+    """Rays of `size` pixels side by side, of which every `stride`-th has one, and the last."""
+    return -(-(size - 1) // stride) + 1
 
 
 def _require_fov(fov_degrees: Any) -> None:
@@ -269,5 +290,5 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
 jax.tree_util.register_dataclass(
     Camera,
     data_fields=["eye", "axes", "half_height", "near", "far", "eye_rest"],
-    meta_fields=["width", "height", "projection"],
+    meta_fields=["width", "height", "projection", "stride"],
 )

@@ -13,7 +13,7 @@ from typing import Any
 
 INTEGRATORS = {"samples": "jaxsph.cast.samples:PointSamples"}
 """Classes without arguments, each a `jaxsph.cast.integrator.Integrator`."""
-SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel"}
+SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel", "quadtree": "jaxsph.screen.quadtree:Quadtree"}
 """Classes without arguments, each a `jaxsph.screen.sampler.ScreenSampler`."""
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from jaxsph.model.registry import INTEGRATORS, SCREENS
 
 ESTIMATORS = ("interval", "pilot")
+LEAF_PIXELS = 4, 8, 16, 32
+LEAF_ESTIMATORS = "hierarchical", "corner_variance", "uniform"  # see `screen.estimators`
 ALLOCATIONS = ("budget", "greedy", "paper", "independent")
 
 
@@ -34,7 +36,12 @@ class Settings:
             form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
             (Hochstetter et al. 2016, section 2.2).
-        screen: which rays are cast; `"pixels"` gives every pixel its own.
+        screen: which rays are cast; `"pixels"` gives every pixel its own, `"quadtree"` interpolates between rays where the image
+            is expected to stay within the tolerance (Kratz et al. 2011): an estimate, which rays and interpolation share. Without
+            a tolerance all leaves are split down to pixels.
+        leaf_pixels: on each side of the quadtree's first leaves, 4, 8, 16 or 32.
+        leaf_estimator: by what leaves are split; `"hierarchical"` compares two approximations (Kratz et al. 2011, section 3),
+            `"corner_variance"` is that of Levoy 1990, `"uniform"` splits all.
         memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it. None is 4 GiB, or
             half of an accelerator's memory.
     """
@@ -48,6 +55,8 @@ class Settings:
     allocation: str = "budget"
     integrator: str = "samples"
     screen: str = "pixels"
+    leaf_pixels: int = 8
+    leaf_estimator: str = "hierarchical"
     memory_limit: int | None = None
 
     def __post_init__(self) -> None:
@@ -66,6 +75,10 @@ class Settings:
         for name, known in (("integrator", INTEGRATORS), ("screen", SCREENS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+        if self.leaf_pixels not in LEAF_PIXELS:
+            raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
+        if self.leaf_estimator not in LEAF_ESTIMATORS:
+            raise ValueError(f"`leaf_estimator` must be one of {', '.join(LEAF_ESTIMATORS)}, got {self.leaf_estimator!r}")
         if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
@@ -80,5 +93,5 @@ def _is_number(value: Any) -> bool:
 jax.tree_util.register_dataclass(
     Settings,
     data_fields=["tolerance", "relax"],
-    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "integrator", "screen", "memory_limit"],
+    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "integrator", "screen", "leaf_pixels", "leaf_estimator", "memory_limit"],
 )

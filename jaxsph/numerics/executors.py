@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import jax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from jaxsph.numerics.programs import PROGRAMS, Programs
 
@@ -31,6 +31,10 @@ class Executor(Protocol):
 
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """Whether what depends on a flag is to be run."""
+        ...
+
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """In how many turns `number` of at most `most` things are done, if so many are done together; and how many then are."""
         ...
 
 
@@ -81,6 +85,11 @@ class Clock:
         return self._known[-1]
 
 
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """As many as there are things for."""
+        return -(-int(number) // together), together
+
+
 class Unforeseen(Exception):
     """What follows depends on a flag that is not known yet."""
 
@@ -110,6 +119,10 @@ class Forecast:
             return value
         raise Unforeseen
 
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """One, as all are runs of the same program."""
+        return 1, together
+
 
 class Traced:
     """Calls the functions that are jitted, as part of a larger program.
@@ -128,3 +141,7 @@ class Traced:
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """A trace knows no values, and has to be ready for either."""
         return True
+
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """One, with room for all."""
+        return 1, most

@@ -35,6 +35,7 @@ class Tuning:
         max_sorts: sorts that run side by side.
         pairs_per_sort: below that, a sort takes less than it costs to have one more.
         max_shards: shards of a band that run side by side.
+        turns: in how many turns all bundles of a band are cast of which single rays are wanted: each has room of its own.
         fusion_barriers: whether fusion is worked around: barriers are real (`numerics.fusion`), and two sums travel as one
             complex number (`field.sums`).
     """
@@ -49,6 +50,7 @@ class Tuning:
     max_sorts: int
     pairs_per_sort: int
     max_shards: int
+    turns: int
     fusion_barriers: bool
 
     def __post_init__(self) -> None:
@@ -66,6 +68,7 @@ CPU = Tuning(
     max_sorts=16,  # 16 sorts of 5 M pairs in all took 0.8 of 4, as each stays in the caches
     pairs_per_sort=1 << 15,
     max_shards=MAX_SHARDS,  # two threads in one program were 1.1 to 1.3 times as fast as one, two programs side by side 1.9 times
+    turns=8,
     fusion_barriers=True,  # without them shading was computed six times, and every weight once for each sum
 )
 ACCELERATOR = Tuning(
@@ -79,6 +82,7 @@ ACCELERATOR = Tuning(
     max_sorts=1,
     pairs_per_sort=1 << 15,
     max_shards=1,
+    turns=1,
     fusion_barriers=False,
 )
 MEMORY = 4 << 30  # bytes that a frame's working arrays may take where the machine is shared with others

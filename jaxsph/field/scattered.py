@@ -1,0 +1,49 @@
+"""Sums over particles at the samples of rays that are no tensor product: each has a column and a row of its own.
+
+Flow: schedule -> [scattered] -> media.
+
+As `gather`, in the same order of operations, so that a ray is the same bit for bit in whichever packet it is cast. Nothing of the
+squared distance is shared by rays of a row or a column, so it is computed where it is added, instead of being stored.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxsph.access.ordering import Ordered
+from jaxsph.field.fetch import Block, fetch, quantities_of
+from jaxsph.field.gather import BLOCK
+from jaxsph.field.sums import Sums, sums_of
+from jaxsph.field.tasks import SlabTask
+from jaxsph.model import kernels
+from jaxsph.numerics.fusion import fusion_barrier
+
+
+def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
+    """Sums (tasks, samples, 1, rays) at every sample of slabs, from all particles of their windows."""
+    entry, s = task.entry, task.depth[..., None]
+    lateral_scale = s if task.perspective else jnp.ones_like(s)
+    su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
+    windows, reference = (entry.begin[..., None], entry.length[..., None]), (entry.reference_quantity[:, None],)
+    smooth = kernels.by_name(kernel)
+
+    def fetched(index: Array) -> Block:
+        return fetch(ordered, rank, windows, index, reference)[1]
+
+    def add_block(nth: Array, sums: Sums) -> Sums:
+        block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+        channels = list(sums.all)
+        for k in range(BLOCK):
+            one = jax.tree.map(lambda column, k=k: column[:, k, None, None], block)
+            across = ((su - one.x) * one.scale) ** 2
+            along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
+            w = smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp)
+            channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], one.quantities, strict=True))]
+        return sums_of(channels)
+
+    blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+    sums = lax.fori_loop(0, blocks, add_block, sums_of([jnp.zeros_like(su)] * (1 + len(quantities_of(ordered)))))
+    return jax.tree.map(lambda value: value[:, :, None], sums)

@@ -1,0 +1,268 @@
+"""A frame whose rays are chosen as it is drawn: a coarse lattice first, then the corners of leaves that are not good enough.
+
+Flow: frame -> coarse grid, cast -> [refinement: estimate -> split -> cast] for each size of leaves -> layers.
+
+The loop is that of Kratz et al. 2011, section 5; rays go through the same grid, media and integrator as those of all pixels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.access.grid import Grid
+from jaxsph.access.lists import BUNDLE, ListPlan
+from jaxsph.access.shards import unshard
+from jaxsph.cast.adjoint import CastMethod, cast
+from jaxsph.cast.batches import CastPlan
+from jaxsph.field.lattice import Lattice
+from jaxsph.field.schedule import SlabSchedule, evaluations
+from jaxsph.frame import Band, Frame
+from jaxsph.layers import Layers, OfShards
+from jaxsph.model import registry
+from jaxsph.model.camera import Camera
+from jaxsph.model.medium import Medium
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics.executors import Executor
+from jaxsph.numerics.tuning import Tuning
+from jaxsph.screen import canvas as canvases
+from jaxsph.screen.canvas import Canvas
+from jaxsph.screen.estimators import ESTIMATORS
+from jaxsph.screen.packets import SCATTERED, Queue, by_bundle, queued, scattered, scattered_packets, whole, whole_packets
+from jaxsph.screen.quadtree import QuadtreePlan
+from jaxsph.stages import BandGrid, Cast, Decided, Verdict, stage
+
+MAX_SHOTS = 8  # painted together
+KINDS = {"scattered": (scattered, scattered_packets), "whole": (whole, whole_packets)}
+
+
+class Shot(NamedTuple):
+    """What some rays have met, and where they are in the image."""
+
+    pixel: Int[Array, "packets rays"]
+    value: Float[Array, "packets rays 6"]
+    spent: Float[Array, "packets rays"]
+
+
+@stage("lists", quickly=True)
+def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, tuning: Tuning) -> Canvas:
+    """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
+    color = unshard(tuple(one.rays.color for one in rays), 1)
+    transmittance, depth = (unshard(tuple(getattr(one.rays, name) for one in rays), 0) for name in ("transmittance", "depth"))
+    spent, cast = unshard(tuple(one.evaluations for one in rays)), unshard(filled).any(0)
+    value = lists.as_image(canvases.channels_of(color, transmittance, depth))
+    spent, cast = (
+        lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in (spent, cast)
+    )
+    rows, columns = camera.nodes
+    made = canvases.blank((camera.height, camera.width), value.dtype)
+    return canvases.painted_on_lattice(made, *(one[:rows, :columns] for one in (value, spent, cast)), camera.stride)
+
+
+@stage("lists", "side", "coarsest", "estimator", quickly=True)
+def choose(
+    canvas: Canvas,
+    filled: Bool[Array, "slabs bundles"],
+    bound: Float[Array, " bundles"],
+    first_row: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    *,
+    lists: ListPlan,
+    side: int,
+    coarsest: int,
+    estimator: str,
+    tuning: Tuning,
+) -> tuple[Canvas, Queue, Queue]:
+    """Rays that leaves of one side want, of a band; pixels whose rays are certain to be empty are known without."""
+    height, width = canvas.shape
+    room = lists.bundles[0] * BUNDLE
+
+    def in_band(image: Array) -> Array:
+        return lax.dynamic_slice_in_dim(jnp.pad(image, ((0, room), (0, 0))), first_row, room, 0)
+
+    def over_image(of_bundles: Array, beyond: Any) -> Array:
+        pixels = lists.as_image(jnp.broadcast_to(of_bundles[:, None, None], (of_bundles.shape[0], BUNDLE, BUNDLE)))[:, :width]
+        whole = jnp.full((height + room, width), beyond, pixels.dtype)
+        return lax.dynamic_update_slice_in_dim(whole, pixels, first_row, 0)[:height]
+
+    canvas = dataclasses.replace(canvas, known=canvas.known | over_image(~filled.any(0), False))
+    of_pixels = over_image(lax.stop_gradient(bound), 0)
+    wanted = canvases.wanted_by_tolerance(canvas, side, coarsest, ESTIMATORS[estimator], tolerance, of_pixels)
+    return canvas, *queued(by_bundle(lists, in_band(wanted)))
+
+
+@stage("shape", "packets", "kind", "cast_plan", "integrator", "kernel")
+def shoot(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction | None,
+    media: tuple[Medium, ...],
+    schedule: SlabSchedule,
+    lattice: Lattice | None,
+    queue: Queue,
+    first: Int[Array, ""],
+    *,
+    shape: tuple[int, int],
+    packets: int,
+    kind: str,
+    cast_plan: CastPlan,
+    integrator: str,
+    kernel: str,
+    tuning: Tuning,
+) -> Shot:
+    """Cast the rays of so many bundles of a queue."""
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    pick, packets_of = KINDS[kind]
+    chosen, made = pick(queue, first, packets), registry.integrator(integrator)
+    rays = cast(grid, schedule, camera, transfer, media, CastMethod(kernel, cast_plan, made, packets_of), lattice, chosen)
+    color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
+    spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
+    spent = jnp.where(chosen.real.T, spent[:, None], 0)
+    return Shot(chosen.pixels(grid, shape), canvases.channels_of(color, *others), spent)
+
+
+@stage(quickly=True)
+def paint(canvas: Canvas, shots: tuple[Shot, ...], *, tuning: Tuning) -> Canvas:
+    """Put what rays have met on the canvas."""
+    together = [jnp.concatenate([part.reshape(-1, *part.shape[2:]) for part in parts]) for parts in zip(*shots, strict=True)]
+    return canvases.painted(canvas, *together)
+
+
+@stage("coarsest", "estimator", quickly=True)
+def finish(canvas: Canvas, bound: Array, full: Array, *, coarsest: int, estimator: str, tuning: Tuning) -> Layers:
+    """The layers of the image."""
+    color, transmittance, depth = canvases.finished(canvas, coarsest)
+    error = canvases.largest_errors(canvas, coarsest, ESTIMATORS[estimator])
+    return Layers(color, transmittance, depth, canvas.spent, bound + error, full, None, canvas.rays)
+
+
+@stage(quickly=True)
+def join(decided: tuple[Decided, ...], *, tuning: Tuning) -> Decided:
+    """What was decided for all bundles of a band, of what was for its shards."""
+    return unshard(decided)  # type: ignore[no-any-return]
+
+
+@stage("height", "width", "lists", quickly=True)
+def spread_over(verdicts: tuple[Verdict, ...], *, height: int, width: int, lists: ListPlan, tuning: Tuning) -> tuple[Array, Array]:
+    """Bounds and evaluations at full rate of all pixels, of those of the bundles of bands."""
+
+    def image(of_bands: tuple[Array, ...]) -> Array:
+        bands = [lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in of_bands]
+        return jnp.concatenate(bands)[:height, :width]
+
+    return image(tuple(one.bound for one in verdicts)), image(tuple(one.full for one in verdicts))
+
+
+@dataclasses.dataclass(frozen=True)
+class Refinement:
+    """How a frame's canvas is filled."""
+
+    frame: Frame
+    sizes: QuadtreePlan
+    run: Executor
+
+    @classmethod
+    def of(cls, frame: Frame, run: Executor) -> Refinement:
+        """That of a frame whose plan has one."""
+        assert frame.plan.quadtree is not None
+        return cls(frame, frame.plan.quadtree, run)
+
+    def begun(self) -> tuple[Canvas, BandGrid]:
+        """The canvas with the first lattice cast, and the grid of that."""
+        frame, run, lists = self.frame, self.run, self.sizes.lists
+        camera = frame.camera.strided(self.sizes.stride)
+        made = frame.grid(jnp.int32(0), run, camera, lists)
+        grid = made.of(frame.ordered)
+        decided = frame.leave(grid, run, with_levels=False, camera=camera)
+        rays = frame.cast(grid, decided, None, run, camera)
+        canvas: Canvas = run.one("adapt", begin, (tuple(rays), tuple(one.schedule.filled for one in decided), camera), lists=lists, **self._tuned)
+        return canvas, made
+
+    def band(self, canvas: Canvas, first_row: Int[Array, ""]) -> tuple[Canvas, BandGrid, Verdict]:
+        """With the leaves of a band split as long as they are not good enough."""
+        frame, run = self.frame, self.run
+        made = frame.grid(first_row, run)
+        grid = made.of(frame.ordered)
+        decided, lattice = frame.decide(grid, run)
+        decision: Decided = decided[0] if len(decided) == 1 else run.one("adapt", join, (tuple(decided),), **self._tuned)
+        scattered = decision.schedule
+        if lattice is not None:
+            of_shards = frame.leave(grid, run, with_levels=False)
+            scattered = (of_shards[0] if len(of_shards) == 1 else run.one("adapt", join, (tuple(of_shards),), **self._tuned)).schedule
+        for side in self.sizes.sides:
+            canvas, *queues = self._choose(canvas, decision, first_row, side)
+            shots: list[Shot] = []
+            for kind, queue, schedule, nodes in (("scattered", queues[0], scattered, None), ("whole", queues[1], decision.schedule, lattice)):
+                shots += self._shoot(kind, queue, (grid, schedule, nodes))
+            canvas = self._paint(canvas, shots)
+        return canvas, made, decision.verdict
+
+    def finished(self, canvas: Canvas, verdicts: list[Verdict]) -> Layers:
+        """The layers of the image."""
+        plan = self.frame.plan
+        size = {"height": plan.height, "width": plan.width, "lists": plan.lists}
+        bound, full = self.run.one("image", spread_over, (tuple(verdicts),), **size, **self._tuned)
+        static = {"coarsest": self.sizes.leaf, "estimator": self.sizes.estimator, **self._tuned}
+        layers: Layers = self.run.one("image", finish, (canvas, bound, full), **static)
+        return layers
+
+    @property
+    def _tuned(self) -> dict[str, Any]:
+        return {"tuning": self.frame.plan.cast.tuning}
+
+    def _choose(self, canvas: Canvas, decision: Decided, first_row: Array, side: int) -> tuple[Any, ...]:
+        dtype = decision.verdict.bound.dtype
+        tolerance = jnp.asarray(-1, dtype) if self.frame.allowed is None else self.frame.allowed
+        inputs = canvas, decision.schedule.filled, decision.verdict.bound, first_row, tolerance
+        static = {"lists": self.frame.plan.lists, "side": side, "coarsest": self.sizes.leaf, "estimator": self.sizes.estimator}
+        return self.run.one("adapt", choose, inputs, **static, **self._tuned)  # type: ignore[no-any-return]
+
+    def _shoot(self, kind: str, queue: Queue, of_band: tuple[Grid, SlabSchedule, Lattice | None]) -> list[Shot]:
+        """Cast what a queue holds, some bundles at a time."""
+        frame, plan = self.frame, self.frame.plan
+        grid, schedule, lattice = of_band
+        turns, packets = self.run.turns(queue.number, self.sizes.packets, plan.lists.num_bundles)
+        cast_plan = plan.cast.of_shard(frame.shards)
+        if kind == "scattered":
+            cast_plan = cast_plan.for_rays(SCATTERED)
+        scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue
+        inputs = [(*scene, jnp.int32(turn * packets)) for turn in range(turns)]
+        static = {"shape": (plan.height, plan.width), "packets": packets, "kind": kind, "cast_plan": cast_plan}
+        method = {"integrator": plan.integrator, "kernel": frame.kernel, **self._tuned}
+        return [
+            shot
+            for first in range(0, turns, frame.shards)
+            for shot in self.run.each("cast", shoot, inputs[first : first + frame.shards], **static, **method)
+        ]
+
+    def _paint(self, canvas: Canvas, shots: list[Shot]) -> Canvas:
+        """In groups of few sizes, as each is a program."""
+        while shots:
+            some = 1 << (min(len(shots), MAX_SHOTS).bit_length() - 1)
+            canvas = self.run.one("adapt", paint, (canvas, tuple(shots[:some])), **self._tuned)
+            shots = shots[some:]
+        return canvas
+
+
+def refined(frame: Frame, run: Executor, progress: Callable[[int, int], None] | None) -> tuple[list[Band], Layers]:
+    """All bands of a frame, of which the first is that of its coarse lattice; and the layers of the image."""
+    filling = Refinement.of(frame, run)
+    canvas, coarse = filling.begun()
+    bands, verdicts, plan = [_counted(coarse)], [], frame.plan
+    for nth in range(plan.bands):
+        canvas, made, verdict = filling.band(canvas, jnp.int32(nth * plan.band_height))
+        bands.append(_counted(made))
+        verdicts.append(verdict)
+        if progress is not None:
+            progress(nth + 1, plan.bands)
+    return bands, filling.finished(canvas, verdicts)
+
+
+def _counted(made: BandGrid) -> Band:
+    return Band(OfShards((), ()), made.lists.faults, made.filled, made.pairs)
