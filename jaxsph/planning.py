@@ -80,7 +80,7 @@ def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: 
     if scene.particles is not None and scene.particles.capacity < capacity:
         scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particles,), capacity=capacity))
     seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes)
-    return seen
+    return seen.with_data(scene)
 
 
 @compiled_quickly

@@ -35,6 +35,11 @@ class Seen(NamedTuple):
     transfer: TransferFunction | None
     media: tuple[Medium, ...]
 
+    def with_data(self, scene: Scene) -> Seen:
+        """With the arrays of the scene that media read, which no stage is to copy."""
+        given = scene.media if scene.volume is None else (scene.volume, *scene.media)
+        return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
+
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames=("samples", "num_classes"))
@@ -48,6 +53,7 @@ def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) 
     viewed = view_particles(particles, camera, half_steps(camera, dtype, samples)[1::2], num_classes)
     media = _media(scene, camera)
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
+    media = tuple(medium.without_data() for medium in media)
     return Seen(dataclasses.replace(viewed, faults=viewed.faults | word), transfer, media)
 
 

@@ -58,6 +58,14 @@ class VolumeMedium(Medium):
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
         return cls(grid, transfer.segments(), Occupancy.of(ranges.shown_by(still)), fault)
 
+    def without_data(self) -> VolumeMedium:
+        """Without values."""
+        return dataclasses.replace(self, grid=self.grid.holding(None))
+
+    def with_data(self, given: Volume) -> VolumeMedium:
+        """With the values of the volume that it was made of."""
+        return dataclasses.replace(self, grid=self.grid.holding(given.values))
+
     def faults(self) -> Int[Array, ""]:
         """Whether the values are usable."""
         return self.fault

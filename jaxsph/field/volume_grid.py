@@ -42,6 +42,10 @@ class VolumeGrid:
         origin = camera.to_view(volume.lower.astype(dtype), volume.lower_rest.astype(dtype))
         return cls(volume.values, origin.astype(dtype), (camera.axes.T / volume.spacing[:, None]).astype(dtype))
 
+    def holding(self, values: Num[Array, "nx ny nz"] | None) -> VolumeGrid:
+        """The same place with other values, or with none."""
+        return dataclasses.replace(self, values=jnp.zeros((0, 0, 0), self.values.dtype) if values is None else values)
+
     def coordinates(self, place: tuple[Float[Array, "..."], ...]) -> list[Float[Array, "..."]]:
         """Grid coordinates of view coordinates."""
         away = [at - zero for at, zero in zip(place, self.origin, strict=True)]

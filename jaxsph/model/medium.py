@@ -34,6 +34,14 @@ class Medium(abc.ABC):
         """The medium in view space; by default as it is."""
         return self
 
+    def without_data(self) -> Medium:
+        """What `seen_by` made, without large arrays that are the scene's own: a stage would copy what it returns."""
+        return self
+
+    def with_data(self, given: Any) -> Medium:
+        """The same with those arrays again, from what of the scene it was made of."""
+        return self
+
     def faults(self) -> Int[Array, ""]:
         """What is wrong with the numbers of a medium that `seen_by` made, as a fault word; by default nothing."""
         return jnp.int32(faults.NONE)

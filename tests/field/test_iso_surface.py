@@ -65,6 +65,7 @@ def test_a_ball_is_opaque_in_its_place_and_shaded(projection):
     np.testing.assert_allclose(np.asarray(image.color)[inside], wanted[inside], atol=0.02)
 
 
+@pytest.mark.slow
 def test_what_lies_in_front_is_seen_and_what_lies_behind_is_not():
     """A fog in front of the surface, and one behind it."""
     view, volume = (
