@@ -1,10 +1,12 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
 from jaxsph import io, reference, scenes
-from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
+from jaxsph.field.iso_surface import IsoSurface
+from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.render import CapacityError, render
+from jaxsph.resample import resample
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
@@ -12,16 +14,19 @@ __all__ = [
     "Camera",
     "CapacityError",
     "Image",
+    "IsoSurface",
     "Particles",
     "Plan",
     "Scene",
     "Settings",
     "TransferFunction",
+    "Volume",
     "__version__",
     "io",
     "plan",
     "reference",
     "render",
+    "resample",
     "scenes",
     "sweep",
 ]

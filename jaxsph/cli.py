@@ -1,4 +1,4 @@
-"""Command line: a picture from a particle file in one command.
+"""Command line: a picture from a file of particles or of a volume in one command.
 
 Flow: file or scene -> [cli] -> render -> EXR or PNG.
 
@@ -20,10 +20,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 import jaxsph
-from jaxsph import cli_cache, cli_sweep, scenes
+from jaxsph import cli_cache, cli_sweep, cli_volume, io, scenes
 from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
-from jaxsph.model import Camera, Particles, Scene, Settings
-from jaxsph.scenes.view import snug
+from jaxsph.model import Camera, Particles, Scene, Settings, Volume
+from jaxsph.scenes.view import snug, snug_box
 
 SCENE = "scene:"
 IMAGE_SUFFIXES = (".exr", ".png")
@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     _add_picture(render)
     _add_control(render)
-    info = command("info", _info, "say what a particle file holds", "And what `render` would show of it.")
+    info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
     _add_source(info, optional=True)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
@@ -126,12 +126,14 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_source(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
     number: dict[str, Any] = {"nargs": "?"} if optional else {}
-    parser.add_argument("source", metavar="FILE|scene:NAME", help="particle file, or built-in scene", **number)
+    parser.add_argument("source", metavar="FILE|scene:NAME", help="file of particles or of a volume, or built-in scene", **number)
     add = parser.add_argument_group("particles of a file").add_argument
     add("--quantity", metavar="NAME", help="an attribute, density, speed, x, y, z, or log10:NAME of any of these")
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
     add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
+    add = parser.add_argument_group("volume of a file").add_argument
+    add("--iso", type=float, metavar="LEVEL", help="show the surface on which its values are LEVEL (--quantity: which values)")
     add = parser.add_argument_group("particles of a built-in scene").add_argument
     add("--particles", type=int, metavar="N", help="how many")
     add("--frame", type=float, metavar="K", help="moment of the scene")
@@ -234,24 +236,29 @@ def _scene(options: argparse.Namespace) -> tuple[Scene, Camera]:
 
 
 def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    _refuse(options, ("quantity", "support", "kernel", "part_type"), "is for particle files, not for built-in scenes")
+    _refuse(options, ("quantity", "support", "kernel", "part_type", "iso"), "is for particle files, not for built-in scenes")
     name = options.source.removeprefix(SCENE)
     width, height = getattr(options, "size", (512, 512))
     try:
         scene, camera = scenes.load(name, options.particles, options.frame, width=width, height=height)
     except ValueError as error:
         raise UsageError(str(error)) from error
-    say("scene", f"{name}, {scene.particles.num_particles:,} particles, support {span(scene.particles.to_numpy()['support'])}")
+    particles = scene.particle_set
+    say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     if options.command != "info":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
-            scene = dataclasses.replace(scene, transfer=_transfer(scene.particles, options, "concentration"))
+            scene = dataclasses.replace(scene, transfer=_transfer(particles, options, "concentration"))
         if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):
-            camera = _camera(scene.particles, options)
+            camera = _camera(particles, options)
     return scene, camera
 
 
 def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for particle files")
+    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
+    if io.is_volume(options.source):
+        _refuse(options, ("support", "kernel", "part_type"), "is for particles, and this is a volume")
+        return cli_volume.scene_of(options, _camera)
+    _refuse(options, ("iso",), "is for volumes, and this is a particle file")
     if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
         raise UsageError(f"--support must be > 0, got {options.support:g}")
     particles, quantity = _particles_of_file(options)
@@ -259,8 +266,6 @@ def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Camera]:
 
 
 def _particles_of_file(options: argparse.Namespace) -> tuple[Particles, str]:
-    from jaxsph import io
-
     table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
@@ -285,8 +290,8 @@ def _transfer(particles: Particles, options: argparse.Namespace, quantity: str) 
     return transfer
 
 
-def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
-    """The camera asked for; where only a part is given, the rest frames the particles."""
+def _camera(particles: Particles | Volume, options: argparse.Namespace) -> Camera:
+    """The camera asked for; where only a part is given, the rest frames the particles or the volume."""
     width, height = options.size
     up, fov = options.up or (0.0, 1.0, 0.0), 45.0 if options.fov is None else options.fov
     if options.target is not None and options.eye is None:
@@ -296,7 +301,8 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
             return Camera.framing(particles, up=up, fov_degrees=fov, width=width, height=height)
         lower, upper = particles.bounds()
         target = (lower + upper) / 2 if options.target is None else options.target
-        return snug(Camera.look_at(options.eye, target, up, fov, width, height, near=1e-3, far=1.0), particles)
+        made = Camera.look_at(options.eye, target, up, fov, width, height, near=1e-3, far=1.0)
+        return snug_box(made, lower, upper) if isinstance(particles, Volume) else snug(made, particles)
     except ValueError as error:
         raise UsageError(str(error)) from error
 
@@ -311,12 +317,13 @@ def _info(options: argparse.Namespace) -> None:
         raise UsageError("a particle file or scene:NAME is needed, or --cache")
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
-        say("quantity", f"concentration, {span(scene.particles.to_numpy()['quantity'])}")
+        say("quantity", f"concentration, {span(scene.particle_set.to_numpy()['quantity'])}")
         say("camera", camera_line(camera))
         return
-    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for particle files")
-    from jaxsph import io
-
+    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
+    if io.is_volume(options.source):
+        cli_volume.describe(options)
+        return
     table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
     print(f"{options.source}: {table.source}, {len(table):,} particles")
     for sentence in table.conventions:
@@ -358,7 +365,7 @@ def _demo(options: argparse.Namespace) -> None:
     truth, some = truth_of.result(), slice(every // 2, None, every)
     seen = dataclasses.replace(full, color=full.color[some, some], transmittance=full.transmittance[some, some])
     rounding = largest_difference(seen, truth)
-    say("scene", f"mixer, {scene.particles.num_particles:,} particles")
+    say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
     for output in outputs:
         say("image", str(output.resolve()))
     say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {largest(image.error_bound):.2g}")

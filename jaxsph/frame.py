@@ -69,7 +69,7 @@ class Frame:
 
     ordered: Ordered
     camera: Camera
-    transfer: TransferFunction
+    transfer: TransferFunction | None
     media: tuple[Medium, ...]
     limits: Limits | None
     plan: Plan

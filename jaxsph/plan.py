@@ -84,9 +84,10 @@ class Plan:
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
         self.check_image(camera, along_rays(scene, settings))
-        if scene.particles.capacity > self.num_particles:
+        capacity = scene.particle_set.capacity
+        if capacity > self.num_particles:
             raise ValueError(
-                f"`plan` was made for scene.particles.capacity = {self.num_particles} at most, got {scene.particles.capacity}; "
+                f"`plan` was made for scene.particles.capacity = {self.num_particles} at most, got {capacity}; "
                 "make a new one with `jaxsph.plan`, or grow this one by its `like=`"
             )
 
@@ -335,14 +336,16 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     """Settings of error control along rays: without a tolerance where only the screen can keep it.
 
     Raises:
-        ValueError: where a tolerance is asked for that nothing can keep.
+        ValueError: where a scene lacks a part, or a tolerance is asked for that nothing can keep.
     """
+    scene.check()
     if settings.tolerance is None:
         return settings
     beyond = {
         f"`integrator={settings.integrator!r}`": settings.integrator != "samples",
         f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
+        "`Scene(volume=...)`": scene.volume is not None,
     }
     if settings.screen == "quadtree":
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast

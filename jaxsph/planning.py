@@ -61,7 +61,7 @@ def plan(
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     settings = along_rays(scene, settings)
-    shape = dataclasses.replace(shape_of(scene.particles, camera, settings), headroom=1.0)
+    shape = dataclasses.replace(shape_of(scene.particle_set, camera, settings), headroom=1.0)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
@@ -77,10 +77,10 @@ def plan(
 
 def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: int, run: Executor) -> Seen:
     """Have the scene viewed, with its particles padded to a capacity."""
-    if scene.particles.capacity < capacity:
+    if scene.particles is not None and scene.particles.capacity < capacity:
         scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particles,), capacity=capacity))
     seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes)
-    return seen
+    return seen.with_data(scene)
 
 
 @compiled_quickly
@@ -100,7 +100,7 @@ class Plans:
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings = along_rays(scene, settings)
-        shape = self._similar(shape_of(scene.particles, camera, settings))
+        shape = self._similar(shape_of(scene.particle_set, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
         measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))

@@ -21,7 +21,7 @@ from jaxsph.version import __version__
 
 def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -> dict[str, Any]:
     """Size of a frame at full rate, and a digest of all that its image depends on."""
-    particles = scene.particles
+    particles = scene.particle_set
     static = (settings, converged, particles.kernel, camera.width, camera.height, camera.projection)
     digest = hashlib.sha256(repr(static).encode())
     for leaf in jax.tree_util.tree_leaves((scene, camera)):

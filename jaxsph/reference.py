@@ -1,4 +1,4 @@
-"""The oracle: the same image in float64 NumPy, particle by particle, with no grid and no cleverness.
+"""The oracle: the same image in float64 NumPy, particle by particle and sample by sample, with no grid and no cleverness.
 
 It follows Hochstetter et al. 2016, sections 2.1 and 2.2, line by line and is what every other renderer here is judged by. Slow:
 about 50 M particle-sample evaluations a second, and two float64 numbers of memory a sample.
@@ -17,6 +17,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.volume import Volume
 
 __all__ = ["field", "render", "sample_depths"]
 
@@ -41,11 +42,17 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     settings = settings or Settings()
     if every < 1:
         raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
+    scene.check()
+    if scene.media:
+        raise ValueError("`media` are unknown to the reference, which has particles and volume; give a scene with `media=()`")
     numerator, denominator, evaluations = field(scene, camera, settings.samples, cull=cull, every=every)
     inside = denominator > 0
     quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
+    parts = [] if scene.transfer is None else [(quantity, inside, scene.transfer)]
+    if scene.volume is not None and scene.volume_transfer is not None:
+        parts.append((*_in_volume(scene.volume, camera, settings.samples, every), scene.volume_transfer))
     edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
-    color, transmittance, depth = _composite(quantity, inside, edges, _ray_lengths(camera, every), scene.transfer)
+    color, transmittance, depth = _composite(parts, edges, _ray_lengths(camera, every))
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
     counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
@@ -71,7 +78,7 @@ def field(
     u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
-    kernel = kernels.by_name(scene.particles.kernel)
+    kernel = kernels.by_name(scene.particle_set.kernel)
     position, support, quantity, volume = _particles(scene, camera)
     strength = volume / support**3
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
@@ -90,7 +97,7 @@ def field(
 
 
 def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, ...]:
-    particles = scene.particles
+    particles = scene.particle_set
     valid = np.asarray(particles.valid)
     arrays = (particles.exact_position(), particles.support, particles.quantity, particles.volume)
     position, support, quantity, volume = (np.asarray(a, np.float64)[valid] for a in arrays)
@@ -133,16 +140,44 @@ def _box(
     return rows, columns, slice(first, last)
 
 
+def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """The trilinear quantity at every sample, and whether it is inside the grid; (height, width, samples) each."""
+    u, v = _ray_coordinates(camera, every)
+    s = sample_depths(camera, samples)
+    spread = s if camera.is_perspective else np.ones_like(s)
+    x, y, z = np.broadcast_arrays(spread * u[None, :, None], spread * v[:, None, None], s)
+    world = np.stack([x, y, z], -1) @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
+    at = (world - volume.bounds()[0]) / np.asarray(volume.spacing, np.float64)
+    values: Any = np.asarray(volume.values, np.float64)
+    last = np.array(values.shape) - 1
+    inside = ((at >= 0) & (at <= last)).all(-1)
+    whole = np.clip(at.astype(int), 0, last - 1)
+    part = np.clip(at - whole, 0, 1)
+    quantity = np.zeros(inside.shape)
+    for corner in np.ndindex(2, 2, 2):
+        share = np.where(corner, part, 1 - part).prod(-1)
+        quantity += share * values[tuple(np.moveaxis(whole + corner, -1, 0))]
+    return quantity, inside
+
+
 def _composite(
-    quantity: np.ndarray, inside: np.ndarray, edges: np.ndarray, lengths: np.ndarray, transfer: TransferFunction
+    parts: list[tuple[np.ndarray, np.ndarray, TransferFunction]], edges: np.ndarray, lengths: np.ndarray
 ) -> tuple[Any, ...]:
-    """Front to back, equation 3: colour, transmittance and the depth where transmittance falls to 1/2."""
+    """Front to back, equation 3: colour, transmittance and the depth where transmittance falls to 1/2.
+
+    Of parts that share samples, extinctions add up and colours weigh by extinction (Kaehler, Abel & Hege 2007, equation 2).
+    """
     color = np.zeros(lengths.shape + (3,))
     transmittance = np.ones(lengths.shape)
     depth = np.full(lengths.shape, np.inf)
-    for i in range(quantity.shape[-1]):
-        rgb, extinction = _look_up(transfer, quantity[..., i])
-        thickness = np.where(inside[..., i], extinction * (edges[i + 1] - edges[i]) * lengths, 0)
+    for i in range(len(edges) - 1):
+        rgb, extinction = np.zeros_like(color), np.zeros_like(transmittance)
+        for quantity, inside, transfer in parts:
+            own, of_part = _look_up(transfer, quantity[..., i])
+            of_part = np.where(inside[..., i], of_part, 0)
+            rgb, extinction = rgb + of_part[..., None] * own, extinction + of_part
+        rgb = rgb / np.where(extinction > 0, extinction, 1)[..., None]
+        thickness = extinction * (edges[i + 1] - edges[i]) * lengths
         behind = transmittance * np.exp(-thickness)
         crossed = (transmittance > 0.5) & (behind <= 0.5)
         part = np.log(2 * transmittance, where=crossed, out=np.zeros_like(transmittance)) / np.where(crossed, thickness, 1)

@@ -101,7 +101,7 @@ def choose(
 def shoot(
     grid: Grid,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     media: tuple[Medium, ...],
     schedule: SlabSchedule,
     lattice: Lattice | None,

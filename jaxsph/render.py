@@ -102,7 +102,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         plan.check(scene, camera, settings)
         clock.mark("plan")
         seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, clock)
-    draw = functools.partial(_draw, seen, camera, settings, plan, scene.particles.kernel)
+    draw = functools.partial(_draw, seen, camera, settings, plan, scene.particle_set.kernel)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
@@ -150,7 +150,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     run = Traced()
     seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
     limits = limits_of(settings, seen.viewed.x.dtype)
-    frame = Frame.begun(seen, camera, limits, plan, scene.particles.kernel, 1, run)
+    frame = Frame.begun(seen, camera, limits, plan, scene.particle_set.kernel, 1, run)
     if plan.quadtree is not None:
         return _refined_traced(frame, seen, run)
 

@@ -200,7 +200,7 @@ def wanted_cells(
 def decide_full_rate(
     grid: Grid,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     media: tuple[Medium, ...],
     nth: Int[Array, ""],
     *,
@@ -258,12 +258,13 @@ def decide_by_bounds(
 
 
 def _at_full_rate(
-    grid: Grid, transfer: TransferFunction, cast: CastPlan, halo: int = 0
+    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """The schedule of the reference image, and its evaluations."""
     reference = reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity)
-    # a reference far beyond what is shown would cost the digits of what is
-    schedule = full_rate(grid.windows, jnp.clip(reference, transfer.values[0], transfer.values[-1]))
+    if transfer is not None:  # a reference far beyond what is shown would cost the digits of what is
+        reference = jnp.clip(reference, transfer.values[0], transfer.values[-1])
+    schedule = full_rate(grid.windows, reference)
     return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
 
 
@@ -278,7 +279,7 @@ class Cast(NamedTuple):
 def cast_shard(
     grid: Grid,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     media: tuple[Medium, ...],
     schedule: SlabSchedule,
     lattice: Lattice | None,

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.access.view import Viewed, view_particles
+from jaxsph.field.volume import VolumeMedium
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Scene
@@ -25,24 +26,43 @@ from jaxsph.numerics.programs import compiled_quickly
 
 
 class Seen(NamedTuple):
-    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles."""
+    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
+
+    A scene without particles has no transfer function, and particles in name only.
+    """
 
     viewed: Viewed
-    transfer: TransferFunction
+    transfer: TransferFunction | None
     media: tuple[Medium, ...]
+
+    def with_data(self, scene: Scene) -> Seen:
+        """With the arrays of the scene that media read, which no stage is to copy."""
+        given = scene.media if scene.volume is None else (scene.volume, *scene.media)
+        return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
 
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames=("samples", "num_classes"))
 def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
-    dtype = jnp.promote_types(scene.particles.dtype, camera.dtype)
+    dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), scene.particle_set
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
-    quantity, transfer = rescaled(scene.particles.quantity.astype(dtype), transfer)
-    particles = dataclasses.replace(scene.particles, quantity=quantity)
+    if transfer is not None:
+        quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
+        particles = dataclasses.replace(particles, quantity=quantity)
     viewed = view_particles(particles, camera, half_steps(camera, dtype, samples)[1::2], num_classes)
-    viewed = dataclasses.replace(viewed, faults=viewed.faults | _input_faults(scene, camera, samples))
-    return Seen(viewed, transfer, tuple(medium.seen_by(camera) for medium in scene.media))
+    media = _media(scene, camera)
+    word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
+    media = tuple(medium.without_data() for medium in media)
+    return Seen(dataclasses.replace(viewed, faults=viewed.faults | word), transfer, media)
+
+
+def _media(scene: Scene, camera: Camera) -> tuple[Medium, ...]:
+    """All media but particles, in view space."""
+    media = tuple(medium.seen_by(camera) for medium in scene.media)
+    if scene.volume is None or scene.volume_transfer is None:
+        return media
+    return VolumeMedium.seen(scene.volume, scene.volume_transfer, camera), *media
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
@@ -55,9 +75,15 @@ def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
     usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
     if camera.is_perspective:
         usable &= camera.near > 0
-    transfer = scene.transfer
+    word = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~usable)
+    for transfer in (scene.transfer, scene.volume_transfer):
+        if transfer is not None:
+            word |= faults.raised(faults.BAD_TRANSFER, ~_shows(transfer))
+    return word
+
+
+def _shows(transfer: TransferFunction) -> Bool[Array, ""]:
+    """Whether a transfer function is usable."""
     shown = (transfer.values[1:] >= transfer.values[:-1]).all() & jnp.isfinite(transfer.values).all()
     shown &= ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
-    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all() & ~too_small(transfer.values)
-    unresolved = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples))
-    return unresolved | faults.raised(faults.BAD_CAMERA, ~usable) | faults.raised(faults.BAD_TRANSFER, ~shown)
+    return shown & ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all() & ~too_small(transfer.values)

@@ -180,3 +180,22 @@ def test_help_and_version_are_exit_code_0(capsys):
 def test_it_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "jaxsph", "render"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+def test_a_volume_is_rendered_described_and_cut_at_a_level(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    x = np.linspace(-1, 1, 9)
+    ball = (200 * np.clip(1.2 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2), 0, 1)).astype(np.uint8)
+    io.write_volume("ball.vti", js.Volume.from_array(ball, (-1, -1, -1), 0.25))
+    code, out, err = run(capsys, "render", "ball.vti", "-o", "out.exr", "--colormap", "heat", *TINY)
+    assert (code, err) == (0, [])
+    assert all(said in out for said in ("9 x 9 x 9 points", "uint8", "heat over 0 to", "--eye"))
+    assert np.asarray(io.read_image("out.exr").alpha).max() > 0.3
+    code, out, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
+    assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}
+    code, out, _ = run(capsys, "info", "ball.vti")
+    assert code == 0 and all(said in out for said in ("VTK XML image, 9 x 9 x 9", "spacing 0.25 0.25 0.25", "0 to 200"))
+    code, _, err = run(capsys, "render", "ball.vti", "--support", "1", *TINY)
+    assert code == 2 and err == ["jaxsph render: --support is for particles, and this is a volume (see `jaxsph render --help`)"]
+    code, _, err = run(capsys, "render", "ball.vti", "--quantity", "rho", *TINY)
+    assert code == 1 and err == ["jaxsph render: ball.vti: has no quantity 'rho'; it has values"]

@@ -60,12 +60,12 @@ class CastMethod:
 
 @dataclasses.dataclass(frozen=True)
 class DiffInputs:
-    """What a march is differentiated by; `media` are those besides particles."""
+    """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any."""
 
     columns: dict[str, Float[Array, " particles"]]
     half_steps: Float[Array, " two_samples_and_one"]
     half_height: Float[Array, ""]
-    transfer: TransferFunction
+    transfer: TransferFunction | None
     media: tuple[Medium, ...]
 
 
@@ -84,7 +84,7 @@ def cast(
     grid: Grid,
     schedule: SlabSchedule,
     camera: Camera,
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     media: tuple[Medium, ...],
     method: CastMethod,
     lattice: Lattice | None = None,
@@ -126,7 +126,9 @@ def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
 
 
 def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
-    """All media, particles first."""
+    """All media, particles first if there are any."""
+    if inputs.transfer is None:
+        return inputs.media
     grid, _ = _seen(inputs, fixed)
     return ParticleMedium(grid, inputs.transfer.segments(), fixed.lattice, method.kernel, wanted), *inputs.media
 
@@ -219,11 +221,14 @@ def _pull(
     )
     with barriers(plan.tuning.fusion_barriers):
         found = _Backward(batches, media, method.integrator, wanted.field).pull(image, cotangent, start)
-    particles, *others = found.media
+    columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, found.media
+    if inputs.transfer is not None:
+        particles, others = found.media[0], found.media[1:]
+        columns, transfer = particles.columns(), particles.of_transfer()
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)
-    total = DiffInputs(particles.columns(), half_steps, half_height, particles.of_transfer(), tuple(others))
+    total = DiffInputs(columns, half_steps, half_height, transfer, others)
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 

@@ -1,4 +1,4 @@
-"""Read particles, write and read images. One format a file; optional libraries are imported when needed.
+"""Read particles, volumes and images, write volumes and images. One format a file; optional libraries are imported when needed.
 
 Flow: file -> [read_table] -> ParticleTable -> [particles_from_table] -> Particles ... Image -> [write_image] -> file.
 
@@ -21,6 +21,8 @@ from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.volume_table import VolumeTable
+from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
 
@@ -30,14 +32,20 @@ __all__ = [
     "Format",
     "ParticleTable",
     "Report",
+    "VolumeTable",
     "available_quantities",
+    "is_volume",
     "kernel_sum",
     "nearest_neighbour_supports",
     "particles_from_table",
     "read_image",
     "read_particles",
     "read_table",
+    "read_volume",
+    "read_volume_table",
+    "volume_from_table",
     "write_image",
+    "write_volume",
 ]
 
 

@@ -40,13 +40,7 @@ def read(path: Path) -> ParticleTable:
         ValueError: damaged, cut short, another type of data set, or a compressor that is not known.
     """
     with explained(path, SOURCE):
-        content = path.read_bytes()
-        head, mark, tail = content.partition(b"<AppendedData")
-        root = ElementTree.fromstring(head + b"</VTKFile>" if mark else content)
-        kind = root.get("type", "unknown")
-        if root.tag != "VTKFile" or kind not in DATASETS:
-            raise DataError(f"is XML of type {kind}; save it as {' or '.join(DATASETS)} (.vtu, .vtp)")
-        decoder = _Decoder(root, tail, len(content))
+        root, decoder = parsed(path, DATASETS, ".vtu, .vtp")
         pieces = [_piece(piece, decoder) for piece in root.iter("Piece")]
         if not pieces:
             raise DataError("has no Piece, so it is cut short or damaged; copy it again")
@@ -63,7 +57,18 @@ def read(path: Path) -> ParticleTable:
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
 
 
-def _piece(piece: ElementTree.Element, decoder: _Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[ElementTree.Element, Decoder]:
+    """The XML of a file of one of those types of data set, and what reads its arrays."""
+    content = path.read_bytes()
+    head, mark, tail = content.partition(b"<AppendedData")
+    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else content)
+    kind = root.get("type", "unknown")
+    if root.tag != "VTKFile" or kind not in datasets:
+        raise DataError(f"is XML of type {kind}; save it as {' or '.join(datasets)} ({suffixes})")
+    return root, Decoder(root, tail, len(content))
+
+
+def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     count = int(piece.get("NumberOfPoints", "0"))
     if count < 0:
         raise DataError(f"announces {count} points, so it is damaged; copy it again")
@@ -84,7 +89,7 @@ def _piece(piece: ElementTree.Element, decoder: _Decoder) -> tuple[np.ndarray, d
     return position, columns
 
 
-class _Decoder:
+class Decoder:
     """What all data arrays of a file share: byte order, compression, and the appended data."""
 
     def __init__(self, root: ElementTree.Element, tail: bytes, file_bytes: int) -> None:

@@ -1,4 +1,4 @@
-"""What is looked at and from where: particles, kernels, transfer function, camera, scene, settings, image."""
+"""What is looked at and from where: particles, kernels, volume, transfer function, camera, scene, settings, image."""
 
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -6,5 +6,6 @@ from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.volume import Volume
 
-__all__ = ["Camera", "Image", "Particles", "Scene", "Settings", "TransferFunction"]
+__all__ = ["Camera", "Image", "Particles", "Scene", "Settings", "TransferFunction", "Volume"]

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.particles import Particles
+from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import is_traced, require_finite
 
 PROJECTIONS = ("perspective", "orthographic")
@@ -113,7 +114,7 @@ class Camera:
     @classmethod
     def framing(
         cls,
-        particles: Particles,
+        particles: Particles | Volume,
         *,
         direction: Any = (-0.45, -0.35, -1.0),
         up: Any = (0.0, 1.0, 0.0),
@@ -122,11 +123,11 @@ class Camera:
         height: int = 512,
         margin: float = 1.05,
     ) -> Camera:
-        """Perspective camera that frames the particles: everything in view, near and far snug (host side).
+        """Perspective camera that frames particles or a volume: everything in view, near and far snug (host side).
 
         Args:
-            particles: what to look at; an empty set is framed as the unit box.
-            direction: line of sight, from the eye to the middle of the particles.
+            particles: what to look at, particles or a volume; an empty set is framed as the unit box.
+            direction: line of sight, from the eye to the middle of it.
             up: as `look_at`.
             fov_degrees: vertical field of view.
             width, height: size in pixels.

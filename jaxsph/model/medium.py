@@ -15,9 +15,10 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.camera import Camera
+from jaxsph.numerics import faults
 
 COLORS = slice(0, 3)
 Total = TypeVar("Total")
@@ -32,6 +33,18 @@ class Medium(abc.ABC):
     def seen_by(self, camera: Camera) -> Medium:
         """The medium in view space; by default as it is."""
         return self
+
+    def without_data(self) -> Medium:
+        """What `seen_by` made, without large arrays that are the scene's own: a stage would copy what it returns."""
+        return self
+
+    def with_data(self, given: Any) -> Medium:
+        """The same with those arrays again, from what of the scene it was made of."""
+        return self
+
+    def faults(self) -> Int[Array, ""]:
+        """What is wrong with the numbers of a medium that `seen_by` made, as a fault word; by default nothing."""
+        return jnp.int32(faults.NONE)
 
     @abc.abstractmethod
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:

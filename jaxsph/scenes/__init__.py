@@ -18,8 +18,8 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
-from jaxsph.scenes import appearance
-from jaxsph.scenes.appearance import colormap, default_transfer
+from jaxsph.scenes import appearance, fields
+from jaxsph.scenes.appearance import colormap, default_transfer, default_volume_transfer
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.dam_break import dam_break
 from jaxsph.scenes.flubber import flubber
@@ -33,6 +33,8 @@ __all__ = [
     "colormap",
     "dam_break",
     "default_transfer",
+    "default_volume_transfer",
+    "fields",
     "flubber",
     "letters",
     "load",

@@ -1,6 +1,6 @@
 """Default appearance: a transfer function from a colour map and a range of the quantity, opaque enough to read.
 
-Flow: Particles, colour map -> [appearance] -> TransferFunction.
+Flow: Particles or Volume, colour map -> [appearance] -> TransferFunction.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Particles, TransferFunction
+from jaxsph.model import Particles, TransferFunction, Volume
 
 COLORMAPS: dict[str, tuple[str, ...]] = {
     "viridis": ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"),
@@ -33,6 +33,9 @@ STEEPNESS = 2
 
 CELLS = (4, 48)
 """Fewest and most cells along the longest edge when columns of the quantity are summed."""
+
+MAX_COLUMNS = 64
+"""Points along each axis of a volume that columns are summed over, about."""
 
 TAILS = (0.5, 99.5)
 """Percentiles of the quantity between which colours vary: a few odd particles must not take all of them."""
@@ -103,11 +106,7 @@ def default_transfer(
     colors = colormap(colormap_name)
     valid = np.asarray(particles.valid)
     quantity = np.asarray(particles.quantity, np.float64)[valid]
-    low, high = value_range(quantity) if values is None else (float(values[0]), float(values[1]))
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"`values` must be two finite numbers that ascend, got ({low}, {high})")
-    if not (np.isfinite(optical_depth) and optical_depth > 0):
-        raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
+    low, high = _span(quantity, values, optical_depth)
     share = np.linspace(0, 1, len(colors))
     ramp = FAINTEST + (1 - FAINTEST) * share**STEEPNESS
     depth = _typical_column(
@@ -116,6 +115,46 @@ def default_transfer(
         np.interp(quantity, low + (high - low) * share, ramp),
     )
     return TransferFunction.from_points(low + (high - low) * share, colors, optical_depth / depth * ramp)
+
+
+def default_volume_transfer(
+    volume: Volume,
+    colormap_name: str = "viridis",
+    values: tuple[float, float] | None = None,
+    optical_depth: float = OPTICAL_DEPTH,
+) -> TransferFunction:
+    r"""A transfer function that shows a volume with a colour map.
+
+    Extinction rises with the square of the place in the range of values, from 0: what is lowest, as the air of a scan, is not
+    shown. Its peak makes the optical depth $\tau$ of typical columns `optical_depth`, $\sum \tau^2 / \sum \tau$ over all columns
+    of a coarser grid along the three axes.
+
+    Args:
+        volume: what to show.
+        colormap_name, values, optical_depth: as for `default_transfer`.
+
+    Raises:
+        ValueError: as `default_transfer`.
+    """
+    colors, steps = colormap(colormap_name), [max(1, points // MAX_COLUMNS) for points in volume.shape]
+    coarse = np.asarray(volume.values)[tuple(slice(None, None, step) for step in steps)].astype(np.float64)
+    low, high = _span(coarse, values, optical_depth)
+    share = np.linspace(0, 1, len(colors))
+    shown = np.interp(coarse, low + (high - low) * share, share**STEEPNESS)
+    cell = np.asarray(volume.spacing, np.float64) * steps
+    columns = np.concatenate([(shown.sum(axis) * cell[axis]).ravel() for axis in range(3)])
+    depth = float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
+    return TransferFunction.from_points(low + (high - low) * share, colors, optical_depth / depth * share**STEEPNESS)
+
+
+def _span(quantity: np.ndarray, values: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
+    """What colours span: as asked for, or by the quantity."""
+    low, high = value_range(quantity) if values is None else (float(values[0]), float(values[1]))
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise ValueError(f"`values` must be two finite numbers that ascend, got ({low}, {high})")
+    if not (np.isfinite(optical_depth) and optical_depth > 0):
+        raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
+    return low, high
 
 
 def _typical_column(position: np.ndarray, support: np.ndarray, extinction: np.ndarray) -> float:

@@ -30,10 +30,22 @@ def snug(camera: Camera, particles: Particles) -> Camera:
     valid = np.asarray(particles.valid)
     if not valid.any():
         return camera
-    offset = particles.exact_position()[valid] - camera.exact_eye()
-    depth = offset @ np.asarray(camera.axes, np.float64)[2]
+    depth = _depth(camera, particles.exact_position()[valid])
     support = np.asarray(particles.support, np.float64)[valid]
-    near, far = (depth - support).min(), (depth + support).max()
+    return _between(camera, (depth - support).min(), (depth + support).max())
+
+
+def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
+    """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
+    depth = _depth(camera, np.array(list(itertools.product(*zip(lower, upper, strict=True)))))
+    return _between(camera, depth.min(), depth.max())
+
+
+def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
+    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
+
+
+def _between(camera: Camera, near: float, far: float) -> Camera:
     if camera.is_perspective:
         if far <= 0:
             return camera

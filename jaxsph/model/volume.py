@@ -1,0 +1,134 @@
+"""Volume: numbers on the points of a regular grid, and what lies between them.
+
+Flow: files, scenes, resampled particles -> [volume] -> field -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
+
+KEPT = ("uint8", "int8", "uint16", "int16")
+"""Integers that stay as they are in memory: float32 holds each of them exactly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Volume:
+    r"""A quantity given at the points $x = \text{lower} + (i, j, k) \cdot \text{spacing}$ of a grid; make it with `from_array`.
+
+    Between grid points it is trilinear; outside of the box that they span there is nothing. Values may be changed by
+    `dataclasses.replace` under jit without recompiling, and an image can be differentiated by them where they are floats.
+
+    Attributes:
+        values: at the grid points, in the units of the transfer function.
+        lower: position of the point (0, 0, 0), length units.
+        spacing: between neighbouring points along x, y and z, > 0, length units.
+        lower_rest: what rounding a float64 `lower` has left, length units.
+    """
+
+    values: Num[Array, "nx ny nz"]
+    lower: Float[Array, "3"]
+    spacing: Float[Array, "3"]
+    lower_rest: Float[Array, "3"]
+
+    @classmethod
+    def from_array(cls, values: Any, lower: Any = (0.0, 0.0, 0.0), spacing: Any = 1.0) -> Volume:
+        """Check and pack the values of a grid.
+
+        Args:
+            values: (Nx, Ny, Nz) at the grid points, at least two along each axis; the first index counts along x. Integers of 8
+                and 16 bits are kept as they are; wider ones, booleans and half floats become float32, which rounds integers
+                beyond 2^24.
+            lower: (3,) position of the point (0, 0, 0), length units.
+            spacing: between neighbouring points, length units: a number, or (3,) for x, y and z; > 0.
+
+        Returns:
+            Volume that is rendered in float64 if `values` are float64 and x64 is enabled, else in float32.
+
+        Raises:
+            ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
+                is not > 0 and finite, a `lower` that is not finite.
+        """
+        given = values if isinstance(values, jax.Array) else np.asarray(values)
+        require_real("values", given)
+        if given.ndim != 3:
+            raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
+        if min(given.shape) < 2:
+            raise ValueError(
+                f"`values` must have at least two points along each axis, got shape {given.shape}; "
+                "repeat a single plane to give it a thickness"
+            )
+        if not is_traced(given):
+            _require_finite_values(given, "repair them, or give them a number that the transfer function does not show")
+        with np.errstate(over="ignore"):  # what overflows is refused by name
+            packed = jnp.asarray(given, _kept_dtype(given.dtype))
+        if not is_traced(given) and packed.dtype != given.dtype:
+            _require_finite_values(packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
+        dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
+        exact = _vector("lower", lower, (3,), "give x, y and z of the first grid point")
+        steps = _vector("spacing", spacing, (3,), "give one number, or one for each of x, y and z")
+        if not is_traced(steps):
+            require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
+            require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
+        near = exact.astype(dtype)
+        return cls(packed, jnp.asarray(near), jnp.asarray(steps, dtype), jnp.asarray(exact - near, dtype))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y and z (static)."""
+        return self.values.shape  # type: ignore[return-value]
+
+    @property
+    def dtype(self) -> Any:
+        """What it is rendered in: float32 or float64."""
+        return self.lower.dtype
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""
+        lower = np.asarray(self.lower, np.float64) + np.asarray(self.lower_rest, np.float64)
+        return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
+
+
+def _kept_dtype(given: Any) -> Any:
+    """Of values in memory: as given where that pays, else float32 or float64."""
+    if np.dtype(given).name in KEPT:
+        return given
+    if jnp.issubdtype(given, jnp.floating):
+        return jnp.promote_types(jax.dtypes.canonicalize_dtype(given), jnp.float32)
+    return jnp.float32
+
+
+def _require_finite_values(values: Any, remedy: str) -> None:
+    """Raise `ValueError` with how many values are not finite, and the index of the first."""
+    host = np.asarray(values)
+    if host.dtype.kind in "iub" or np.isfinite(host.min() + host.max()):
+        return
+    bad = ~np.isfinite(host)
+    where = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), host.shape))
+    at = ", ".join(map(str, where))
+    if not bad.any():  # their sum alone overflows
+        return
+    raise ValueError(
+        f"`values` must be finite, but {int(bad.sum())} of {host.size} are not, first values[{at}] = {host[where]}; {remedy}"
+    )
+
+
+def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:
+    """A vector in float64 on the host; one number stands for all of its entries."""
+    if is_traced(value):
+        return jnp.broadcast_to(jnp.asarray(value), shape)
+    given: np.ndarray = np.asarray(value, np.float64)
+    if given.shape not in ((), shape) or (given.shape == () and name == "lower"):
+        raise ValueError(f"`{name}` must have shape {shape}, got {given.shape}; {remedy}")
+    require_finite(name, given, remedy)
+    return np.broadcast_to(given, shape)
+
+
+jax.tree_util.register_dataclass(Volume, data_fields=["values", "lower", "spacing", "lower_rest"], meta_fields=[])

@@ -1,0 +1,118 @@
+"""From particles to a grid: their CSPH field at the points of a lattice, as a volume.
+
+Flow: particles -> [resample] -> Volume -> render, write_volume.
+
+Particle by particle, each adds its weight to the points in its support: the sums that a sample gathers, in float64. Particles
+whose supports span as many points are taken together, in the order in which they lie in memory, so that what a chunk adds to is
+small.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxsph.model import kernels
+from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import require_finite, require_positive
+
+PAIRS = 1 << 19  # (particle, point) pairs of a chunk: its arrays stay in the caches
+BEYOND = 4.0  # a squared distance in supports, at which every kernel is 0
+
+
+def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, int, int], *, fill: float = 0.0) -> Volume:
+    r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid (host side, float64 sums).
+
+    Args:
+        particles: whose quantity is resampled.
+        lower: (3,) position of the point (0, 0, 0), length units.
+        spacing: between neighbouring points, length units: a number, or (3,); > 0.
+        shape: points along x, y and z, at least 2 each.
+        fill: value of points outside of every support. Particles show nothing there, a volume what its transfer function makes of
+            `fill`: give a value beyond the quantities, and extinction 0 from there to the first that is to be shown. Between a
+            point inside and one outside the volume is interpolated, so borders are blurred by a cell.
+
+    Returns:
+        Volume of the particles' dtype.
+
+    Raises:
+        ValueError: a shape, spacing, lower corner or fill out of range.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, equations 1 and 2.
+    """
+    lower, spacing = (np.asarray(value, np.float64) for value in (lower, spacing))
+    if len(shape) != 3 or any(int(points) != points or points < 2 for points in shape):
+        raise ValueError(f"`shape` must be three integers of at least 2, got {tuple(shape)}; give the points along x, y and z")
+    for name, value, shapes in (("lower", lower, [(3,)]), ("spacing", spacing, [(), (3,)]), ("fill", np.asarray(fill), [()])):
+        if value.shape not in shapes:
+            raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
+        require_finite(name, value, "give finite numbers")
+    require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
+    grid = _Sums(lower, np.broadcast_to(spacing, 3), tuple(int(points) for points in shape), particles)
+    for box in grid.boxes():
+        grid.add(*box)
+    inside = grid.weight > 0
+    quantity = np.where(inside, grid.weighted / np.where(inside, grid.weight, 1), fill)
+    return Volume.from_array(quantity.reshape(shape).astype(particles.dtype), lower, spacing)
+
+
+@dataclasses.dataclass
+class _Sums:
+    """Sums of weights, and of quantities times weights, at all points of a grid."""
+
+    lower: np.ndarray
+    spacing: np.ndarray
+    shape: tuple[int, ...]
+    particles: Particles
+
+    def __post_init__(self) -> None:
+        valid, columns = np.asarray(self.particles.valid), self.particles.to_numpy()
+        self.position = (self.particles.exact_position()[valid] - self.lower) / self.spacing
+        self.support, self.quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
+        strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(self.support)  # ratios alone count, however far apart
+        largest = strength.max(initial=-np.inf, where=volume > 0)
+        self.strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
+        self.kernel = kernels.by_name(self.particles.kernel)
+        self.weight, self.weighted = np.zeros((2, int(np.prod(self.shape))))
+
+    def boxes(self) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[range, ...]]]:
+        """Particles whose supports span boxes of one size: which, the first point of each, and the offsets of all its points."""
+        reach = self.support[:, None] / self.spacing
+        first = np.maximum(np.ceil(self.position - reach), 0).astype(np.int64)
+        last = np.minimum(np.floor(self.position + reach), np.array(self.shape) - 1).astype(np.int64)
+        points = last - first + 1
+        some = np.flatnonzero((points > 0).all(1) & (self.strength > 0))
+        sizes = np.array([capacity_class(count) for count in range(max(self.shape) + 1)])[points[some]]
+        ways, of_size = np.unique(sizes, axis=0, return_inverse=True)
+        for k, size in enumerate(ways.tolist()):
+            which = some[of_size.ravel() == k]
+            which = which[np.argsort(np.ravel_multi_index(tuple(first[which].T), self.shape))]
+            deep = max(PAIRS // (size[1] * size[2]), 1)
+            together = max(PAIRS // (min(size[0], deep) * size[1] * size[2]), 1)
+            for begin, x in itertools.product(range(0, len(which), together), range(0, size[0], deep)):
+                chunk = which[begin : begin + together]
+                yield chunk, first[chunk], (range(x, min(x + deep, size[0])), range(size[1]), range(size[2]))
+
+    def add(self, which: np.ndarray, first: np.ndarray, offsets: tuple[range, ...]) -> None:
+        """Add particles to the points of their boxes."""
+        squares, places = [], []
+        for axis, points in enumerate(self.shape):
+            at = first[:, axis, None] + np.array(offsets[axis])
+            away = (at - self.position[which, axis, None]) * (self.spacing[axis] / self.support[which, None])
+            squares.append(np.where(at < points, away**2, BEYOND))
+            places.append(np.minimum(at, points - 1))
+        columns, rows, layers = (np.s_[:, :, None, None], np.s_[:, None, :, None], np.s_[:, None, None, :])
+        distance = squares[0][columns] + squares[1][rows] + squares[2][layers]
+        weight = self.kernel.of_square(distance, np) * self.strength[which, None, None, None]
+        place = (places[0][columns] * self.shape[1] + places[1][rows]) * self.shape[2] + places[2][layers]
+        start, end = int(place.min()), int(place.max()) + 1
+        count = functools.partial(np.bincount, (place - start).ravel(), minlength=end - start)
+        self.weight[start:end] += count(weight.ravel())
+        self.weighted[start:end] += count((weight * self.quantity[which, None, None, None]).ravel())
