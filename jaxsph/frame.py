@@ -15,6 +15,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
+from jaxsph.host_stages import MAKE_GRID, ORDER
 from jaxsph.layers import OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
@@ -30,8 +31,6 @@ from jaxsph.stages import (
     decide_by_bounds,
     decide_by_pilot,
     decide_full_rate,
-    make_grid,
-    order,
     probe_shard,
     sum_shard,
     wanted_cells,
@@ -73,14 +72,14 @@ class Frame:
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
-        ordered = run.one("grid", order, (seen.viewed, camera), **static)
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera), **static)
         return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
         plan = self.plan
-        sizes = {"lists": plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
-        made = run.one("grid", make_grid, (self.ordered, self.camera, first_row), **sizes)
+        sizes: dict[str, Any] = {"lists": plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
+        made = run.with_host("grid", MAKE_GRID, (self.ordered, self.camera, first_row), **sizes)
         grid = made.of(self.ordered)
         decided, lattice = self._decide(grid, run)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards

@@ -131,11 +131,18 @@ def make_grid(
     ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, halo: int, tuning: Tuning
 ) -> BandGrid:
     """The grid of the band that begins at a row of pixels; `halo` is that of the integrator."""
+    still, looking = jax.tree.map(lax.stop_gradient, (ordered, camera))
+    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, halo)
+
+
+def grid_of_lists(
+    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, halo: int
+) -> BandGrid:
+    """The same, given the lists of its bundles."""
     depths = half_steps(camera, ordered.x.dtype, samples)
-    ordered, camera = jax.tree.map(lax.stop_gradient, (ordered, camera))
-    made = build_lists(ordered, camera, lists, first_row)
-    windows = (slab_windows_with_borders if halo else find_slab_windows)(ordered, made)
-    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), made.end[-1])
+    windows = (slab_windows_with_borders if halo else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
+    pairs = (made.end - made.start).sum(dtype=jnp.int32)
+    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
 
 
 @stage("shards", "lists", "cast", "control", "kernel")
