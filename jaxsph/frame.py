@@ -72,7 +72,7 @@ class Frame:
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
-        ordered = run.with_host("grid", ORDER, (seen.viewed, camera), **static)
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:

@@ -11,28 +11,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Int
 
 from jaxsph.access.host_lists import build_lists_on_host, find_sides, find_touched, list_shapes, pair_shapes
-from jaxsph.access.host_sorting import sorted_order
+from jaxsph.access.host_sorting import depth_order
 from jaxsph.access.lists import BundleLists, ListPlan
-from jaxsph.access.ordering import Ordered, in_order
+from jaxsph.access.ordering import Ordered
 from jaxsph.access.view import Viewed
 from jaxsph.model.camera import Camera
 from jaxsph.numerics.executors import Clock, Forecast, HostStage
 from jaxsph.numerics.tuning import Tuning, cores_at_hand
 from jaxsph.stages import BandGrid, grid_of_lists, make_grid, order, stage
-from jaxsph.viewing import half_steps
 
-
-@stage("samples", "slab_samples", quickly=True)
-def arrange(
-    viewed: Viewed, order: Int[Array, " particles"], camera: Camera, *, samples: int, slab_samples: int, tuning: Tuning
-) -> Ordered:
-    """The particles in the order of their keys."""
-    depths = half_steps(camera, viewed.x.dtype, samples)[1::2]
-    return in_order(viewed, viewed.key[order], order, camera, depths, slab_samples)
+Found = Int[Array, " particles"] | None
 
 
 @stage("lists", "samples", "halo")
@@ -51,26 +42,27 @@ def find_windows(
     return grid_of_lists(ordered, made, camera, first_row, lists, samples, halo)._replace(lists=None)  # type: ignore[arg-type]
 
 
-def _order(run: Clock, stage: str, viewed: Viewed, camera: Camera, **static: Any) -> Ordered:
-    order = jax.device_put(sorted_order(np.asarray(viewed.key), cores_at_hand()), may_alias=True)
-    run.mark(stage)
-    arranged: Ordered = run.one(stage, arrange, (viewed, order, camera), **static)
-    return arranged
+def _order(run: Clock, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
+    if found is None:
+        found = depth_order(viewed, cores_at_hand())
+        run.mark(stage)
+    ordered: Ordered = run.one(stage, order, (viewed, camera, found), **static)
+    return ordered
 
 
-def _order_foreseen(run: Forecast, stage: str, viewed: Viewed, camera: Camera, **static: Any) -> Ordered:
-    order = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
-    arranged: Ordered = run.one(stage, arrange, (viewed, order, camera), **static)
-    return arranged
+def _order_foreseen(run: Forecast, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
+    shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32) if found is None else found
+    ordered: Ordered = run.one(stage, order, (viewed, camera, shape), **static)
+    return ordered
 
 
 def _grid(
     run: Clock, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
 ) -> BandGrid:
     sides = run.one(stage, find_sides, (ordered, first_row), lists=lists)
-    view = (ordered, sides.bundles, camera, first_row)
+    view = (sides.spheres, sides.bundles, camera, first_row)
     touched = run.program(stage, find_touched, (*view, pair_shapes(lists)))
-    made = build_lists_on_host(sides, lambda pairs: touched(*view, pairs), lists)
+    made = build_lists_on_host(sides, lambda pairs: touched(*view, pairs), lists, cores_at_hand())
     run.mark(stage)
     grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
     return grid._replace(lists=made)
@@ -80,7 +72,7 @@ def _grid_foreseen(
     run: Forecast, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
 ) -> BandGrid:
     sides = run.one(stage, find_sides, (ordered, first_row), lists=lists)
-    run.one(stage, find_touched, (ordered, sides.bundles, camera, first_row, pair_shapes(lists)))
+    run.one(stage, find_touched, (sides.spheres, sides.bundles, camera, first_row, pair_shapes(lists)))
     made = list_shapes(lists)
     grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
     return grid._replace(lists=made)

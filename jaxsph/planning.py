@@ -13,12 +13,14 @@ import dataclasses
 import functools
 import math
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.measures import measure
+from jaxsph.access.host_sorting import depth_order
+from jaxsph.measures import Measures, measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
@@ -26,7 +28,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
-from jaxsph.numerics.tuning import Tuning, memory_for, tuning_for
+from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class, require_controllable
 from jaxsph.viewing import Seen, view_scene
 
@@ -90,6 +92,16 @@ def pad(particles: Particles, *, capacity: int) -> Particles:
     return particles.padded(capacity)
 
 
+def _measured(seen: Seen, camera: Camera, shape: FrameShape) -> tuple[Seen, Measures]:
+    """What is seen measured; and sorted beside that, if the host is to."""
+    if not shape.tuning.sorts_on_host:
+        return seen, measure(seen.viewed, camera, shape.samples)
+    with ThreadPoolExecutor(1) as thread:
+        order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
+        measures = measure(seen.viewed, camera, shape.samples)
+        return seen._replace(order=order.result()), measures
+
+
 class Plans:
     """The plans of a process's frames, the least recently used of which goes when there are too many."""
 
@@ -103,7 +115,7 @@ class Plans:
         shape = self._similar(shape_of(scene.particles, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
-        measures = measure(seen.viewed, camera, shape.samples)
+        seen, measures = _measured(seen, camera, shape)
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
         made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)

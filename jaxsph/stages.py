@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.extents import slab_extents
 from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
-from jaxsph.access.ordering import Ordered, rank_particles
+from jaxsph.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.access.shards import shard, shard_of_grid
 from jaxsph.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders
 from jaxsph.access.view import Viewed
@@ -120,10 +120,20 @@ class Decided(NamedTuple):
 
 
 @stage("samples", "slab_samples", quickly=True)
-def order(viewed: Viewed, camera: Camera, *, samples: int, slab_samples: int, tuning: Tuning) -> Ordered:
-    """The particles that can be seen, by rank."""
+def order(
+    viewed: Viewed,
+    camera: Camera,
+    found: Int[Array, " particles"] | None = None,
+    *,
+    samples: int,
+    slab_samples: int,
+    tuning: Tuning,
+) -> Ordered:
+    """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
     depths = half_steps(camera, viewed.x.dtype, samples)[1::2]
-    return rank_particles(viewed, camera, depths, slab_samples)
+    if found is None:
+        return rank_particles(viewed, camera, depths, slab_samples)
+    return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
 
 
 @stage("lists", "samples", "halo")

@@ -25,11 +25,15 @@ from jaxsph.numerics.programs import compiled_quickly
 
 
 class Seen(NamedTuple):
-    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles."""
+    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
+
+    `order` is that of the particles' keys, where the host has found it.
+    """
 
     viewed: Viewed
     transfer: TransferFunction
     media: tuple[Medium, ...]
+    order: Int[Array, " particles"] | None = None
 
 
 @compiled_quickly

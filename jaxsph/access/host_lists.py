@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.access.host_sorting import entries_at
 from jaxsph.access.lists import BundleLists, ListPlan, Ranges, Sphere, bundle_ranges, children_mask, touched_bundles
@@ -35,7 +36,9 @@ Test = Callable[[tuple[np.ndarray, ...]], Array]
 class Sides(NamedTuple):
     """Tiles of a band that each particle can touch, first and last, in small integers; none if a first is past the last.
 
-    `bundles` are the same for bundles as in `Ranges`, packed into as few words as hold them.
+    Attributes:
+        bundles: the same for bundles as in `Ranges`, packed into as few words as hold them.
+        spheres: x, y, z and reach of each, side by side: to fetch them one by one is to miss the cache four times.
     """
 
     left: Int[Array, " particles"]
@@ -43,6 +46,7 @@ class Sides(NamedTuple):
     top: Int[Array, " particles"]
     bottom: Int[Array, " particles"]
     bundles: tuple[Int[Array, " particles"], ...]
+    spheres: Float[Array, "particles 4"]
 
 
 class _Pairs(NamedTuple):
@@ -51,12 +55,14 @@ class _Pairs(NamedTuple):
     Attributes:
         rank: of the particle.
         down, across: row and column of the tile in the band.
+        touched: which of its bundles, see `lists.children_mask`.
         start: (rows, columns + 1): where the pairs of each tile begin, and those of the row end.
     """
 
     rank: np.ndarray
     down: np.ndarray
     across: np.ndarray
+    touched: np.ndarray
     start: np.ndarray
 
     @classmethod
@@ -65,7 +71,7 @@ class _Pairs(NamedTuple):
         room = -(-total // PAIRS_AT_ONCE) * PAIRS_AT_ONCE
         places = np.zeros((2, room), _small(plan))
         start = np.zeros((plan.tile_rows, plan.tile_columns + 1), np.int64)
-        return cls(np.zeros(room, np.int32), places[0], places[1], start)
+        return cls(np.zeros(room, np.int32), places[0], places[1], np.empty(room, np.uint8), start)
 
 
 @functools.partial(jax.jit, static_argnames="lists")
@@ -79,12 +85,15 @@ def find_sides(ordered: Ordered, first_row: Int[Array, ""], *, lists: ListPlan) 
     bits = jnp.iinfo(kind).bits
     each = 32 // bits
     words = [[side << (bits * nth) for nth, side in enumerate(sides[k : k + each])] for k in range(0, 4, each)]
-    return Sides(left, right, top, bottom, tuple(functools.reduce(jnp.bitwise_or, word) for word in words))
+    lane, spheres = jnp.arange(4, dtype=jnp.int32), jnp.zeros((*ordered.x.shape, 4), ordered.x.dtype)
+    for nth, column in enumerate((ordered.x, ordered.y, ordered.z, ordered.reach)):
+        spheres = jnp.where(lane == nth, column[:, None], spheres)
+    return Sides(left, right, top, bottom, tuple(functools.reduce(jnp.bitwise_or, word) for word in words), spheres)
 
 
 @jax.jit
 def find_touched(
-    ordered: Ordered,
+    spheres: Float[Array, "particles 4"],
     bundles: tuple[Int[Array, " particles"], ...],
     camera: Camera,
     first_row: Int[Array, ""],
@@ -92,17 +101,16 @@ def find_touched(
 ) -> Int[Array, " pairs"]:
     """As `lists.children_mask`, for `pairs` of a rank and a tile's row and column."""
     rank, down, across = pairs
-    columns = (ordered.x, ordered.y, ordered.z, ordered.reach, *bundles)
 
     def fetch(rank: Array) -> tuple[Array, ...]:
-        return tuple(column.at[rank].get(mode="promise_in_bounds") for column in columns)
+        return tuple(column.at[rank].get(mode="promise_in_bounds") for column in (spheres, *bundles))
 
-    def test(x: Array, y: Array, z: Array, reach: Array, *words: Array) -> Array:
+    def test(sphere: Array, *words: Array) -> Array:
         bits = 8 * len(words)
         sides = [(word >> (bits * nth)) & ((1 << bits) - 1) for word in words for nth in range(4 // len(words))]
         ranges = Ranges(*(side.astype(jnp.int32) for side in sides))
         places = down.astype(jnp.int32), across.astype(jnp.int32)
-        return children_mask(touched_bundles(Sphere(x, y, z, reach), ranges, camera, first_row, *places))
+        return children_mask(touched_bundles(Sphere(*sphere.T), ranges, camera, first_row, *places))
 
     # apart from each other the two vectorise: together they take four times as long
     found: Array = fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))
@@ -121,70 +129,77 @@ def list_shapes(plan: ListPlan) -> BundleLists:
     return BundleLists(*shapes)
 
 
-def build_lists_on_host(sides: Sides, test: Test, plan: ListPlan) -> BundleLists:
-    """The lists of all bundles of a band.
+def build_lists_on_host(sides: Sides, test: Test, plan: ListPlan, threads: int) -> BundleLists:
+    """The lists of all bundles of a band; without room for them, a fault and none.
 
     Args:
         sides: of the particles, from `find_sides`.
         test: `find_touched` for pairs; it may return before it is done.
         plan: sizes of the band.
+        threads: rows of tiles that are worked on side by side.
     """
-    picked = _pick(sides, test, plan)
-    made = None if picked is None else _split(*picked, plan)
-    fault = faults.TILE_OVERFLOW if picked is None else faults.LIST_OVERFLOW if made is None else 0
-    rank = _zeros(plan.list_capacity + 1)
-    borders = np.zeros((2, plan.num_bundles), np.int32)
-    if made is not None:
-        rank, borders = made
-    return BundleLists(*(jax.device_put(value, may_alias=True) for value in (rank, *borders, np.uint32(fault))))
+    with ThreadPoolExecutor(threads) as pool:
+        pairs = _pick(sides, test, plan, pool)
+        if pairs is None:
+            return _lists(plan, faults.TILE_OVERFLOW)
+        found = _split(pairs, plan, pool)
+    return _lists(plan, faults.LIST_OVERFLOW) if found is None else _lists(plan, 0, *found)
 
 
-def _pick(sides: Sides, test: Test, plan: ListPlan) -> tuple[_Pairs, list[Array]] | None:
-    """All pairs, and the tests of them, which may not be done yet; None where there is no room for so many."""
+def _lists(plan: ListPlan, fault: int, rank: np.ndarray | None = None, borders: np.ndarray | None = None) -> BundleLists:
+    rank = _zeros(plan.list_capacity + 1) if rank is None else rank
+    start, end = np.zeros((2, plan.num_bundles), np.int32) if borders is None else borders
+    return BundleLists(*(jax.device_put(value, may_alias=True) for value in (rank, start, end, np.uint32(fault))))
+
+
+def _pick(sides: Sides, test: Test, plan: ListPlan, pool: ThreadPoolExecutor) -> _Pairs | None:
+    """All pairs, and which bundles they touch; None without room for so many."""
     left, right, top, bottom = (np.asarray(side) for side in sides[:4])
-    rows = [
-        (ranks, left[ranks], right[ranks])
-        for ranks in entries_at(np.arange(len(top), dtype=np.int32), top, bottom, 0, plan.tile_rows)
-    ]
-    total = sum(len(ranks) + int(last.sum(dtype=np.int64)) - int(first.sum(dtype=np.int64)) for ranks, first, last in rows)
-    if total > plan.tile_capacity:
+    rows = list(entries_at(np.arange(len(top), dtype=np.int32), top, bottom, 0, plan.tile_rows))
+    columns = [(left[ranks], right[ranks]) for ranks in rows]
+    counts = [len(first) + int(last.sum(dtype=np.int64) - first.sum(dtype=np.int64)) for first, last in columns]
+    begin = np.concatenate([[0], np.cumsum(counts)])
+    if begin[-1] > plan.tile_capacity:
         return None
-    pairs, filled = _Pairs.empty(total, plan), 0
+    pairs = _Pairs.empty(int(begin[-1]), plan)
+
+    def pick(row: int) -> None:
+        filled = int(begin[row])
+        for column, some in enumerate(entries_at(rows[row], *columns[row], 0, plan.tile_columns)):
+            place = slice(filled, filled + len(some))
+            pairs.rank[place], pairs.across[place], pairs.start[row, column] = some, column, filled
+            filled += len(some)
+        pairs.down[begin[row] : filled], pairs.start[row, -1] = row, filled
+
     tests: list[Array] = []
-    for row, (ranks, first, last) in enumerate(rows):
-        begin = filled
-        for column, some in enumerate(entries_at(ranks, first, last, 0, plan.tile_columns)):
-            pairs.start[row, column] = filled
-            pairs.rank[filled : filled + len(some)] = some
-            pairs.across[filled : filled + len(some)] = column
-            filled += len(some)
-        pairs.start[row, -1] = filled
-        pairs.down[begin:filled] = row
-        whole = len(pairs.rank) if row == plan.tile_rows - 1 else filled - filled % PAIRS_AT_ONCE
-        for place in range(len(tests) * PAIRS_AT_ONCE, whole, PAIRS_AT_ONCE):
-            batch = slice(place, place + PAIRS_AT_ONCE)
+    for row, _ in enumerate(pool.map(pick, range(plan.tile_rows))):
+        whole = len(pairs.rank) if row == plan.tile_rows - 1 else int(begin[row + 1])
+        while (len(tests) + 1) * PAIRS_AT_ONCE <= whole:
+            batch = slice(len(tests) * PAIRS_AT_ONCE, (len(tests) + 1) * PAIRS_AT_ONCE)
             tests.append(test((pairs.rank[batch], pairs.down[batch], pairs.across[batch])))
-    return pairs, tests
+    for nth, found in enumerate(tests):
+        pairs.touched[nth * PAIRS_AT_ONCE : (nth + 1) * PAIRS_AT_ONCE] = found
+    return pairs
 
 
-def _split(pairs: _Pairs, tests: list[Array], plan: ListPlan) -> tuple[np.ndarray, np.ndarray] | None:
-    """Ranks of the lists, and where each begins and ends; None where there is no room for so many."""
-    rank, borders, filled = _zeros(plan.list_capacity + 1), np.zeros((2, plan.num_tiles, 4), np.int32), 0
-    touched, known = np.empty(len(pairs.rank), np.uint8), 0
-    for row, start in enumerate(pairs.start):
-        begin, end = int(start[0]), int(start[-1])
-        tiles = slice(row * plan.tile_columns, (row + 1) * plan.tile_columns)
-        for place in range(known, end, PAIRS_AT_ONCE):
-            touched[place : place + PAIRS_AT_ONCE] = tests[place // PAIRS_AT_ONCE]
-            known = place + PAIRS_AT_ONCE
-        for child in range(4):
-            some = np.flatnonzero((touched[begin:end] & (1 << child)) != 0)
-            if filled + len(some) > plan.list_capacity:
-                return None
-            pairs.rank[begin:end].take(some, out=rank[filled : filled + len(some)], mode="clip")
-            places = filled + np.searchsorted(some, start - begin)
-            borders[0, tiles, child], borders[1, tiles, child] = places[:-1], places[1:]
-            filled += len(some)
+def _split(pairs: _Pairs, plan: ListPlan, pool: ThreadPoolExecutor) -> tuple[np.ndarray, np.ndarray] | None:
+    """Ranks of the lists, and where each begins and ends; None without room for so many."""
+    rows = [slice(*map(int, start[[0, -1]])) for start in pairs.start]
+    corners = [(row, child) for row in range(plan.tile_rows) for child in range(4)]
+    touched = list(pool.map(lambda corner: pairs.touched[rows[corner[0]]] & (1 << corner[1]) != 0, corners))
+    begin = np.concatenate([[0], np.cumsum([np.count_nonzero(found) for found in touched])])
+    if begin[-1] > plan.list_capacity:
+        return None
+    rank, borders = _zeros(plan.list_capacity + 1), np.zeros((2, plan.tile_rows, plan.tile_columns, 4), np.int32)
+
+    def split(nth: int) -> None:
+        row, child = corners[nth]
+        some = np.flatnonzero(touched[nth])
+        pairs.rank[rows[row]].take(some, out=rank[begin[nth] : begin[nth + 1]], mode="clip")
+        places = begin[nth] + np.searchsorted(some, pairs.start[row] - pairs.start[row, 0])
+        borders[0, row, :, child], borders[1, row, :, child] = places[:-1], places[1:]
+
+    list(pool.map(split, range(len(corners))))
     return rank, borders.reshape(2, -1)
 
 

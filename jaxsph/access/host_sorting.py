@@ -11,11 +11,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import numpy as np
+from jaxtyping import Array, Int
+
+from jaxsph.access.view import Viewed
 
 GROUP = 8  # places that entries are looked through for together, before they are for each
 PER_THREAD = 1 << 16  # keys that a thread more pays for
 SAMPLED = 1 << 10  # keys that the keys' middle is told from
+
+
+def depth_order(viewed: Viewed, threads: int) -> Int[Array, " particles"]:
+    """The order of particles' keys, on the device that holds them."""
+    order: Array = jax.device_put(sorted_order(np.asarray(viewed.key), threads), may_alias=True)
+    return order
 
 
 def sorted_order(key: np.ndarray, threads: int) -> np.ndarray:
