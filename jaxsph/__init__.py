@@ -1,6 +1,7 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
 from jaxsph import io, reference, scenes
+from jaxsph.access.morton import prepare
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
@@ -20,6 +21,7 @@ __all__ = [
     "__version__",
     "io",
     "plan",
+    "prepare",
     "reference",
     "render",
     "scenes",
