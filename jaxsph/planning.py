@@ -92,13 +92,13 @@ def pad(particles: Particles, *, capacity: int) -> Particles:
     return particles.padded(capacity)
 
 
-def _measured(seen: Seen, camera: Camera, shape: FrameShape) -> tuple[Seen, Measures]:
-    """What is seen measured; and sorted beside that, if the host is to."""
-    if not shape.tuning.sorts_on_host:
-        return seen, measure(seen.viewed, camera, shape.samples)
+def measured(seen: Seen, camera: Camera, samples: int, tuning: Tuning) -> tuple[Seen, Measures]:
+    """What is seen, measured; and beside that sorted, if the host is to."""
+    if not tuning.sorts_on_host:
+        return seen, measure(seen.viewed, camera, samples)
     with ThreadPoolExecutor(1) as thread:
         order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
-        measures = measure(seen.viewed, camera, shape.samples)
+        measures = measure(seen.viewed, camera, samples)
         return seen._replace(order=order.result()), measures
 
 
@@ -115,7 +115,7 @@ class Plans:
         shape = self._similar(shape_of(scene.particles, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
-        seen, measures = _measured(seen, camera, shape)
+        seen, measures = measured(seen, camera, shape.samples, shape.tuning)
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
         made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)

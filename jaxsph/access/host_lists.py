@@ -27,6 +27,7 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.programs import compiled_quickly
 
 PAIRS_AT_ONCE = 1 << 16  # that a program tests: with fewer, calling it costs more than what it does
 ALIGNMENT = 64  # bytes that arrays are to begin at for XLA to take them without a copy
@@ -74,6 +75,7 @@ class _Pairs(NamedTuple):
         return cls(np.zeros(room, np.int32), places[0], places[1], np.empty(room, np.uint8), start)
 
 
+@compiled_quickly
 @functools.partial(jax.jit, static_argnames="lists")
 def find_sides(ordered: Ordered, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
     """What all particles of a band are picked by."""
