@@ -2,7 +2,7 @@
 
 Flow: view -> [host_sorting] -> ordering, host_lists.
 
-XLA sorts by comparisons, 45 ns a particle, and selects by scatters, 4 ns an entry; both on one thread. Of 16-bit numbers NumPy
+XLA sorts by comparisons, 45 ns a particle (of a million, on one core of an AVX-512 machine), and selects by scatters, 4 ns an entry; both on one thread. Of 16-bit numbers NumPy
 makes a radix sort, 5 ns a particle and digit, and it finds what is true in half a nanosecond an entry.
 """
 
