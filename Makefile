@@ -84,6 +84,7 @@ results: $(VENV)/.installed-all
 	-$(MEASURE) benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
 	-$(MEASURE) benchmarks/scaling.py --repeats 1
 	-$(MEASURE) benchmarks/vtk_grid.py --repeats 1
+	-$(VENV)/bin/python benchmarks/access.py
 	-$(VENV)/bin/python benchmarks/peers.py --repeats 2
 	-$(VENV)/bin/python benchmarks/gradients.py --repeats 2
 	$(VENV)/bin/python benchmarks/report.py

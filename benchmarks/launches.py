@@ -28,6 +28,7 @@ import workloads
 import jaxsph as js
 from jaxsph.frame import Frame
 from jaxsph.layers import develop
+from jaxsph.numerics.executors import HostStage
 from jaxsph.numerics.tuning import ACCELERATOR, CPU, Tuning
 from jaxsph.planning import see
 from jaxsph.provenance import of_this_run
@@ -57,6 +58,9 @@ class Counted:
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         return [self.one(stage, function, arguments, **static) for arguments in inputs]
+
+    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        return self.one(stage, made.function, arguments, **static)
 
     def may_hold(self, flag: jax.Array) -> bool:
         return bool(flag)

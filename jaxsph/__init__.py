@@ -1,6 +1,7 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
 from jaxsph import io, reference, scenes
+from jaxsph.access.morton import prepare
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
@@ -24,6 +25,7 @@ __all__ = [
     "__version__",
     "io",
     "plan",
+    "prepare",
     "reference",
     "render",
     "resample",

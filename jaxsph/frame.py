@@ -16,6 +16,7 @@ from jaxsph.access.lists import ListPlan
 from jaxsph.access.ordering import Ordered
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
+from jaxsph.host_stages import MAKE_GRID, ORDER
 from jaxsph.layers import OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
@@ -33,14 +34,11 @@ from jaxsph.stages import (
     decide_by_bounds,
     decide_by_pilot,
     decide_full_rate,
-    make_grid,
-    order,
     probe_shard,
     sum_shard,
     wanted_cells,
 )
 from jaxsph.viewing import Seen
-
 
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
 
@@ -83,7 +81,7 @@ class Frame:
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
-        ordered = run.one("grid", order, (seen.viewed, camera), **static)
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         allowed = None if limits is None else limits.tolerance
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
@@ -98,21 +96,27 @@ class Frame:
         of_shards = OfShards(tuple(rays), tuple(one.verdict for one in decided))
         return Band(of_shards, made.lists.faults, made.filled, made.pairs)
 
-    def grid(self, first_row: Int[Array, ""], run: Executor, camera: Camera | None = None, lists: ListPlan | None = None) -> BandGrid:
+    def grid(
+        self, first_row: Int[Array, ""], run: Executor, camera: Camera | None = None, lists: ListPlan | None = None
+    ) -> BandGrid:
         """Of the band that begins at a row of pixels, or of another camera's nodes."""
         plan = self.plan
-        sizes = {"lists": lists or plan.lists, "samples": plan.samples, "halo": self._halo, "tuning": plan.cast.tuning}
-        made: BandGrid = run.one("grid", make_grid, (self.ordered, camera or self.camera, first_row), **sizes)
+        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "halo": self._halo}
+        sizes["tuning"] = plan.cast.tuning
+        made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
         return made
 
-    def cast(self, grid: Grid, decided: list[Decided], lattice: Lattice | None, run: Executor, camera: Camera | None = None) -> list[Cast]:
+    def cast(
+        self, grid: Grid, decided: list[Decided], lattice: Lattice | None, run: Executor, camera: Camera | None = None
+    ) -> list[Cast]:
         """What the rays of all packets of a grid meet, shard by shard."""
         plan = self.plan
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
         scene = (grid, camera or self.camera, self.transfer, self.media)
         inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
         method = {"cast_plan": plan.cast, "integrator": plan.integrator, "screen": plan.screen, "kernel": self.kernel}
-        return run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        return rays
 
     @property
     def _each(self) -> list[Int[Array, ""]]:

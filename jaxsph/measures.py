@@ -39,7 +39,7 @@ class Measures:
 
 
 def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Measures:
-    """Measure particles in the view of a camera with `samples` along each ray; and for a lattice of rays, if its stride is given."""
+    """Measure particles in the view of a camera with `samples` along each ray; and for a lattice of rays of some stride."""
     left, right, top, bottom = (np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom))
     seen = np.flatnonzero((right >= left) & (bottom >= top))
     some = seen[:: max(1, len(seen) // MAX_MEDIAN_OF)]
@@ -53,7 +53,7 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
     reached = [int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1) for first, last in ends]
     medians = [float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters)]
     of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
-    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians, of_lattice)
+    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians, of_lattice=of_lattice)
 
 
 def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int) -> tuple[int, int]:

@@ -13,12 +13,14 @@ import dataclasses
 import functools
 import math
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.measures import measure
+from jaxsph.access.host_sorting import depth_order
+from jaxsph.measures import Measures, measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
@@ -26,7 +28,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
-from jaxsph.numerics.tuning import Tuning, memory_for, tuning_for
+from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, along_rays, choose, fitted, next_class
 from jaxsph.viewing import Seen, view_scene
 
@@ -90,6 +92,16 @@ def pad(particles: Particles, *, capacity: int) -> Particles:
     return particles.padded(capacity)
 
 
+def measured(seen: Seen, camera: Camera, samples: int, tuning: Tuning, stride: int) -> tuple[Seen, Measures]:
+    """What is seen, measured; and beside that sorted, if the host is to."""
+    if not tuning.sorts_on_host:
+        return seen, measure(seen.viewed, camera, samples, stride)
+    with ThreadPoolExecutor(1) as thread:
+        order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
+        measures = measure(seen.viewed, camera, samples, stride)
+        return seen._replace(order=order.result()), measures
+
+
 class Plans:
     """The plans of a process's frames, the least recently used of which goes when there are too many."""
 
@@ -103,7 +115,7 @@ class Plans:
         shape = self._similar(shape_of(scene.particle_set, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
-        measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
+        seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
         made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)

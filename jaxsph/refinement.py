@@ -50,6 +50,15 @@ class Shot(NamedTuple):
     spent: Float[Array, "packets rays"]
 
 
+class Decisions(NamedTuple):
+    """How rays of a band are marched: those of whole bundles, and single ones, for which no lattice of nodes serves."""
+
+    grid: Grid
+    of_bundles: Decided
+    of_rays: Decided
+    lattice: Lattice | None
+
+
 @stage("lists", quickly=True)
 def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, tuning: Tuning) -> Canvas:
     """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
@@ -57,12 +66,11 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
     transmittance, depth = (unshard(tuple(getattr(one.rays, name) for one in rays), 0) for name in ("transmittance", "depth"))
     spent, cast = unshard(tuple(one.evaluations for one in rays)), unshard(filled).any(0)
     value = lists.as_image(canvases.channels_of(color, transmittance, depth))
-    spent, cast = (
-        lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in (spent, cast)
-    )
+    spent, cast = (lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in (spent, cast))
     rows, columns = camera.nodes
     made = canvases.blank((camera.height, camera.width), value.dtype)
-    return canvases.painted_on_lattice(made, *(one[:rows, :columns] for one in (value, spent, cast)), camera.stride)
+    value, spent, cast = (one[:rows, :columns] for one in (value, spent, cast))
+    return canvases.painted_on_lattice(made, value, spent, cast, camera.stride)
 
 
 @stage("lists", "side", "coarsest", "estimator", quickly=True)
@@ -148,7 +156,9 @@ def join(decided: tuple[Decided, ...], *, tuning: Tuning) -> Decided:
 
 
 @stage("height", "width", "lists", quickly=True)
-def spread_over(verdicts: tuple[Verdict, ...], *, height: int, width: int, lists: ListPlan, tuning: Tuning) -> tuple[Array, Array]:
+def spread_over(
+    verdicts: tuple[Verdict, ...], *, height: int, width: int, lists: ListPlan, tuning: Tuning
+) -> tuple[Array, Array]:
     """Bounds and evaluations at full rate of all pixels, of those of the bundles of bands."""
 
     def image(of_bands: tuple[Array, ...]) -> Array:
@@ -179,28 +189,35 @@ class Refinement:
         made = frame.grid(jnp.int32(0), run, camera, lists)
         grid = made.of(frame.ordered)
         decided = frame.leave(grid, run, with_levels=False, camera=camera)
-        rays = frame.cast(grid, decided, None, run, camera)
-        canvas: Canvas = run.one("adapt", begin, (tuple(rays), tuple(one.schedule.filled for one in decided), camera), lists=lists, **self._tuned)
+        rays = tuple(frame.cast(grid, decided, None, run, camera))
+        filled = tuple(one.schedule.filled for one in decided)
+        canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=lists, **self._tuned)
         return canvas, made
 
     def band(self, canvas: Canvas, first_row: Int[Array, ""]) -> tuple[Canvas, BandGrid, Verdict]:
         """With the leaves of a band split as long as they are not good enough."""
+        decisions, made = self.decided(first_row)
+        for side in self.sizes.sides:
+            canvas, *queues = self._choose(canvas, decisions.of_bundles, first_row, side)
+            canvas = self.shot(canvas, decisions, *queues)
+        return canvas, made, decisions.of_bundles.verdict
+
+    def decided(self, first_row: Int[Array, ""]) -> tuple[Decisions, BandGrid]:
+        """The grid of a band, and how rays are to be marched there."""
         frame, run = self.frame, self.run
         made = frame.grid(first_row, run)
         grid = made.of(frame.ordered)
         decided, lattice = frame.decide(grid, run)
-        decision: Decided = decided[0] if len(decided) == 1 else run.one("adapt", join, (tuple(decided),), **self._tuned)
-        scattered = decision.schedule
+        of_bundles = of_rays = self._joined(decided)
         if lattice is not None:
-            of_shards = frame.leave(grid, run, with_levels=False)
-            scattered = (of_shards[0] if len(of_shards) == 1 else run.one("adapt", join, (tuple(of_shards),), **self._tuned)).schedule
-        for side in self.sizes.sides:
-            canvas, *queues = self._choose(canvas, decision, first_row, side)
-            shots: list[Shot] = []
-            for kind, queue, schedule, nodes in (("scattered", queues[0], scattered, None), ("whole", queues[1], decision.schedule, lattice)):
-                shots += self._shoot(kind, queue, (grid, schedule, nodes))
-            canvas = self._paint(canvas, shots)
-        return canvas, made, decision.verdict
+            of_rays = self._joined(frame.leave(grid, run, with_levels=False))
+        return Decisions(grid, of_bundles, of_rays, lattice), made
+
+    def shot(self, canvas: Canvas, decisions: Decisions, scattered: Queue, whole: Queue) -> Canvas:
+        """With the rays cast that are queued."""
+        shots = self._shoot("scattered", scattered, decisions.grid, decisions.of_rays.schedule, None)
+        shots += self._shoot("whole", whole, decisions.grid, decisions.of_bundles.schedule, decisions.lattice)
+        return self._paint(canvas, shots)
 
     def finished(self, canvas: Canvas, verdicts: list[Verdict]) -> Layers:
         """The layers of the image."""
@@ -222,10 +239,13 @@ class Refinement:
         static = {"lists": self.frame.plan.lists, "side": side, "coarsest": self.sizes.leaf, "estimator": self.sizes.estimator}
         return self.run.one("adapt", choose, inputs, **static, **self._tuned)  # type: ignore[no-any-return]
 
-    def _shoot(self, kind: str, queue: Queue, of_band: tuple[Grid, SlabSchedule, Lattice | None]) -> list[Shot]:
+    def _joined(self, decided: list[Decided]) -> Decided:
+        joined: Decided = decided[0] if len(decided) == 1 else self.run.one("adapt", join, (tuple(decided),), **self._tuned)
+        return joined
+
+    def _shoot(self, kind: str, queue: Queue, grid: Grid, schedule: SlabSchedule, lattice: Lattice | None) -> list[Shot]:
         """Cast what a queue holds, some bundles at a time."""
         frame, plan = self.frame, self.frame.plan
-        grid, schedule, lattice = of_band
         turns, packets = self.run.turns(queue.number, self.sizes.packets, plan.lists.num_bundles)
         cast_plan = plan.cast.of_shard(frame.shards)
         if kind == "scattered":

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.extents import slab_extents
 from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
-from jaxsph.access.ordering import Ordered, rank_particles
+from jaxsph.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.access.shards import shard, shard_of_grid
 from jaxsph.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders
 from jaxsph.access.view import Viewed
@@ -120,10 +120,20 @@ class Decided(NamedTuple):
 
 
 @stage("samples", "slab_samples", quickly=True)
-def order(viewed: Viewed, camera: Camera, *, samples: int, slab_samples: int, tuning: Tuning) -> Ordered:
-    """The particles that can be seen, by rank."""
+def order(
+    viewed: Viewed,
+    camera: Camera,
+    found: Int[Array, " particles"] | None = None,
+    *,
+    samples: int,
+    slab_samples: int,
+    tuning: Tuning,
+) -> Ordered:
+    """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
     depths = half_steps(camera, viewed.x.dtype, samples)[1::2]
-    return rank_particles(viewed, camera, depths, slab_samples)
+    if found is None:
+        return rank_particles(viewed, camera, depths, slab_samples)
+    return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
 
 
 @stage("lists", "samples", "halo")
@@ -131,11 +141,18 @@ def make_grid(
     ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, halo: int, tuning: Tuning
 ) -> BandGrid:
     """The grid of the band that begins at a row of pixels; `halo` is that of the integrator."""
+    still, looking = jax.tree.map(lax.stop_gradient, (ordered, camera))
+    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, halo)
+
+
+def grid_of_lists(
+    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, halo: int
+) -> BandGrid:
+    """The same, given the lists of its bundles."""
     depths = half_steps(camera, ordered.x.dtype, samples)
-    ordered, camera = jax.tree.map(lax.stop_gradient, (ordered, camera))
-    made = build_lists(ordered, camera, lists, first_row)
-    windows = (slab_windows_with_borders if halo else find_slab_windows)(ordered, made)
-    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), made.end[-1])
+    windows = (slab_windows_with_borders if halo else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
+    pairs = (made.end - made.start).sum(dtype=jnp.int32)
+    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
 
 
 @stage("shards", "lists", "cast", "control", "kernel")

@@ -29,11 +29,13 @@ class Seen(NamedTuple):
     """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
 
     A scene without particles has no transfer function, and particles in name only.
+    `order` is that of the particles' keys, where the host has found it.
     """
 
     viewed: Viewed
     transfer: TransferFunction | None
     media: tuple[Medium, ...]
+    order: Int[Array, " particles"] | None = None
 
     def with_data(self, scene: Scene) -> Seen:
         """With the arrays of the scene that media read, which no stage is to copy."""

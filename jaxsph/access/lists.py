@@ -15,12 +15,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.footprint import side_distances, touches
 from jaxsph.access.ordering import Ordered
@@ -279,25 +279,50 @@ def _touched_children(
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
     rank, tile = pairs
-    x, y, z, reach = (column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
+    sphere = Sphere(*(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach)))
+    found = Ranges(*(side[rank] for side in (ranges.left, ranges.right, ranges.top, ranges.bottom)))
     tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
-    down, across = ((2 * place)[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
+    down, across = (place[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
+    mask = children_mask(touched_bundles(sphere, found, camera, first_row, down, across))
+    return jnp.where(tile < plan.num_tiles, mask, 0)
+
+
+class Sphere(NamedTuple):
+    """Where particles are in view space, and how far they reach."""
+
+    x: Float[Array, " pairs"]
+    y: Float[Array, " pairs"]
+    z: Float[Array, " pairs"]
+    reach: Float[Array, " pairs"]
+
+
+def touched_bundles(
+    sphere: Sphere, ranges: Ranges, camera: Camera, first_row: Any, down: Int[Array, " pairs"], across: Int[Array, " pairs"]
+) -> list[Bool[Array, " pairs"]]:
+    """Whether spheres meet the pyramids of rays of the four bundles of tiles, given by row and column in the band."""
+    x, y, z, reach = sphere
     columns: list[tuple[Array, tuple[Array, Array]]] = []
     rows: list[tuple[Array, tuple[Array, Array]]] = []
     for half in range(2):
-        near, far = (across + half) * BUNDLE + 0.5, (across + half) * BUNDLE + BUNDLE - 0.5
+        place = 2 * across + half
+        near, far = place * BUNDLE + 0.5, place * BUNDLE + BUNDLE - 0.5
         sides = side_distances(x, z, _of(x, camera.column(near)), _of(x, camera.column(far)), camera.is_perspective)
-        columns.append(((ranges.left[rank] <= across + half) & (across + half < ranges.right[rank]), sides))
-        high, low = (down + half) * BUNDLE + 0.5 + first_row, (down + half) * BUNDLE + BUNDLE - 0.5 + first_row
+        columns.append(((ranges.left <= place) & (place < ranges.right), sides))
+        place = 2 * down + half
+        high, low = place * BUNDLE + 0.5 + first_row, place * BUNDLE + BUNDLE - 0.5 + first_row
         sides = side_distances(y, z, _of(x, camera.row(low)), _of(x, camera.row(high)), camera.is_perspective)
-        rows.append(((ranges.top[rank] <= down + half) & (down + half < ranges.bottom[rank]), sides))
+        rows.append(((ranges.top <= place) & (place < ranges.bottom), sides))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
-    mask = jnp.zeros(rank.shape, jnp.uint8)
-    for child in range(4):
-        (inside_column, x_side), (inside_row, y_side) = columns[child & 1], rows[child >> 1]
-        touched = inside_column & inside_row & touches(x_side, y_side, reach, size)
-        mask |= touched.astype(jnp.uint8) << child
-    return jnp.where(tile < plan.num_tiles, mask, 0)
+    children = [(*columns[child & 1], *rows[child >> 1]) for child in range(4)]
+    return [in_column & in_row & touches(x_side, y_side, reach, size) for in_column, x_side, in_row, y_side in children]
+
+
+def children_mask(touched: list[Bool[Array, " pairs"]]) -> Int[Array, " pairs"]:
+    """Bit `child` is set where that bundle of the pair's tile is touched; all are found in one loop."""
+    mask = jnp.zeros(touched[0].shape, jnp.uint8)
+    for child, one in enumerate(touched):
+        mask |= one.astype(jnp.uint8) << child
+    return mask
 
 
 def _of(like: Array, value: Array) -> Array:

@@ -50,7 +50,18 @@ def rank_particles(viewed: Viewed, camera: Camera, depths: Float[Array, " sample
     Differentiation:
         The columns x, y, z, scale, size and quantity have derivatives; all else is held fixed.
     """
-    key, order = _sort_by(viewed.key)
+    return in_order(viewed, *_sort_by(viewed.key), camera, depths, slab_samples)
+
+
+def in_order(
+    viewed: Viewed,
+    key: Int[Array, " particles"],
+    order: Int[Array, " particles"],
+    camera: Camera,
+    depths: Float[Array, " samples"],
+    slab_samples: int,
+) -> Ordered:
+    """The same, given the sorted keys and the order that sorts them."""
     ranked = {name: getattr(viewed, name)[order] for name in COLUMNS}
     begin, end = _windows(key, viewed.widest, camera, depths, slab_samples)
     return Ordered(**ranked, first_rank=begin[0], last_rank=end[0], first_beside=begin[1], last_beside=end[1])

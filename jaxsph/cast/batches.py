@@ -53,7 +53,6 @@ class CastPlan:
         """The plan of one of so many shards: all together they hold as much light as the plan for all does."""
         return dataclasses.replace(self, batch_slabs=max(self.batch_slabs // (shards * self.chunk), 1) * self.chunk)
 
-
     def for_rays(self, rays: int) -> CastPlan:
         """The plan of packets of fewer rays than a bundle has: as much light as it holds, of more slabs."""
         times = BUNDLE * BUNDLE // rays

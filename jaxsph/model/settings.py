@@ -93,5 +93,16 @@ def _is_number(value: Any) -> bool:
 jax.tree_util.register_dataclass(
     Settings,
     data_fields=["tolerance", "relax"],
-    meta_fields=["samples", "estimator", "super_pixels", "merge", "allocation", "integrator", "screen", "leaf_pixels", "leaf_estimator", "memory_limit"],
+    meta_fields=[
+        "samples",
+        "estimator",
+        "super_pixels",
+        "merge",
+        "allocation",
+        "integrator",
+        "screen",
+        "leaf_pixels",
+        "leaf_estimator",
+        "memory_limit",
+    ],
 )

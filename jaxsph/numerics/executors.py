@@ -10,12 +10,27 @@ import contextlib
 import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 from jaxtyping import Array, Bool, Int
 
 from jaxsph.numerics.programs import PROGRAMS, Programs
+from jaxsph.numerics.tuning import Tuning
+
+
+class HostStage(NamedTuple):
+    """A stage that the host does part of, where a frame is run stage by stage and its tuning says so.
+
+    Attributes:
+        function: the stage as one jitted function.
+        on_host: the same, given a `Clock` to run programs by.
+        foreseen: the shapes that it returns, given a `Forecast` to have those programs compiled by.
+    """
+
+    function: Any
+    on_host: Callable[..., Any]
+    foreseen: Callable[..., Any]
 
 
 class Executor(Protocol):
@@ -27,6 +42,10 @@ class Executor(Protocol):
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """The same for several arguments of the same shapes, side by side where that pays."""
+        ...
+
+    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
+        """A stage that the host may do part of."""
         ...
 
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
@@ -77,13 +96,27 @@ class Clock:
         self.mark(stage)
         return results
 
+    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
+        """Done in part by the host where that pays."""
+        if not tuning.sorts_on_host:
+            return self.one(stage, made.function, arguments, tuning=tuning, **static)
+        result = jax.block_until_ready(made.on_host(self, stage, *arguments, tuning=tuning, **static))
+        self.mark(stage)
+        return result
+
+    def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
+        """The program of a function, for a stage that is under way; to wait for it is booked apart."""
+        self.mark(stage)
+        program = self._programs.get(function, arguments, static).compiled.result()
+        self.mark("compile")
+        return program
+
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """The flag's value."""
         self._known.append(bool(flag))
         if self._foresee is not None:
             self.foresee(self._foresee)
         return self._known[-1]
-
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """As many as there are things for."""
@@ -113,6 +146,12 @@ class Forecast:
         """The same for several arguments of the same shapes."""
         return [self.one(stage, function, inputs[0], **static)] * len(inputs)
 
+    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
+        """The shapes that a stage returns; its programs' compilation has begun."""
+        if not tuning.sorts_on_host:
+            return self.one(stage, made.function, arguments, tuning=tuning, **static)
+        return made.foreseen(self, stage, *arguments, tuning=tuning, **static)
+
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """The flag's value where it is known; else what follows cannot be foreseen."""
         for value in self._known:
@@ -137,6 +176,10 @@ class Traced:
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """One after the other."""
         return [function.__wrapped__(*arguments, **static) for arguments in inputs]
+
+    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """All of it by XLA, as a trace holds no values for the host."""
+        return self.one(stage, made.function, arguments, **static)
 
     def may_hold(self, flag: Bool[Array, ""]) -> bool:
         """A trace knows no values, and has to be ready for either."""

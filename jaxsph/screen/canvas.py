@@ -6,6 +6,7 @@ Flow: cast -> [canvas: paint] -> estimators -> [canvas: wanted] -> packets -> ca
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +18,8 @@ from jaxsph.screen.pyramid import (
     at_nodes,
     lattices,
     nodes_of_leaves,
-    over_pixels,
     of_corners,
+    over_pixels,
     pixels_of_nodes,
     places,
 )
@@ -116,14 +117,13 @@ def finished(canvas: Canvas, coarsest: int, estimator: Estimator) -> tuple[Array
     half = (seen > 0) & (transmittance <= 0.5)
     depth = jnp.where(half, depth / jnp.where(half, seen, 1), jnp.inf)
     error, side = jnp.zeros(canvas.shape, transmittance.dtype), coarsest // 2
-    for coarser, corners in zip(found[:-2], found[1:-1], strict=True):
-        here = estimator(*(lax.stop_gradient(lattice[:LIGHT]) for lattice in (coarser, corners)), canvas.shape, side)
+    for coarser, corners in itertools.pairwise(found[:-1]):
+        before, now = (lax.stop_gradient(lattice[:LIGHT]) for lattice in (coarser, corners))
+        here = estimator(before, now, canvas.shape, side)
         made = over_pixels(of_corners(at_nodes(canvas.known, side), jnp.logical_and), canvas.shape, side)
         error = jnp.where(made, over_pixels(here.largest, canvas.shape, side), error)
         side //= 2
     return jnp.stack([red, green, blue], -1), transmittance, depth, jnp.where(canvas.known, 0, error)
 
 
-jax.tree_util.register_dataclass(
-    Canvas, data_fields=[field.name for field in dataclasses.fields(Canvas)], meta_fields=[]
-)
+jax.tree_util.register_dataclass(Canvas, data_fields=[field.name for field in dataclasses.fields(Canvas)], meta_fields=[])

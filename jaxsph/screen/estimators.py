@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxsph.screen.pyramid import at_nodes, corners_of, halved, num_leaves, of_corners
 
 CAUTION = 1.0  # of the largest difference around, how much a leaf may yet be wrong by: `benchmarks/calibrate_screen.py`
+Lattice = Float[Array, "channels rows columns"]
 GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -40,9 +41,7 @@ class Estimator(abc.ABC):
     """How errors of leaves are estimated."""
 
     @abc.abstractmethod
-    def __call__(
-        self, coarser: Float[Array, "channels ..."], corners: Float[Array, "channels rows columns"], shape: tuple[int, int], side: int
-    ) -> LeafErrors:
+    def __call__(self, coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> LeafErrors:
         """Of all leaves whose sides are `side` pixels long.
 
         Args:
@@ -58,9 +57,7 @@ class Hierarchical(Estimator):
     Either is bilinear on the leaf, so the square of their difference is a polynomial that Gauss quadrature integrates exactly.
     """
 
-    def __call__(
-        self, coarser: Float[Array, "channels ..."], corners: Float[Array, "channels rows columns"], shape: tuple[int, int], side: int
-    ) -> LeafErrors:
+    def __call__(self, coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> LeafErrors:
         """See `Estimator`."""
         gain = corners - halved(coarser, shape, side)
         size = _leaves(shape, side)
@@ -70,9 +67,7 @@ class Hierarchical(Estimator):
 class CornerVariance(Estimator):
     """How much the colours at the corners of a leaf vary (Levoy 1990, as in Kratz et al. 2011, section 7.3)."""
 
-    def __call__(
-        self, coarser: Float[Array, "channels ..."], corners: Float[Array, "channels rows columns"], shape: tuple[int, int], side: int
-    ) -> LeafErrors:
+    def __call__(self, coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> LeafErrors:
         """See `Estimator`."""
         four = jnp.stack(corners_of(corners))
         return LeafErrors(side * jnp.sqrt(four.var(0).sum(0)), (four.max(0) - four.min(0)).max(0) / 2)
@@ -81,9 +76,7 @@ class CornerVariance(Estimator):
 class Uniform(Estimator):
     """No estimate: the larger a leaf, the sooner it is split."""
 
-    def __call__(
-        self, coarser: Float[Array, "channels ..."], corners: Float[Array, "channels rows columns"], shape: tuple[int, int], side: int
-    ) -> LeafErrors:
+    def __call__(self, coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> LeafErrors:
         """See `Estimator`."""
         size = jnp.full(_leaves(shape, side), side, corners.dtype)
         return LeafErrors(size, jnp.full_like(size, jnp.inf))
@@ -109,7 +102,7 @@ def _mean_square(gain: Float[Array, "channels rows columns"], leaves: tuple[int,
 
 
 def _largest_around(value: Float[Array, "rows columns"], leaves: tuple[int, int]) -> Float[Array, "rows columns"]:
-    """The largest at the corners of each leaf and at the nodes next to them: an edge that a leaf has seen may enter its neighbours."""
+    """The largest at the corners of each leaf and at the nodes next to them: what a leaf sees may reach into the next."""
     pads = [(1, count - have + 2) for count, have in zip(leaves, value.shape, strict=True)]
     return lax.reduce_window(value, jnp.zeros((), value.dtype), lax.max, (4, 4), (1, 1), pads)
 

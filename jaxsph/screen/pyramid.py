@@ -82,7 +82,7 @@ def lattices(
     found = [at_nodes(value, coarsest)]
     while coarsest > stride:
         coarsest //= 2
-        between = halved(found[-1], value.shape[-2:], coarsest)
+        between = halved(found[-1], (value.shape[-2], value.shape[-1]), coarsest)
         found.append(jnp.where(at_nodes(known, coarsest), at_nodes(value, coarsest), between))
     return found
 

@@ -1,0 +1,104 @@
+"""Prepared particles are the same particles, and so are their images and derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+
+
+def mixed_up(particles, seed=0):
+    """The same entries in any order, so that padding lies among particles."""
+    order = np.random.default_rng(seed).permutation(particles.capacity)
+    return jax.tree.map(lambda column: column[order], particles)
+
+
+def rows(particles):
+    """What each particle is, in an order of its own."""
+    columns = particles.to_numpy()
+    table = np.column_stack([columns["position"], columns["support"], columns["quantity"], columns["volume"]])
+    return table[np.lexsort(table.T)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_prepared_particles_are_the_same_and_come_before_the_padding(frames, dtype):
+    with jax.enable_x64(dtype == np.float64):
+        scene = frames.scene(np.random.default_rng(0), decades=3, count=17, dtype=dtype)
+        prepared = js.prepare(mixed_up(scene.particles))
+        assert prepared.dtype == dtype and prepared.kernel == scene.particles.kernel
+        assert np.asarray(prepared.valid).tolist() == [True] * 17 + [False] * (frames.capacity - 17)
+        np.testing.assert_array_equal(rows(prepared), rows(scene.particles))
+        again = js.prepare(prepared)
+        for name, column in dataclasses.asdict(prepared).items():
+            np.testing.assert_array_equal(getattr(again, name), column)
+
+
+def test_what_positions_lost_to_rounding_goes_with_its_particle():
+    position = 1e4 + np.random.default_rng(0).uniform(0, 1, (20, 3))
+    particles = js.Particles.from_arrays(position, 0.01, np.arange(20.0))
+    prepared = js.prepare(particles)
+    order = np.asarray(prepared.quantity)[:20].astype(int)
+    np.testing.assert_array_equal(prepared.exact_position()[:20], particles.exact_position()[order])
+
+
+def test_neighbours_in_memory_are_neighbours_in_space():
+    position = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    particles = js.Particles.from_arrays(position, 0.1, 0.0)
+    apart = [
+        np.linalg.norm(np.diff(one.to_numpy()["position"], axis=0), axis=1).mean() for one in (js.prepare(particles), particles)
+    ]
+    assert apart[0] < apart[1] / 5
+
+
+@pytest.mark.parametrize("position", [np.zeros((0, 3)), np.ones((1, 3)), np.full((5, 3), 3e38), [[-3e38] * 3, [3e38] * 3]])
+def test_any_box_has_an_order(position):
+    particles = js.Particles.from_arrays(position, 1.0, 0.0)
+    np.testing.assert_array_equal(rows(js.prepare(particles)), rows(particles))
+
+
+def test_derivatives_go_back_to_the_particles_given(frames):
+    particles = mixed_up(frames.scene(np.random.default_rng(0), count=17).particles)
+    prepared, pull = jax.vjp(lambda position, quantity: columns_of(particles, position, quantity), *columns_of_given(particles))
+    for given, of_given, found in zip(columns_of_given(particles), pull(prepared), prepared, strict=True):
+        np.testing.assert_array_equal(of_given, given)
+        assert not np.array_equal(found, given)
+
+
+def columns_of_given(particles):
+    return particles.position, particles.quantity
+
+
+def columns_of(particles, position, quantity):
+    return columns_of_given(js.prepare(dataclasses.replace(particles, position=position, quantity=quantity)))
+
+
+@pytest.mark.slow
+def test_images_and_derivatives_are_those_of_the_particles_given(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    plan = js.plan(scene, camera, frames.settings)
+
+    def total(particles, prepared):
+        shown = js.prepare(particles) if prepared else particles
+        image = js.render(dataclasses.replace(scene, particles=shown), camera, frames.settings, plan=plan)
+        return image.color.sum() + image.transmittance.sum()
+
+    values = jax.jit(jax.value_and_grad(total, allow_int=True), static_argnums=1)
+    (plain, of_plain), (ours, of_ours) = (values(scene.particles, prepared) for prepared in (False, True))
+    np.testing.assert_allclose(ours, plain, rtol=1e-6)
+    for name in ("position", "support", "quantity", "volume"):
+        expected = np.asarray(getattr(of_plain, name))
+        np.testing.assert_allclose(getattr(of_ours, name), expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_eager_images_are_the_same_to_rounding():
+    scene, camera = js.scenes.load("mixer", 2000, width=40, height=33)
+    prepared = dataclasses.replace(scene, particles=js.prepare(scene.particles))
+    images = [js.render(one, camera, js.Settings(samples=32)) for one in (scene, prepared)]
+    assert images[0].stats["pairs"] == images[1].stats["pairs"]
+    np.testing.assert_allclose(images[1].color, images[0].color, atol=1e-6)
+    np.testing.assert_allclose(images[1].transmittance, images[0].transmittance, atol=1e-6)
