@@ -50,10 +50,12 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
     of_tiles = _pairs_in_rows(sides, TILE, tile_rows)
     of_bundles = _pairs_in_rows(sides, BUNDLE, 2 * tile_rows).reshape(-1, 2).sum(1)
     ends = (top, bottom), (left, right)
-    reached = [int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1) for first, last in ends]
-    medians = [float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters)]
+    rows, columns = (
+        max(int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1), 1) for first, last in ends
+    )
+    depth, diameter = (float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters))
     of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
-    return Measures(of_tiles, of_bundles, *(max(number, 1) for number in reached), *medians, of_lattice=of_lattice)
+    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, of_lattice)
 
 
 def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int) -> tuple[int, int]:
