@@ -6,6 +6,7 @@ from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
+from jaxsph.progressive import Progressive, progressive
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
 from jaxsph.sweep import sweep
@@ -18,6 +19,7 @@ __all__ = [
     "IsoSurface",
     "Particles",
     "Plan",
+    "Progressive",
     "Scene",
     "Settings",
     "TransferFunction",
@@ -26,6 +28,7 @@ __all__ = [
     "io",
     "plan",
     "prepare",
+    "progressive",
     "reference",
     "render",
     "resample",

@@ -21,6 +21,7 @@ import numpy as np
 
 import jaxsph
 from jaxsph import cli_cache, cli_sweep, cli_volume, io, scenes
+from jaxsph.cli_progressive import render_in_stages
 from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings, Volume
 from jaxsph.scenes.view import snug, snug_box
@@ -167,7 +168,9 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("error control").add_argument
     add("--tolerance", type=float, metavar="T", help="largest error of any channel of any pixel (default: none)")
     add("--estimator", choices=("interval", "pilot"), help="how the error is known")
-    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for correlation_length")
+    add("--screen", choices=("pixels", "quadtree"), help="whether pixels are interpolated where the tolerance allows it")
+    add("--progressive", action="store_true", help="by a quadtree, in stages: OUT is rewritten at each")
+    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -183,13 +186,18 @@ def _size(text: str) -> tuple[int, int]:
 
 def _render(options: argparse.Namespace) -> None:
     settings = _settings(options)
+    if options.progressive and options.screen == "pixels":
+        raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
     output = options.output or Path(Path(options.source.removeprefix(SCENE)).stem + ".png")
     _require_writable(output)
     scene, camera = _scene(options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
-    with progress("render") as show:
-        image = jaxsph.render(scene, camera, settings, progress=show)
+    if options.progressive:
+        image = render_in_stages(scene, camera, settings, output)
+    else:
+        with progress("render") as show:
+            image = jaxsph.render(scene, camera, settings, progress=show)
     elapsed = time.perf_counter() - started
     image.save(output)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
@@ -218,7 +226,7 @@ def _settings(options: argparse.Namespace) -> Settings:
         raise UsageError(f"--memory must be a positive number of GiB, got {options.memory:g}")
     given = {
         "samples": options.samples,
-        **{name: getattr(options, name, None) for name in ("tolerance", "estimator", "relax")},
+        **{name: getattr(options, name, None) for name in ("tolerance", "estimator", "relax", "screen")},
         "memory_limit": None if options.memory is None else int(options.memory * 2**30),
     }
     given = {name: value for name, value in given.items() if value is not None}

@@ -34,6 +34,7 @@ from jaxsph.numerics.tuning import Tuning
 from jaxsph.screen import canvas as canvases
 from jaxsph.screen.canvas import Canvas
 from jaxsph.screen.estimators import ESTIMATORS
+from jaxsph.screen.marking import Quality, holding, leaves_of, wanted_by, worst
 from jaxsph.screen.packets import SCATTERED, Queue, by_bundle, queued, scattered, scattered_packets, whole, whole_packets
 from jaxsph.screen.quadtree import QuadtreePlan
 from jaxsph.stages import BandGrid, Cast, Decided, Verdict, stage
@@ -73,6 +74,33 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
     return canvases.painted_on_lattice(made, value, spent, cast, camera.stride)
 
 
+class BandView(NamedTuple):
+    """Where a band lies in an image of some shape."""
+
+    lists: ListPlan
+    shape: tuple[int, int]
+    first_row: Int[Array, ""]
+
+    @property
+    def rows(self) -> int:
+        """Of its pixels, as many as its bundles have."""
+        return self.lists.bundles[0] * BUNDLE
+
+    def in_band(self, image: Array) -> Array:
+        """The rows of an image that it has."""
+        return lax.dynamic_slice_in_dim(jnp.pad(image, ((0, self.rows), (0, 0))), self.first_row, self.rows, 0)
+
+    def over_image(self, of_bundles: Array, beyond: Any) -> Array:
+        """What its bundles have, at their pixels; and something else beyond."""
+        pixels = _at_pixels(self.lists, of_bundles)[:, : self.shape[1]]
+        image = jnp.full((self.shape[0] + self.rows, self.shape[1]), beyond, pixels.dtype)
+        return lax.dynamic_update_slice_in_dim(image, pixels, self.first_row, 0)[: self.shape[0]]
+
+
+def _at_pixels(lists: ListPlan, of_bundles: Array) -> Array:
+    return lists.as_image(jnp.broadcast_to(of_bundles[:, None, None], (of_bundles.shape[0], BUNDLE, BUNDLE)))
+
+
 @stage("lists", "side", "coarsest", "estimator", quickly=True)
 def choose(
     canvas: Canvas,
@@ -88,21 +116,43 @@ def choose(
     tuning: Tuning,
 ) -> tuple[Canvas, Queue, Queue]:
     """Rays that leaves of one side want, of a band; pixels whose rays are certain to be empty are known without."""
-    height, width = canvas.shape
-    room = lists.bundles[0] * BUNDLE
-
-    def in_band(image: Array) -> Array:
-        return lax.dynamic_slice_in_dim(jnp.pad(image, ((0, room), (0, 0))), first_row, room, 0)
-
-    def over_image(of_bundles: Array, beyond: Any) -> Array:
-        pixels = lists.as_image(jnp.broadcast_to(of_bundles[:, None, None], (of_bundles.shape[0], BUNDLE, BUNDLE)))[:, :width]
-        whole = jnp.full((height + room, width), beyond, pixels.dtype)
-        return lax.dynamic_update_slice_in_dim(whole, pixels, first_row, 0)[:height]
-
-    canvas = dataclasses.replace(canvas, known=canvas.known | over_image(~filled.any(0), False))
-    of_pixels = over_image(lax.stop_gradient(bound), 0)
+    view = BandView(lists, canvas.shape, first_row)
+    canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
+    of_pixels = view.over_image(lax.stop_gradient(bound), 0)
     wanted = canvases.wanted_by_tolerance(canvas, side, coarsest, ESTIMATORS[estimator], tolerance, of_pixels)
-    return canvas, *queued(by_bundle(lists, in_band(wanted)))
+    return canvas, *queued(by_bundle(lists, view.in_band(wanted)))
+
+
+@stage("lists", "sizes", "number", quickly=True)
+def mark(
+    canvas: Canvas,
+    filled: Bool[Array, "slabs bundles"],
+    bound: Float[Array, " bundles"],
+    first_row: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    share: Float[Array, ""],
+    *,
+    lists: ListPlan,
+    sizes: QuadtreePlan,
+    number: int | None,
+    tuning: Tuning,
+) -> tuple[Canvas, Queue, Queue]:
+    """Rays that the worst leaves of all sides want, so many or as few as hold a share of the error; of a band."""
+    view = BandView(lists, canvas.shape, first_row)
+    canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
+    of_pixels = view.over_image(lax.stop_gradient(bound), 0)
+    leaves, _ = leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, of_pixels)
+    marked = holding(leaves, share) if number is None else worst(leaves, number)
+    wanted = wanted_by(marked, canvas, sizes.sides)
+    return canvas, *queued(by_bundle(lists, view.in_band(wanted)))
+
+
+@stage("sizes", quickly=True)
+def judge(
+    canvas: Canvas, bound: Float[Array, "height width"], tolerance: Array, *, sizes: QuadtreePlan, tuning: Tuning
+) -> Quality:
+    """How good a canvas is said to be."""
+    return leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, bound)[1]
 
 
 @stage("shape", "packets", "kind", "cast_plan", "integrator", "kernel")
@@ -162,8 +212,7 @@ def spread_over(
     """Bounds and evaluations at full rate of all pixels, of those of the bundles of bands."""
 
     def image(of_bands: tuple[Array, ...]) -> Array:
-        bands = [lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in of_bands]
-        return jnp.concatenate(bands)[:height, :width]
+        return jnp.concatenate([_at_pixels(lists, one) for one in of_bands])[:height, :width]
 
     return image(tuple(one.bound for one in verdicts)), image(tuple(one.full for one in verdicts))
 
@@ -213,6 +262,35 @@ class Refinement:
             of_rays = self._joined(frame.leave(grid, run, with_levels=False))
         return Decisions(grid, of_bundles, of_rays, lattice), made
 
+    def marked(
+        self, canvas: Canvas, decisions: Decisions, first_row: Int[Array, ""], number: int | None, share: float
+    ) -> tuple[Canvas, Queue, Queue]:
+        """Rays that the worst leaves want."""
+        filled, bound = decisions.of_bundles.schedule.filled, decisions.of_bundles.verdict.bound
+        inputs = canvas, filled, bound, first_row, self._allowed(bound.dtype), jnp.asarray(share, bound.dtype)
+        static = {"lists": self.frame.plan.lists, "sizes": self.sizes.with_room(1, 1), "number": number}
+        return self.run.one("adapt", mark, inputs, **static, **self._tuned)  # type: ignore[no-any-return]
+
+    def judged(self, canvas: Canvas, bands: tuple[Decisions, ...]) -> Quality:
+        """How good the canvas is said to be."""
+        bound = self._over_pixels([band.of_bundles.verdict for band in bands])[0]
+        inputs = canvas, bound, self._allowed(bound.dtype)
+        quality: Quality = self.run.one("adapt", judge, inputs, sizes=self.sizes.with_room(1, 1), **self._tuned)
+        return quality
+
+    def _allowed(self, dtype: Any) -> Float[Array, ""]:
+        return jnp.asarray(-1, dtype) if self.frame.allowed is None else self.frame.allowed
+
+    def _over_pixels(self, verdicts: list[Verdict]) -> tuple[Array, Array]:
+        """Bounds and evaluations at full rate of all pixels; nothing where no band is known yet."""
+        plan = self.frame.plan
+        if not verdicts:
+            nothing = jnp.zeros((plan.height, plan.width), self.frame.ordered.x.dtype)
+            return nothing, nothing
+        size = {"height": plan.height, "width": plan.width, "lists": plan.lists}
+        both: tuple[Array, Array] = self.run.one("image", spread_over, (tuple(verdicts),), **size, **self._tuned)
+        return both
+
     def shot(self, canvas: Canvas, decisions: Decisions, scattered: Queue, whole: Queue) -> Canvas:
         """With the rays cast that are queued."""
         shots = self._shoot("scattered", scattered, decisions.grid, decisions.of_rays.schedule, None)
@@ -221,9 +299,7 @@ class Refinement:
 
     def finished(self, canvas: Canvas, verdicts: list[Verdict]) -> Layers:
         """The layers of the image."""
-        plan = self.frame.plan
-        size = {"height": plan.height, "width": plan.width, "lists": plan.lists}
-        bound, full = self.run.one("image", spread_over, (tuple(verdicts),), **size, **self._tuned)
+        bound, full = self._over_pixels(verdicts)
         static = {"coarsest": self.sizes.leaf, "estimator": self.sizes.estimator, **self._tuned}
         layers: Layers = self.run.one("image", finish, (canvas, bound, full), **static)
         return layers
@@ -233,9 +309,8 @@ class Refinement:
         return {"tuning": self.frame.plan.cast.tuning}
 
     def _choose(self, canvas: Canvas, decision: Decided, first_row: Array, side: int) -> tuple[Any, ...]:
-        dtype = decision.verdict.bound.dtype
-        tolerance = jnp.asarray(-1, dtype) if self.frame.allowed is None else self.frame.allowed
-        inputs = canvas, decision.schedule.filled, decision.verdict.bound, first_row, tolerance
+        bound = decision.verdict.bound
+        inputs = canvas, decision.schedule.filled, bound, first_row, self._allowed(bound.dtype)
         static = {"lists": self.frame.plan.lists, "side": side, "coarsest": self.sizes.leaf, "estimator": self.sizes.estimator}
         return self.run.one("adapt", choose, inputs, **static, **self._tuned)  # type: ignore[no-any-return]
 

@@ -106,7 +106,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
-    _raise(word, planned)
+    raise_for(word, planned)
     image = assemble(layers, word)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
@@ -119,7 +119,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         stats["rays"] = int(layers.rays)
     clock.mark("image")
     certified = _certifies(plan) and (plan.control is None or float(settings.relax) == 0)
-    metadata = _metadata(camera, settings, certified)
+    metadata = metadata_of(camera, settings, certified)
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats, metadata=metadata)
 
 
@@ -189,14 +189,16 @@ def _certifies(plan: Plan) -> bool:
     return not isinstance(plan.control, PilotPlan) and plan.quadtree is None
 
 
-def _raise(word: int, planned: bool) -> None:
+def raise_for(word: int, planned: bool) -> None:
+    """Raise what faults say; `planned`: whether capacities were made for the frame."""
     if word & faults.OVERFLOWS and not planned:
         raise CapacityError(f"`plan` is too small for this frame: {faults.describe(word)}")
     if word:
         raise ValueError(f"this frame cannot be rendered: {faults.describe(word)}")
 
 
-def _metadata(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
+def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
+    """What a file says of how its image was made."""
     exact = settings.tolerance is None
     return (
         ("jaxsph.version", __version__),

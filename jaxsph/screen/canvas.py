@@ -95,14 +95,14 @@ def wanted_by_tolerance(
     coarser, corners = lattices(light, canvas.known, side, coarsest)[-2:]
     errors = estimator(coarser, corners, canvas.shape, side)
     room = allowed(tolerance, bound, side)
-    split = (errors.largest > room) | _unseen(canvas, corners, side)
+    split = (errors.largest > room) | unseen(canvas, corners, side)
     wanted = pixels_of_nodes(nodes_of_leaves(split, canvas.shape, side // 2), canvas.shape, side // 2)
     if side > 2:
         wanted |= over_pixels(errors.largest > TWICE * room, canvas.shape, side)
     return wanted & ~canvas.known
 
 
-def _unseen(canvas: Canvas, corners: Float[Array, "4 rows columns"], side: int) -> Bool[Array, "rows columns"]:
+def unseen(canvas: Canvas, corners: Float[Array, "4 rows columns"], side: int) -> Bool[Array, "rows columns"]:
     """Leaves that look empty, though rays between their corners may meet something."""
     empty = of_corners(corners[3] == 1, jnp.logical_and)
     pads = [(0, count * side - size) for count, size in zip(empty.shape, canvas.shape, strict=True)]

@@ -36,6 +36,11 @@ class LeafErrors:
     norm: Float[Array, "rows columns"]
     largest: Float[Array, "rows columns"]
 
+    @property
+    def both(self) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+        """Norm and largest."""
+        return self.norm, self.largest
+
 
 class Estimator(abc.ABC):
     """How errors of leaves are estimated."""

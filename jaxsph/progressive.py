@@ -1,0 +1,187 @@
+"""A picture at once, and better ones after it: until the tolerance is met, or every pixel has its ray.
+
+Flow: scene, camera, settings -> plan -> coarse lattice -> [progressive: mark -> cast -> image], again and again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.frame import Frame
+from jaxsph.layers import assemble
+from jaxsph.model.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.executors import Clock, Executor, Forecast
+from jaxsph.numerics.tuning import shards_at_hand
+from jaxsph.planning import PLANS
+from jaxsph.refinement import Decisions, Refinement
+from jaxsph.render import metadata_of, raise_for
+from jaxsph.screen.canvas import Canvas
+from jaxsph.screen.marking import Quality
+from jaxsph.stages import limits_of
+
+SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
+
+
+def progressive(
+    scene: Scene, camera: Camera, settings: Settings | None = None, *, worst: int | None = None, share: float = SHARE
+) -> Progressive:
+    """Render in stages: `for image in jaxsph.progressive(scene, camera, settings): ...`
+
+    The first image is interpolated between the rays of a coarse lattice; each stage splits the leaves of a quadtree that are
+    estimated to be worst, casts the rays that are new, and yields a better image (Kratz et al. 2011, section 5). It ends when no
+    leaf is expected to be over `settings.tolerance`, or without one when every pixel has a ray that is not certain to be empty.
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`; `settings.leaf_pixels` and `leaf_estimator` choose the first leaves and
+            by what leaves are judged; `settings.screen` is taken to be `"quadtree"`.
+        worst: leaves that a stage splits, m of the paper; all with an error as large as the last of them.
+        share: if `worst` is not given, each stage splits as few leaves as hold this share in (0, 1] of the sum of all squared
+            errors.
+
+    Returns:
+        An iterator of images that can be left and gone on with at any time, and begun anew: see `Progressive`.
+
+    Raises:
+        ValueError: for a `worst` < 1, a `share` outside (0, 1], traced arguments, and what `jaxsph.render` raises it for.
+    """
+    if is_traced(scene, camera, settings):
+        raise ValueError("`progressive` shows images as they come and needs concrete arrays; call `jaxsph.render` under jit")
+    if worst is not None and not worst >= 1:
+        raise ValueError(f"`worst` must be at least 1 leaf a stage, got {worst}; None splits by `share`")
+    if not 0 < share <= 1:
+        raise ValueError(f"`share` must lie in (0, 1], got {share}; 1 splits all leaves that are over the tolerance")
+    return Progressive(scene, camera, settings or Settings(), worst, share)
+
+
+class Progressive:
+    """Images of one view, each better than the one before; an iterator that ends when the image is good enough.
+
+    What is known of the image is kept when a stage is interrupted: the next call begins that stage again.
+    `image.stats` of each holds `stage`, `rays` cast so far, `rays_left` at most until every pixel has its own, `l2_error` (the
+    estimated relative L2 norm of the error), `max_error` (the largest error that a pixel is expected to have), `leaves_over`
+    the tolerance, and `seconds` of all stages; `image.error_bound` is the error that each pixel is expected to have.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, settings: Settings, worst: int | None, share: float) -> None:
+        self._scene, self._camera, self._settings = scene, camera, _with_quadtree(settings)
+        self._worst, self._share = worst, share
+        self._state: _State | None = None
+
+    def restart(self, scene: Scene | None = None, camera: Camera | None = None, settings: Settings | None = None) -> Progressive:
+        """Begin anew, with another scene, view or settings if given; for a similar frame nothing is compiled."""
+        self._scene, self._camera = scene or self._scene, camera or self._camera
+        self._settings = self._settings if settings is None else _with_quadtree(settings)
+        self._state = None
+        return self
+
+    def __iter__(self) -> Progressive:
+        return self
+
+    def __next__(self) -> Image:
+        if self._state is None:
+            self._state = _begun(self._scene, self._camera, self._settings, self._worst)
+        elif self._state.done:
+            raise StopIteration
+        else:
+            self._state = self._state.refined(self._worst, self._share)
+        return self._state.image(self._settings)
+
+
+@dataclasses.dataclass(frozen=True)
+class _State:
+    """What is known after a stage."""
+
+    filling: Refinement
+    clock: Clock
+    word: int
+    canvas: Canvas
+    quality: Quality
+    bands: tuple[Decisions, ...]
+    stage: int
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing left to split."""
+        return self.stage > 0 and not float(self.quality.over) > 0
+
+    def refined(self, worst: int | None, share: float) -> _State:
+        """After another stage."""
+        bands, word = self.bands, self.word
+        if not bands:
+            made = [self.filling.decided(row) for row in self._rows]
+            bands = tuple(decisions for decisions, _ in made)
+            word = functools.reduce(operator.or_, (int(grid.lists.faults) for _, grid in made), word)
+            raise_for(word, True)
+        canvas = self.canvas
+        for row, decisions in zip(self._rows, bands, strict=True):
+            canvas, *queues = self.filling.marked(canvas, decisions, row, worst, share)
+            canvas = self.filling.shot(canvas, decisions, *queues)
+        quality = self.filling.judged(canvas, bands)
+        return dataclasses.replace(self, word=word, canvas=canvas, quality=quality, bands=bands, stage=self.stage + 1)
+
+    @property
+    def _rows(self) -> list[Any]:
+        plan = self.filling.frame.plan
+        return [jnp.int32(nth * plan.band_height) for nth in range(plan.bands)]
+
+    def image(self, settings: Settings) -> Image:
+        """What it looks like."""
+        layers = self.filling.finished(self.canvas, [decisions.of_bundles.verdict for decisions in self.bands])
+        image = assemble(layers, self.word)
+        stats: dict[str, Any] = {
+            "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
+            "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
+            "stage": self.stage,
+            "rays": int(self.canvas.rays),
+            "rays_left": int((~self.canvas.known).sum()),
+            "l2_error": float(self.quality.l2),
+            "max_error": float(self.quality.largest),
+            "leaves_over": int(self.quality.over),
+        }
+        self.clock.mark("image")
+        stats["seconds"] = dict(self.clock.seconds)
+        metadata = metadata_of(self.filling.frame.camera, settings, False)
+        return dataclasses.replace(image, certified=False, faults=self.word, stats=stats, metadata=metadata)
+
+
+def _with_quadtree(settings: Settings) -> Settings:
+    return dataclasses.replace(settings, screen="quadtree")
+
+
+def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) -> _State:
+    clock = Clock()
+    plan, seen = PLANS.for_frame(scene, camera, settings, clock)
+    limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
+
+    def filling(run: Executor) -> Refinement:
+        frame = Frame.begun(seen, camera, limits, plan, scene.particle_set.kernel, shards, run)
+        return Refinement.of(frame, run)
+
+    clock.foresee(lambda known: _rehearse(filling(Forecast(known)), worst))
+    begun = filling(clock)
+    canvas, made = begun.begun()
+    word = int(seen.viewed.faults) | int(made.lists.faults)
+    raise_for(word, True)
+    return _State(begun, clock, word, canvas, begun.judged(canvas, ()), (), 0)
+
+
+def _rehearse(filling: Refinement, worst: int | None) -> None:
+    """All that will be run, once."""
+    canvas, _ = filling.begun()
+    filling.judged(canvas, ())
+    filling.finished(canvas, [])
+    decisions, _ = filling.decided(jnp.int32(0))
+    canvas, *queues = filling.marked(canvas, decisions, jnp.int32(0), worst, SHARE)
+    filling.shot(canvas, decisions, *queues)
+    filling.judged(canvas, (decisions,) * filling.frame.plan.bands)
+    filling.finished(canvas, [decisions.of_bundles.verdict] * filling.frame.plan.bands)
