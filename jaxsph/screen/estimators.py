@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.screen.pyramid import at_nodes, corners_of, halved, num_leaves, of_corners
 
-CAUTION = 0.8  # of the largest difference around, how much a leaf may yet be wrong by: `benchmarks/calibrate_screen.py`
+CAUTION = 0.9  # of the largest difference around, how much a leaf may yet be wrong by: `benchmarks/calibrate_screen.py`
 Lattice = Float[Array, "channels rows columns"]
 GAUSS = np.polynomial.legendre.leggauss(3)
 

@@ -19,7 +19,7 @@ from jaxsph.access.lists import BUNDLE, ListPlan
 from jaxsph.field.tasks import RayPackets
 from jaxsph.model.camera import Camera
 
-SCATTERED = 16  # rays of a packet of scattered rays: what is read for a packet took as long as half of a whole bundle's rays
+SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
 
 
 @dataclasses.dataclass(frozen=True)
