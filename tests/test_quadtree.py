@@ -23,7 +23,8 @@ ROUNDING = 1e-6
 def screened(frames):
     """Settings and plan of a quadtree for all random frames, whose rays are cast in several turns."""
     coarse = QuadtreePlan(8, "hierarchical", ListPlan(1, 1, 4 * frames.capacity, 16 * frames.capacity), 3)
-    return dataclasses.replace(frames.settings, **QUADTREE), dataclasses.replace(frames.plan(), screen="quadtree", quadtree=coarse)
+    plan = dataclasses.replace(frames.plan(), screen="quadtree", quadtree=coarse)
+    return dataclasses.replace(frames.settings, **QUADTREE), plan
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,8 @@ def cloud(frames, rng, supports=5.0, extinction=0.4):
     scene = frames.scene(rng)
     particles = dataclasses.replace(scene.particles, support=jnp.full(frames.capacity, supports, jnp.float32))
     points = np.linspace(0, 1, 5)
-    transfer = js.TransferFunction.from_points(points, np.stack([points, 0.5 + 0 * points, 1 - points], 1), 0 * points + extinction)
+    colors = np.stack([points, 0.5 + 0 * points, 1 - points], 1)
+    transfer = js.TransferFunction.from_points(points, colors, np.full(5, extinction))
     return js.Scene(particles=particles, transfer=transfer)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from dataclasses import replace as dataclasses_replace
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,8 @@ from jaxsph.field.gather import gather
 from jaxsph.field.scattered import gather_scattered
 from jaxsph.field.schedule import full_rate
 from jaxsph.field.tasks import RayPackets, SlabTask
+from jaxsph.numerics.fusion import barriers
+from jaxsph.numerics.tuning import CPU
 from jaxsph.screen.packets import SCATTERED
 
 RAYS = BUNDLE * BUNDLE
@@ -37,15 +39,9 @@ def apart(grid, camera):
     return RayPackets(u, v, bundle, jnp.arange(u.shape[1]) < number * len(parts), scattered=True)
 
 
-def as_dense(value, number):
-    """(..., packets, 1, 16) as (..., bundles, 64): rays by row and column."""
-    value = np.moveaxis(np.asarray(value)[..., : 4 * number, 0, :].reshape(*value.shape[:-3], 4, number, SCATTERED), -3, -2)
-    return value.reshape(*value.shape[:-2], RAYS)
-
-
-@functools.partial(jax.jit, static_argnames="kernel")
-def both_sums(grid, camera, reference, *, kernel):
-    """Of the first slabs of all bundles, four samples each."""
+@functools.partial(jax.jit, static_argnames=("kernel", "scattered"))
+def sums(grid, camera, reference, *, kernel, scattered):
+    """Of a slab in the middle of each bundle, of four samples."""
     bundles = grid.row.shape[0]
     depth = jnp.broadcast_to(grid.half_steps[1::2][16:20], (bundles, 4))
     border = jnp.broadcast_to(grid.half_steps[::2][16:21], (bundles, 5))
@@ -53,13 +49,15 @@ def both_sums(grid, camera, reference, *, kernel):
     every = jnp.arange(bundles, dtype=jnp.int32)
 
     def task(packets):
-        return SlabTask(entry, 0 * every + 4, every, packets.u.T, packets.v.T, depth, border, camera.is_perspective, packets.scattered)
+        where = packets.u.T, packets.v.T, depth, border
+        return SlabTask(entry, 0 * every + 4, every, *where, camera.is_perspective, packets.scattered)
 
-    packets = dense(grid, camera)
-    u, v = jnp.tile(packets.u, (BUNDLE, 1)), jnp.repeat(packets.v, BUNDLE, 0)
-    scattered = RayPackets(u, v, scattered=True)
-    where = grid.ordered, grid.lists.rank
-    return gather(*where, task(packets), kernel).all, gather_scattered(*where, task(scattered), kernel).all
+    packets, sum_up = dense(grid, camera), gather
+    if scattered:
+        u, v = jnp.tile(packets.u, (BUNDLE, 1)), jnp.repeat(packets.v, BUNDLE, 0)
+        packets, sum_up = RayPackets(u, v, scattered=True), gather_scattered
+    with barriers(CPU.fusion_barriers):
+        return sum_up(grid.ordered, grid.lists.rank, task(packets), kernel).all
 
 
 @pytest.mark.parametrize(("kernel", "projection"), [("poly6", "perspective"), ("wendland_c2", "orthographic")])
@@ -67,15 +65,11 @@ def test_sums_are_those_of_tensor_products_bit_for_bit(frames, stages, kernel, p
     for seed in range(3):
         rng = np.random.default_rng(seed)
         scene, camera = frames.scene(rng, kernel), frames.camera(rng, projection)
-        products, found = both_sums(*args(stages(scene.particles, camera, plan=frames.plan()), camera), kernel=kernel)
+        grid, reference = stages(scene.particles, camera, plan=frames.plan())
+        products, found = (sums(grid, camera, reference, kernel=kernel, scattered=apart) for apart in (False, True))
         for one, other in zip(products, found, strict=True):
             np.testing.assert_array_equal(np.asarray(one).reshape(*one.shape[:2], -1), other[:, :, 0])
         assert np.asarray(products[0]).any()
-
-
-def args(made, camera):
-    grid, reference = made
-    return grid, camera, reference
 
 
 def test_light_and_cotangents_are_those_of_tensor_products(frames, stages, x64):
@@ -88,8 +82,8 @@ def test_light_and_cotangents_are_those_of_tensor_products(frames, stages, x64):
     cotangent = rng.normal(size=(4, number, RAYS))
 
     def seen(packets_of, cotangent, columns, half_steps, half_height, transfer):
-        looking = dataclasses_replace(camera, half_height=half_height)
-        there = dataclasses_replace(grid, ordered=dataclasses_replace(grid.ordered, **columns), half_steps=half_steps)
+        looking = dataclasses.replace(camera, half_height=half_height)
+        there = dataclasses.replace(grid, ordered=dataclasses.replace(grid.ordered, **columns), half_steps=half_steps)
         method = CastMethod("poly6", plan.cast, PointSamples(), packets_of)
         rays = cast(there, schedule, looking, transfer, (), method)
         layers = jnp.concatenate([rays.color, rays.transmittance[None]])
