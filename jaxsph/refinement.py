@@ -50,6 +50,11 @@ class Shot(NamedTuple):
     value: Float[Array, "packets rays 6"]
     spent: Float[Array, "packets rays"]
 
+    def nowhere(self, pixels: int) -> Shot:
+        """As many rays beyond the last of so many pixels."""
+        pixel, *others = (jnp.zeros(part.shape, part.dtype) for part in self)
+        return Shot(pixel + pixels, *others)
+
 
 class Decisions(NamedTuple):
     """How rays of a band are marched: those of whole bundles, and single ones, for which no lattice of nodes serves."""
@@ -293,9 +298,9 @@ class Refinement:
 
     def shot(self, canvas: Canvas, decisions: Decisions, scattered: Queue, whole: Queue) -> Canvas:
         """With the rays cast that are queued."""
-        shots = self._shoot("scattered", scattered, decisions.grid, decisions.of_rays.schedule, None)
-        shots += self._shoot("whole", whole, decisions.grid, decisions.of_bundles.schedule, decisions.lattice)
-        return self._paint(canvas, shots)
+        apart = self._shoot("scattered", scattered, decisions.grid, decisions.of_rays.schedule, None)
+        whole_ones = self._shoot("whole", whole, decisions.grid, decisions.of_bundles.schedule, decisions.lattice)
+        return self._paint(self._paint(canvas, apart), whole_ones)
 
     def finished(self, canvas: Canvas, verdicts: list[Verdict]) -> Layers:
         """The layers of the image."""
@@ -336,11 +341,13 @@ class Refinement:
         ]
 
     def _paint(self, canvas: Canvas, shots: list[Shot]) -> Canvas:
-        """In groups of few sizes, as each is a program."""
-        while shots:
-            some = 1 << (min(len(shots), MAX_SHOTS).bit_length() - 1)
-            canvas = self.run.one("adapt", paint, (canvas, tuple(shots[:some])), **self._tuned)
-            shots = shots[some:]
+        """In groups of one size, as each size is a program: filled up with such as paint nothing."""
+        plan = self.frame.plan
+        size = min(-(-plan.lists.num_bundles // shots[0].pixel.shape[0]), MAX_SHOTS) if shots else 1
+        for first in range(0, len(shots), size):
+            some = shots[first : first + size]
+            room = (some[0].nowhere(plan.width * plan.height),) * (size - len(some))
+            canvas = self.run.one("adapt", paint, (canvas, (*some, *room)), **self._tuned)
         return canvas
 
 

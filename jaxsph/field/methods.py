@@ -29,15 +29,16 @@ class SlabMethod(Protocol):
         ...
 
 
-def methods_of(grid: Grid, kernel: str, lattice: Lattice | None) -> list[SlabMethod]:
-    """In the order of `schedule.DENSE`, `SUBSAMPLED`, `INTERPOLATED` and on; without a lattice, the first alone."""
-    dense = functools.partial(_from_all_particles, grid, kernel=kernel)
+def methods_of(grid: Grid, kernel: str, lattice: Lattice | None, scattered: bool) -> list[SlabMethod]:
+    """In the order of `schedule.DENSE`, `SUBSAMPLED`, `INTERPOLATED` and on; without a lattice, the first alone.
+
+    Args:
+        scattered: whether rays are no tensor product.
+    """
+    from_all = gather_scattered if scattered else gather
+    dense = functools.partial(from_all, grid.ordered, grid.lists.rank, kernel=kernel)
     if lattice is None:
         return [dense]
     subsampled = functools.partial(gather_subsampled, grid.ordered, grid.lists.rank, kernel=kernel)
     interpolated = functools.partial(interpolate_slabs, lattice, grid)
     return [dense, subsampled, *(functools.partial(interpolated, level=level) for level in range(MAX_SPACING_LEVEL + 1))]
-
-
-def _from_all_particles(grid: Grid, task: SlabTask, *, kernel: str) -> Sums:
-    return (gather_scattered if task.scattered else gather)(grid.ordered, grid.lists.rank, task, kernel)

@@ -77,7 +77,7 @@ class ParticleMedium(Medium):
 
     def gather(self, task: SlabTask) -> Sums:
         """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule."""
-        methods = methods_of(self.grid, self.kernel, self.lattice)
+        methods = methods_of(self.grid, self.kernel, self.lattice, task.scattered)
         if len(methods) == 1 or task.entry.method is None:
             return methods[0](task)
         # a dummy has any method, and drops what it finds

@@ -3,7 +3,8 @@
 Flow: schedule -> [scattered] -> media.
 
 As `gather`, in the same order of operations, so that a ray is the same bit for bit in whichever packet it is cast. Nothing of the
-squared distance is shared by rays of a row or a column, so it is computed where it is added, instead of being stored.
+squared distance is shared by rays of a row or a column, so it is computed where it is added, instead of being stored: but rounded
+as if it were, as a compiler may contract a square and what it is added to into one operation.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTas
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
     windows, reference = (entry.begin[..., None], entry.length[..., None]), (entry.reference_quantity[:, None],)
-    smooth = kernels.by_name(kernel)
+    smooth, largest = kernels.by_name(kernel), jnp.finfo(s.dtype).max
 
     def fetched(index: Array) -> Block:
         return fetch(ordered, rank, windows, index, reference)[1]
@@ -38,7 +39,7 @@ def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTas
         channels = list(sums.all)
         for k in range(BLOCK):
             one = jax.tree.map(lambda column, k=k: column[:, k, None, None], block)
-            across = ((su - one.x) * one.scale) ** 2
+            across = jnp.minimum(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
             along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
             w = smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp)
             channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], one.quantities, strict=True))]

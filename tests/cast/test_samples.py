@@ -21,19 +21,19 @@ TASKS, SAMPLES, ROWS, COLUMNS = 5, 4, 3, 2
 class Given(Medium):
     """Optics at samples as given: red, green, blue and extinction."""
 
-    optics: jax.Array
+    given: jax.Array
 
     def occupied(self, slabs):
         raise NotImplementedError
 
     def extinction(self, gathered, task):
-        return self.optics[3], ()
+        return self.given[3], ()
 
     def colors(self, samples, task, channels):
-        return list(self.optics)[channels]
+        return list(self.given)[channels]
 
 
-jax.tree_util.register_dataclass(Given, data_fields=["optics"], meta_fields=[])
+jax.tree_util.register_dataclass(Given, data_fields=["given"], meta_fields=[])
 
 
 def task(rng, perspective):

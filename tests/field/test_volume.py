@@ -51,7 +51,7 @@ def particles():
     ("projection", "parts"),
     [
         ("perspective", "both"),
-        ("orthographic", "volume"),
+        pytest.param("orthographic", "volume", marks=pytest.mark.slow),
         pytest.param("perspective", "volume", marks=pytest.mark.slow),
         pytest.param("orthographic", "both", marks=pytest.mark.slow),
     ],
@@ -65,6 +65,7 @@ def test_an_image_is_that_of_the_reference(compare, projection, parts):
         assert image.stats["evaluations"] == 0
 
 
+@pytest.mark.slow
 def test_bytes_are_kept_and_show_what_their_floats_do():
     data = (255 * FIELD).astype(np.uint8)
     volume = js.Volume.from_array(data, LOWER, SPACING)
@@ -83,6 +84,7 @@ def test_a_scene_of_float64_is_rendered_in_float64(x64):
     assert np.abs(np.asarray(image.color) - truth.color).max() < 2e-5  # the camera is float32
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(x64):
     """By values and extinction, in reverse mode."""
     shown, view = scene(FIELD.astype(np.float64)), camera(width=8, height=8)
