@@ -77,7 +77,7 @@ class Frame:
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
         inputs = self.grid, self.camera, self.transfer, (), schedule, self.lattice, jnp.int32(0)
-        how = {"integrator": self.plan.integrator, "screen": self.plan.screen, "kernel": self.kernel}
+        how = {"integrator": self.plan.chosen_integrator, "screen": self.plan.screen, "kernel": self.kernel}
         rays = cast_shard(*inputs, shards=1, cast_plan=self.plan.cast, **how, **self.sizes).rays
         return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
 

@@ -114,7 +114,7 @@ class Frame:
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
         scene = (grid, camera or self.camera, self.transfer, self.media)
         inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
-        method = {"cast_plan": plan.cast, "integrator": plan.integrator, "screen": plan.screen, "kernel": self.kernel}
+        method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "kernel": self.kernel}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays
 
@@ -124,7 +124,7 @@ class Frame:
 
     @property
     def _halo(self) -> int:
-        return int(registry.integrator(self.plan.integrator).halo)
+        return int(registry.integrator(*self.plan.chosen_integrator).halo)
 
     @property
     def _cast(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ a reused plan raises a fault.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from jaxsph.measures import Measures
 from jaxsph.memory_estimate import frame_bytes
 from jaxsph.model.camera import Camera, num_nodes
 from jaxsph.model.particles import capacity_class
+from jaxsph.model.registry import AT_POINTS
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
@@ -51,6 +53,7 @@ class Plan:
         control: static choices of error control; None renders at full rate.
         integrator, screen: names of how samples become light, and of which rays are cast.
         quadtree: sizes of its refinement, where rays are chosen by one.
+        step_tolerance: of integrators that have one; None of others.
     """
 
     width: int
@@ -66,6 +69,12 @@ class Plan:
     integrator: str = "samples"
     screen: str = "pixels"
     quadtree: QuadtreePlan | None = None
+    step_tolerance: float | None = None
+
+    @property
+    def chosen_integrator(self) -> tuple[Any, ...]:
+        """Its name and what it is made with, for `registry.integrator`."""
+        return (self.integrator,) if self.step_tolerance is None else (self.integrator, self.step_tolerance, self.samples)
 
     @property
     def band_height(self) -> int:
@@ -99,6 +108,7 @@ class Plan:
             "settings.samples": (settings.samples, self.samples),
             "settings.integrator": (settings.integrator, self.integrator),
             "settings.screen": (settings.screen, self.screen),
+            "settings.step_tolerance": (_step_tolerance(settings), self.step_tolerance),
         }
         if self.quadtree is not None:
             given["settings.leaf_pixels"] = (settings.leaf_pixels, self.quadtree.leaf)
@@ -237,7 +247,12 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     needed = frame_bytes(size, shape.num_classes, lists, cast, control, shape.number)
     quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
     method = control, settings.integrator, settings.screen, quadtree
-    return Plan(*size, shape.num_classes, bands, lists, cast, needed, *method)
+    return Plan(*size, shape.num_classes, bands, lists, cast, needed, *method, step_tolerance=_step_tolerance(settings))
+
+
+def _step_tolerance(settings: Settings) -> float | None:
+    """That of integrators that have one, so that plans of others are the same whatever it is."""
+    return float(settings.step_tolerance) if settings.integrator in AT_POINTS else None
 
 
 def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, lists: ListPlan) -> QuadtreePlan:
@@ -336,9 +351,12 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     """Settings of error control along rays: without a tolerance where only the screen can keep it.
 
     Raises:
-        ValueError: where a scene lacks a part, or a tolerance is asked for that nothing can keep.
+        ValueError: where a scene lacks a part, holds a medium that its integrator cannot ask for points, or a tolerance is asked
+            for that nothing can keep.
     """
     scene.check()
+    if settings.integrator in AT_POINTS:
+        _require_points(scene, settings.integrator)
     if settings.tolerance is None:
         return settings
     beyond = {
@@ -354,3 +372,15 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
     return settings
+
+
+def _require_points(scene: Scene, integrator: str) -> None:
+    """Raise where a medium cannot tell its optics at any point."""
+    refused = [type(medium).__name__ for medium in scene.media if not medium.at_points]
+    if scene.particles is not None:
+        refused = ["Scene(particles=...)", *refused]
+    if refused:
+        raise ValueError(
+            f"`integrator={integrator!r}` asks media for points of its own choosing, which `{refused[0]}` cannot answer; "
+            "give `integrator='samples'`, leave that out, or make a volume of particles by `jaxsph.resample`"
+        )

@@ -175,14 +175,14 @@ def shoot(
     packets: int,
     kind: str,
     cast_plan: CastPlan,
-    integrator: str,
+    integrator: tuple[Any, ...],
     kernel: str,
     tuning: Tuning,
 ) -> Shot:
     """Cast the rays of so many bundles of a queue."""
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     pick, packets_of = KINDS[kind]
-    chosen, made = pick(queue, first, packets), registry.integrator(integrator)
+    chosen, made = pick(queue, first, packets), registry.integrator(*integrator)
     rays = cast(grid, schedule, camera, transfer, media, CastMethod(kernel, cast_plan, made, packets_of), lattice, chosen)
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
@@ -333,7 +333,7 @@ class Refinement:
         scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue
         inputs = [(*scene, jnp.int32(turn * packets)) for turn in range(turns)]
         static = {"shape": (plan.height, plan.width), "packets": packets, "kind": kind, "cast_plan": cast_plan}
-        method = {"integrator": plan.integrator, "kernel": frame.kernel, **self._tuned}
+        method = {"integrator": plan.chosen_integrator, "kernel": frame.kernel, **self._tuned}
         return [
             shot
             for first in range(0, turns, frame.shards)

@@ -304,7 +304,7 @@ def cast_shard(
     *,
     shards: int,
     cast_plan: CastPlan,
-    integrator: str,
+    integrator: tuple[Any, ...],
     screen: str,
     kernel: str,
     tuning: Tuning,
@@ -314,7 +314,7 @@ def cast_shard(
     of_nodes = None if lattice is None else lattice.evaluations
     if lattice is not None:
         schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
-    made = registry.integrator(integrator)
+    made = registry.integrator(*integrator)
     method = CastMethod(kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets)
     grid = shard_of_grid(grid, nth, shards)
     rays = cast(grid, schedule, camera, transfer, media, method, lattice)

@@ -37,7 +37,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium, mixed
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.fusion import barriers, fusion_barrier
-from jaxsph.numerics.transposed import linear_map
+from jaxsph.numerics.transposed import forward_only, linear_map
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
@@ -99,7 +99,7 @@ def cast(
 
     Raises:
         NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
-            elsewhere; and when differentiated twice.
+            elsewhere; when differentiated twice; and in reverse mode, of integrators that are `forward_only`.
     """
     columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
@@ -162,7 +162,10 @@ def _moved(
         cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, (found.color, found.transmittance), cotangent))
         return [cotangents[i] for i in moving]
 
-    like = found.color, found.transmittance
+    like, why = (found.color, found.transmittance), method.integrator.forward_only
+    if why is not None:
+        color, transmittance = forward_only(push([moves[i] for i in moving]), why)
+        return found, dataclasses.replace(still, color=color, transmittance=transmittance)
     color, transmittance = linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE)
     return found, dataclasses.replace(still, color=color, transmittance=transmittance)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -42,9 +42,11 @@ class Integrator(abc.ABC):
     Attributes:
         halo: 0 where samples are the middles of what they stand for; 1 where they lie on the borders, both ends included, so that
             neighbouring slabs share one.
+        forward_only: what is said where reverse mode is asked for; None where there is that.
     """
 
-    halo: int = 0
+    halo: ClassVar[int] = 0
+    forward_only: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:

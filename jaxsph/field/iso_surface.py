@@ -52,6 +52,7 @@ class IsoSurface(Medium):
         fault: fault word.
     """
 
+    at_points = False  # a surface lies between points, and no step is short enough to resolve it
     volume: Volume | None
     level: Float[Array, ""]
     color: Float[Array, "3"]

@@ -65,6 +65,7 @@ class ParticleMedium(Medium):
         wanted: cotangents that `pull` is to find.
     """
 
+    at_points = False  # lists are of slabs
     grid: Grid
     segments: Segments
     lattice: Lattice | None

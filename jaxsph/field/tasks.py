@@ -111,6 +111,19 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
+    def one_by_one(self) -> SlabTask:
+        """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
+        rays, u, v = self.shape[2], self.u, self.v
+        if not self.scattered:
+            both = self.v.shape[1], self.u.shape[1]
+            u = jnp.broadcast_to(self.u[:, None, :], (self.u.shape[0], *both))
+            v = jnp.broadcast_to(self.v[:, :, None], (self.v.shape[0], *both))
+        entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, rays, axis=-1), self.entry)
+        slab, bundle, depth, border = (
+            jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
+        )
+        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, scattered=True)
+
 
 jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])
 jax.tree_util.register_dataclass(

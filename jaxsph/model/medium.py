@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,13 @@ class Medium(abc.ABC):
     """A participating medium that emits and absorbs.
 
     Positions are in view space (length units): x right, y up, z forward from the eye.
+
+    Attributes:
+        at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
+            points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
     """
+
+    at_points: ClassVar[bool] = True
 
     def seen_by(self, camera: Camera) -> Medium:
         """The medium in view space; by default as it is."""

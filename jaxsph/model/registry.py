@@ -11,15 +11,17 @@ import functools
 import importlib
 from typing import Any
 
-INTEGRATORS = {"samples": "jaxsph.cast.samples:PointSamples"}
-"""Classes without arguments, each a `jaxsph.cast.integrator.Integrator`."""
+INTEGRATORS = {"samples": "jaxsph.cast.samples:PointSamples", "step_doubling": "jaxsph.cast.step_doubling:StepDoubling"}
+"""Classes without arguments, each a `jaxsph.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
+AT_POINTS = {"step_doubling"}
+"""Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
 SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel", "quadtree": "jaxsph.screen.quadtree:Quadtree"}
 """Classes without arguments, each a `jaxsph.screen.sampler.ScreenSampler`."""
 
 
-def integrator(name: str) -> Any:
-    """The integrator of that name: one object a process, so that it may be static in what is compiled."""
-    return _made(INTEGRATORS[name])
+def integrator(name: str, *arguments: Any) -> Any:
+    """The integrator of that name, made with arguments if it takes any: one object a process, so that it may be static."""
+    return _made(INTEGRATORS[name], *arguments)
 
 
 def screen(name: str) -> Any:
@@ -28,6 +30,6 @@ def screen(name: str) -> Any:
 
 
 @functools.cache
-def _made(entry: str) -> Any:
+def _made(entry: str, *arguments: Any) -> Any:
     module, _, name = entry.partition(":")
-    return getattr(importlib.import_module(module), name)()
+    return getattr(importlib.import_module(module), name)(*arguments)

@@ -35,7 +35,11 @@ class Settings:
             does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict
             form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
-            (Hochstetter et al. 2016, section 2.2).
+            (Hochstetter et al. 2016, section 2.2); `"step_doubling"` takes steps of at most a sample, and halves those that two
+            halves disagree with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
+        step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
+            ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs
+            are compiled for it.
         screen: which rays are cast; `"pixels"` gives every pixel its own, `"quadtree"` interpolates between rays where the image
             is expected to stay within the tolerance (Kratz et al. 2011): an estimate, which rays and interpolation share. Without
             a tolerance all leaves are split down to pixels.
@@ -54,6 +58,7 @@ class Settings:
     merge: bool = True
     allocation: str = "budget"
     integrator: str = "samples"
+    step_tolerance: float = 1e-3
     screen: str = "pixels"
     leaf_pixels: int = 8
     leaf_estimator: str = "hierarchical"
@@ -75,6 +80,11 @@ class Settings:
         for name, known in (("integrator", INTEGRATORS), ("screen", SCREENS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+        step = self.step_tolerance
+        if isinstance(step, bool) or not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
+            raise ValueError(
+                f"`step_tolerance` must be a Python number > 0 and finite, got {step!r}; it is fixed when a program is compiled"
+            )
         if self.leaf_pixels not in LEAF_PIXELS:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.leaf_estimator not in LEAF_ESTIMATORS:
@@ -100,6 +110,7 @@ jax.tree_util.register_dataclass(
         "merge",
         "allocation",
         "integrator",
+        "step_tolerance",
         "screen",
         "leaf_pixels",
         "leaf_estimator",

@@ -13,6 +13,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import linear_call
 from jaxtyping import Array
 
 Result = TypeVar("Result")
@@ -58,6 +59,20 @@ def linear_map(
 
     found: Result = lax.custom_linear_solve(matrix, (moves, tied(moves, [])), solve, solve_transposed)[1]
     return found
+
+
+def forward_only(moves: Result, why: str) -> Result:
+    """`moves`, a pytree of tangents that nothing transposes.
+
+    Raises:
+        NotImplementedError: saying `why`, in reverse mode; and JAX's own under `vmap`.
+    """
+
+    def refuse(_: object, __: object) -> Result:
+        raise NotImplementedError(why)
+
+    refused: Result = linear_call(lambda _, moves: moves, refuse, (), moves)
+    return refused
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
