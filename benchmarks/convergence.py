@@ -13,6 +13,7 @@ ends in asserts.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import pathlib
 import statistics
@@ -48,7 +49,7 @@ Record = dict[str, Any]
 
 def rays_for(curve: list[Record], goal: float = GOAL, key: str = "error") -> float | None:
     """Rays at which an error is reached, interpolated (in logarithms) between the stages around it."""
-    for before, after in zip(curve, curve[1:], strict=False):
+    for before, after in itertools.pairwise(curve):
         if before[key] > goal >= after[key]:
             share = np.log(before[key] / goal) / np.log(before[key] / after[key])
             return float(before["rays"] * (after["rays"] / before["rays"]) ** share)
@@ -181,10 +182,10 @@ def check(records: list[Record]) -> list[str]:
     wrong = []
     for record in records:
         curves = record["curves"]
-        for grid in curves["uniform"]:
-            if curves["hierarchical"][0]["rays"] < grid["rays"] <= curves["hierarchical"][-1]["rays"]:
-                if error_at(curves["hierarchical"], grid["rays"]) >= grid["error"]:
-                    wrong.append(f"{record['field']}: {grid['rays']:.0f} uniform rays are as good as adaptive ones")
+        adaptive = curves["hierarchical"]
+        between = [grid for grid in curves["uniform"] if adaptive[0]["rays"] < grid["rays"] <= adaptive[-1]["rays"]]
+        if any(error_at(adaptive, grid["rays"]) >= grid["error"] for grid in between):
+            wrong.append(f"{record['field']}: uniform rays are as good as adaptive ones")
         if record["field"] == "ramp":
             beyond = [stage for stage in curves["hierarchical"] if stage["rays"] > INITIAL**2]
             if any(stage["error"] >= error_at(curves["corner_variance"], stage["rays"]) for stage in beyond):
