@@ -234,52 +234,59 @@ def convergence(found: dict) -> str:
     """Rays for an error: the graphs of Kratz et al. 2011, and the iterations of their section 7.4."""
     rows, leaves = [], []
     for record in found["fields"]:
-        uniform, variance, hierarchical = (record["rays"][kind] for kind in ("uniform", "corner_variance", "hierarchical"))
-        fewer = [number(uniform / rays if uniform and rays else None, ".1f") for rays in (variance, hierarchical)]
+        reached = [record["rays"][kind] for kind in ("uniform", "corner_variance", "hierarchical")]
+        least = "" if reached[0] else "> "
+        most = reached[0] or record["curves"]["uniform"][-1]["rays"]
+        fewer = [least + number(most / rays, ".1f") if rays else "-" for rays in reached[1:]]
+        rays = [least + number(most, ",.0f"), *(number(some, ",.0f") for some in reached[1:])]
         curved = record["parabolas"]
         gains = [number(100 * (1 - curved[kind] / curved["error"]), ".1f") if curved else "-" for kind in ("smoothed", "best")]
-        rays = [number(rays, ",.0f") for rays in (uniform, variance, hierarchical)]
         rows.append([record["field"], *rays, *fewer, *gains])
-        if record["leaves"]:
-            about = record["leaves"]
+        if about := record["leaves"]:
             index = [number(about["index"][k], ".2f") for k in (0, 2, 4)]
             leaves.append([record["field"], number(about["spearman"], ".2f"), *index, number(about["whole"], ".2f")])
-    size, timed = found["fields"][0]["size"], found["timed"]
-    stages, spent = timed["stages"], timed["stages"][-1]["spent"]
-    total, later = sum(stage["seconds"] for stage in stages), [stage["seconds"] for stage in stages[1:]]
-    shares = ", ".join(f"{name} {100 * seconds / sum(spent.values()):.0f} %" for name, seconds in spent.items())
-    goal, run = found["goal"], found["run"]
+    size, goal, run = found["fields"][0]["size"], found["goal"], found["run"]
     header = "field", "uniform", "variance of corners", "hierarchical", "uniform / variance", "uniform / hierarchical"
     return f"""## Fewer rays: the quadtree
 After section 7 of Kratz et al. 2011. Relative L2 error of colours (their equation 11) against rays: leaves split by the
 hierarchical estimator, by the variance of their corners (Levoy 1990), and plain uniform grids. The truth is an image of
-{size} x {size} pixels and {found["samples"]} samples a ray; refinement is simulated on it, by the same marking that renders, where no
-pixel is known to be empty and no bundle is cast whole. {run["device"]}, {run["cores"]} cores, jax {run["jax"]}.
+{size} x {size} pixels and {found["samples"]} samples a ray; refinement is simulated on it, by the same marking that renders,
+where no pixel is known to be empty and no bundle is cast whole. {run["device"]}, {run["cores"]} cores, jax {run["jax"]}.
 
 ![Error against rays](../benchmarks/results/convergence/rays.png)
 
-Rays for an error of {100 * goal:g} %. The last columns are how many per cent of the hierarchical estimator's rays would be saved if
-smooth leaves were biquadratic: those that are smooth by their errors, and those that really gain.
+Rays for an error of {100 * goal:g} %. The last columns are how many per cent of the hierarchical estimator's rays would be saved
+if smooth leaves were biquadratic: those that are smooth by their errors, and those that really gain.
 
 {table((*header, "smooth, %", "best, %"), rows)}
 
-Estimated over true error of leaves where {100 * goal:g} % is reached: rank correlation, effectivity index at 1, 50 and 99 % of the
-leaves that matter (0.1 % of the largest error or more), and that of the whole image.
+Estimated over true error of leaves where {100 * goal:g} % is reached: rank correlation, effectivity index at 1, 50 and 99 % of
+the leaves that matter (0.1 % of the largest error or more), and that of the whole image.
 
 ![Estimated against true error of leaves](../benchmarks/results/convergence/leaves.png)
 
 {table(("field", "rank correlation", "1 %", "50 %", "99 %", "whole image"), leaves)}
 
-Section 7.4 of the paper, on the mixing layer: from 256 x 256 rays, {found["worst"]} leaves an iteration, to an error of {goal:g}. The paper
-takes 7 iterations; here it is {len(found["iterations"]) - 1} on paper at {size} x {size}. Rendered for real at
-{timed["size"]} x {timed["size"]}: {len(stages) - 1} iterations, the first lattice in {stages[0]["seconds"]:.2f} s, then
-{sorted(later)[len(later) // 2]:.2f} s each, {total:.2f} s in all; an image whose every pixel has a ray takes {timed["every_pixel"]:.2f} s.
-Of the time: {shares} (`adapt` is estimator and marking, `image` reconstruction).
-Rendered iterations cast more rays than simulated ones: leaves that look empty and may not be come first, and bundles of which more
-than sixteen rays are wanted are cast whole.
-
-![Iterations of a real image](../benchmarks/results/convergence/iterations.png)
+{iterations(found)}
 """
+
+
+def iterations(found: dict) -> str:
+    """Section 7.4 of Kratz et al. 2011."""
+    size, timed = found["fields"][0]["size"], found["timed"]
+    stages, spent = timed["stages"], timed["stages"][-1]["spent"]
+    total, later = sum(stage["seconds"] for stage in stages), sorted(stage["seconds"] for stage in stages[1:])
+    shares = ", ".join(f"{name} {100 * seconds / sum(spent.values()):.0f} %" for name, seconds in spent.items())
+    seconds = f"the first lattice in {stages[0]['seconds']:.2f} s, then {later[len(later) // 2]:.2f} s each"
+    return f"""Section 7.4 of the paper, on the mixing layer: from 256 x 256 rays, {found["worst"]} leaves an iteration, to an
+error of {found["goal"]:g}. The paper takes 7 iterations; here it is {len(found["iterations"]) - 1} on paper at {size} x {size}.
+Rendered for real at {timed["size"]} x {timed["size"]} it is {len(stages) - 1}: {seconds},
+{total:.2f} s in all; an image whose every pixel has a ray takes {timed["every_pixel"]:.2f} s.
+Of the time: {shares} (`adapt` is estimator and marking, `image` reconstruction).
+Rendered iterations cast more rays than simulated ones: leaves that look empty and may not be come first, and bundles of which
+more than sixteen rays are wanted are cast whole.
+
+![Iterations of a real image](../benchmarks/results/convergence/iterations.png)"""
 
 
 SECTIONS: dict[str, Callable[[dict], str]] = {
