@@ -1,8 +1,8 @@
 """Claim: on volumes step doubling errs less on average than as many uniform samples, at some tolerance of each.
 
-The three made volumes of `jaxsph.scenes.fields` are rendered by uniform samples and by step doubling; errors are of colours, to an
-image of very many uniform samples. What is counted is how often a ray asks its media, over all rays: uniform samples of slabs that
-are not marched count nothing, as step doubling does not march them either. Times are medians of the cast, in turns. Writes
+The three made volumes of `jaxsph.scenes.fields` are rendered by uniform samples and by step doubling; errors are of colours, to
+an image of very many uniform samples. What is counted is how often a ray asks its media, over all rays: uniform samples of slabs
+that are not marched count nothing, as step doubling does not march them either. Times are medians of the cast, in turns. Writes
 `results/step_doubling.json`; ends in an assert on mean errors.
 
     python benchmarks/step_doubling.py [--points 64] [--size 64] [--repeats 3]
