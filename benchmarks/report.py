@@ -284,7 +284,7 @@ Rendered for real at {timed["size"]} x {timed["size"]} it is {len(stages) - 1}: 
 {total:.2f} s in all; an image whose every pixel has a ray takes {timed["every_pixel"]:.2f} s.
 Of the time: {shares} (`adapt` is estimator and marking, `image` reconstruction).
 Rendered iterations cast more rays than simulated ones: leaves that look empty and may not be come first, and bundles of which
-more than sixteen rays are wanted are cast whole.
+more than eight rays are wanted are cast whole.
 
 ![Iterations of a real image](../benchmarks/results/convergence/iterations.png)"""
 
