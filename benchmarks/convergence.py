@@ -215,9 +215,11 @@ def main() -> None:
     rendered = timed(arguments.timed_size)
     found = {"run": of_this_run(), "samples": SAMPLES, "goal": GOAL, "worst": WORST}
     found |= {"fields": records, "iterations": on_paper, "timed": rendered}
+    convergence_figures.draw(found, images, arguments.output.with_suffix(""))
+    for record in records:
+        (record["leaves"] or {}).pop("sample", None)  # a figure shows it
     with written_whole(arguments.output) as temporary:
         temporary.write_text(json.dumps(rounded(found), indent=1) + "\n")
-    convergence_figures.draw(found, images, arguments.output.with_suffix(""))
     print(table(records))
     each = statistics.median(stage["seconds"] for stage in rendered["stages"][1:])
     total = sum(stage["seconds"] for stage in rendered["stages"])
