@@ -215,13 +215,16 @@ def main() -> None:
     rendered = timed(arguments.timed_size)
     found = {"run": of_this_run(), "samples": SAMPLES, "goal": GOAL, "worst": WORST}
     found |= {"fields": records, "iterations": on_paper, "timed": rendered}
+    convergence_figures.draw(found, images, arguments.output.with_suffix(""))
+    for record in records:
+        (record["leaves"] or {}).pop("sample", None)  # a figure shows it
     with written_whole(arguments.output) as temporary:
         temporary.write_text(json.dumps(rounded(found), indent=1) + "\n")
-    convergence_figures.draw(found, images, arguments.output.with_suffix(""))
     print(table(records))
     each = statistics.median(stage["seconds"] for stage in rendered["stages"][1:])
     total = sum(stage["seconds"] for stage in rendered["stages"])
-    print(f"iterations to {GOAL:g}: {len(on_paper) - 1} on paper at {arguments.size}, {len(rendered['stages']) - 1} for real")
+    simulated = f"{len(on_paper) - 1} on paper at {arguments.size}, " if on_paper else ""
+    print(f"iterations to {GOAL:g}: {simulated}{len(rendered['stages']) - 1} for real at {arguments.timed_size}")
     print(f"{each:.3f} s each, {total:.3f} s in all, every pixel {rendered['every_pixel']:.3f} s")
     wrong = check(records)
     assert not wrong, "\n".join(wrong)

@@ -280,11 +280,17 @@ def iterations(found: dict) -> str:
     seconds = f"the first lattice in {stages[0]['seconds']:.2f} s, then {later[len(later) // 2]:.2f} s each"
     return f"""Section 7.4 of the paper, on the mixing layer: from 256 x 256 rays, {found["worst"]} leaves an iteration, to an
 error of {found["goal"]:g}. The paper takes 7 iterations; here it is {len(found["iterations"]) - 1} on paper at {size} x {size}.
-Rendered for real at {timed["size"]} x {timed["size"]} it is {len(stages) - 1}: {seconds},
+Rendered for real at {timed["size"]} x {timed["size"]} with {found["samples"] // 4} samples it is {len(stages) - 1}
+({len(timed["on_paper"]) - 1} on paper, as fewer samples leave more to resolve): {seconds},
 {total:.2f} s in all; an image whose every pixel has a ray takes {timed["every_pixel"]:.2f} s.
 Of the time: {shares} (`adapt` is estimator and marking, `image` reconstruction).
+<<<<<<< HEAD
 Rendered iterations cast more rays than simulated ones: leaves that look empty and may not be come first, and bundles of which
 more than eight rays are wanted are cast whole.
+=======
+The first iterations go to leaves that look empty and may not be, of which the simulation knows nothing, and bundles of which more
+than sixteen rays are wanted are cast whole; rays of bundles that are certain to be empty are not cast, nor counted.
+>>>>>>> convergence
 
 ![Iterations of a real image](../benchmarks/results/convergence/iterations.png)"""
 

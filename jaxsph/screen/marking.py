@@ -8,6 +8,7 @@ A leaf is told from those that are split by its nodes: as long as one of the nin
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxsph.screen.canvas import LIGHT, Canvas, unseen
 from jaxsph.screen.estimators import Estimator, allowed
 from jaxsph.screen.pyramid import at_nodes, lattices, nodes_of_leaves, pixels_of_nodes
 
+HALVINGS = 32  # of the range of norms, when the least that is split is sought
 FEWEST = 1000  # leaves that a stage splits, if there are so many
 
 
@@ -28,12 +30,14 @@ class Leaves(NamedTuple):
         norm, largest: see `estimators.LeafErrors`; 0 where there is no such leaf.
         split: those that are to be: they are over the tolerance, or hidden.
         hidden: those that look empty and may not be.
+        side: pixels.
     """
 
     norm: Float[Array, "rows columns"]
     largest: Float[Array, "rows columns"]
     split: Bool[Array, "rows columns"]
     hidden: Bool[Array, "rows columns"]
+    side: int
 
 
 class Quality(NamedTuple):
@@ -70,7 +74,7 @@ def leaves_of(
         norm, largest = (jnp.where(whole, error, 0) for error in errors.both)
         hidden = whole & unseen(canvas, corners, side)
         over = (whole & (errors.largest > allowed(tolerance, bound, side))) | hidden
-        found.append(Leaves(norm, largest, over, hidden))
+        found.append(Leaves(norm, largest, over, hidden, side))
     squares = jnp.stack([(leaves.norm**2).sum() for leaves in found]).sum()
     total = jnp.maximum((every[-1][:LIGHT] ** 2).sum(), jnp.finfo(light.dtype).tiny)
     largest = jnp.stack([leaves.largest.max() for leaves in found]).max()
@@ -79,23 +83,50 @@ def leaves_of(
 
 
 def worst(leaves: list[Leaves], number: int) -> list[Bool[Array, "rows columns"]]:
-    """So many of those that are to be split (and all that are as bad as the last): first the hidden, then by their norms."""
-    urgency = [jnp.where(some.hidden, jnp.inf, jnp.where(some.split, some.norm, 0)) for some in leaves]
-    flat = _flat(urgency)
-    least = lax.top_k(flat, min(number, flat.shape[0]))[0][-1]
+    """The most urgent leaves, so many of those that are to be split (and all that are as urgent as the last)."""
+    urgency = _urgency(leaves)
+    flat = jnp.concatenate([some.ravel() for some in urgency])
+    least = _largest(lambda level: (flat >= level).sum() >= number, flat)
     return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
 
 
 def holding(leaves: list[Leaves], share: Array) -> list[Bool[Array, "rows columns"]]:
-    """As few as hold a share of the sum of all squared norms (Doerfler 1996), of those that are to be split; and the hidden.
+    """As few as hold a share of the sum of all squared norms (Doerfler 1996), of those that are to be split.
 
     But not fewer than `FEWEST`: a stage takes some time however little is done in it.
     """
-    norms = jnp.flip(jnp.sort(_flat([jnp.where(some.split, some.norm, 0) for some in leaves])))
-    before = jnp.cumsum(norms**2) - norms**2
-    needed = (before < share * (norms**2).sum()) | (jnp.arange(norms.shape[0]) < FEWEST)
-    least = jnp.where(needed, norms, jnp.inf).min()
-    return [some.split & ((some.norm >= least) | some.hidden) for some in leaves]
+    urgency = _urgency(leaves)
+    flat = jnp.concatenate([some.ravel() for some in urgency])
+    squares = flat**2
+
+    def enough(level: Array) -> Array:
+        chosen = flat >= level
+        return (jnp.where(chosen, squares, 0).sum() >= share * squares.sum()) & (chosen.sum() >= FEWEST)
+
+    least = _largest(enough, flat)
+    return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
+
+
+def _urgency(leaves: list[Leaves]) -> list[Float[Array, "rows columns"]]:
+    """Norms of leaves that are to be split; those that look empty are taken to hide as much as others of their size show."""
+    shown = [some.split & ~some.hidden for some in leaves]
+    squares = jnp.stack([jnp.where(some, each.norm**2, 0).sum() for some, each in zip(shown, leaves, strict=True)]).sum()
+    area = jnp.stack([some.sum() * float(each.side) ** 2 for some, each in zip(shown, leaves, strict=True)]).sum()
+    density = jnp.sqrt(squares / jnp.maximum(area, 1))
+    return [jnp.where(some.split, jnp.where(some.hidden, density * some.side, some.norm), 0) for some in leaves]
+
+
+def _largest(enough: Callable[[Array], Array], values: Float[Array, " leaves"]) -> Float[Array, ""]:
+    """The largest level that is `enough`, to rounding; 0 if none is. By bisection, as to sort takes many times as long."""
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = low + 0.5 * (high - low)
+        good = enough(middle)
+        return jnp.where(good, middle, low), jnp.where(good, high, middle)
+
+    low = jnp.zeros((), values.dtype)
+    return lax.fori_loop(0, HALVINGS, halve, (low, values.max() * (1 + jnp.finfo(values.dtype).eps)))[0]
 
 
 def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: tuple[int, ...]) -> Bool[Array, "height width"]:
@@ -108,10 +139,6 @@ def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: 
 
 def _two(leaves: Array) -> tuple[int, int]:
     return leaves.shape[0], leaves.shape[1]
-
-
-def _flat(leaves: list[Float[Array, "rows columns"]]) -> Float[Array, " leaves"]:
-    return jnp.concatenate([some.ravel() for some in leaves])
 
 
 def _children(split: Bool[Array, "rows columns"], shape: tuple[int, int]) -> Bool[Array, "rows columns"]:
