@@ -108,11 +108,11 @@ def line(row: dict) -> str:
 
 
 def saved(rows: list[dict]) -> dict[str, float]:
-    """By setting, how many times its evaluations uniform samples take for its mean error, by interpolation between them."""
+    """By setting, how many times its evaluations uniform samples take for its mean error: interpolated, where any are as good."""
     uniform = sorted((row for row in rows if row["step_tolerance"] is None), key=lambda row: -row["mean_error"])
     error, spent = ([np.log(row[key]) for row in uniform] for key in ("mean_error", "evaluations"))
     found = {}
-    for row in (row for row in rows if row["step_tolerance"] is not None):
+    for row in (row for row in rows if row["step_tolerance"] is not None and row["mean_error"] >= uniform[-1]["mean_error"]):
         as_good = np.exp(np.interp(-np.log(row["mean_error"]), -np.asarray(error), spent))
         found[f"{row['samples']} samples, {row['step_tolerance']:g}"] = round(float(as_good / row["evaluations"]), 2)
     return found
