@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +27,7 @@ from jaxsph.refinement import Decisions, Refinement
 from jaxsph.render import metadata_of, raise_for
 from jaxsph.screen.canvas import Canvas
 from jaxsph.screen.marking import Quality
+from jaxsph.screen.packets import Queue
 from jaxsph.stages import limits_of
 
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
@@ -97,16 +98,24 @@ class Progressive:
         return self._state.image(self._settings)
 
 
+class _Band(NamedTuple):
+    """What is known of a band, and the rays that its leaves want next."""
+
+    decisions: Decisions
+    scattered: Queue
+    whole: Queue
+
+
 @dataclasses.dataclass(frozen=True)
 class _State:
-    """What is known after a stage."""
+    """What is known after a stage; no band is before the first."""
 
     filling: Refinement
     clock: Clock
     word: int
     canvas: Canvas
     quality: Quality
-    bands: tuple[Decisions, ...]
+    bands: tuple[_Band, ...]
     stage: int
 
     @property
@@ -116,18 +125,26 @@ class _State:
 
     def refined(self, worst: int | None, share: float) -> _State:
         """After another stage."""
-        bands, word = self.bands, self.word
-        if not bands:
-            made = [self.filling.decided(row) for row in self._rows]
-            bands = tuple(decisions for decisions, _ in made)
-            word = functools.reduce(operator.or_, (int(grid.lists.faults) for _, grid in made), word)
-            raise_for(word, True)
-        canvas = self.canvas
-        for row, decisions in zip(self._rows, bands, strict=True):
-            canvas, *queues = self.filling.marked(canvas, decisions, row, worst, share)
-            canvas = self.filling.shot(canvas, decisions, *queues)
-        quality = self.filling.judged(canvas, bands)
-        return dataclasses.replace(self, word=word, canvas=canvas, quality=quality, bands=bands, stage=self.stage + 1)
+        state = self if self.bands else self._opened(worst, share)
+        canvas = state.canvas
+        for band in state.bands:
+            canvas = self.filling.shot(canvas, *band)
+        state = dataclasses.replace(state, stage=self.stage + 1)
+        return state._marked(canvas, [band.decisions for band in state.bands], worst, share)
+
+    def _opened(self, worst: int | None, share: float) -> _State:
+        """With all bands known, and what their leaves want."""
+        made = [self.filling.decided(row) for row in self._rows]
+        word = functools.reduce(operator.or_, (int(grid.lists.faults) for _, grid in made), self.word)
+        raise_for(word, True)
+        return dataclasses.replace(self, word=word)._marked(self.canvas, [one for one, _ in made], worst, share)
+
+    def _marked(self, canvas: Canvas, decisions: list[Decisions], worst: int | None, share: float) -> _State:
+        bands, quality = [], self.quality
+        for row, one in zip(self._rows, decisions, strict=True):
+            canvas, scattered, whole, quality = self.filling.marked(canvas, one, row, worst, share)
+            bands.append(_Band(one, scattered, whole))
+        return dataclasses.replace(self, canvas=canvas, quality=quality, bands=tuple(bands))
 
     @property
     def _rows(self) -> list[Any]:
@@ -136,7 +153,7 @@ class _State:
 
     def image(self, settings: Settings) -> Image:
         """What it looks like."""
-        layers = self.filling.finished(self.canvas, [decisions.of_bundles.verdict for decisions in self.bands])
+        layers = self.filling.finished(self.canvas, [band.decisions.of_bundles.verdict for band in self.bands])
         image = assemble(layers, self.word)
         stats: dict[str, Any] = {
             "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
@@ -172,16 +189,15 @@ def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) 
     canvas, made = begun.begun()
     word = int(seen.viewed.faults) | int(made.lists.faults)
     raise_for(word, True)
-    return _State(begun, clock, word, canvas, begun.judged(canvas, ()), (), 0)
+    return _State(begun, clock, word, canvas, begun.judged(canvas), (), 0)
 
 
 def _rehearse(filling: Refinement, worst: int | None) -> None:
     """All that will be run, once."""
     canvas, _ = filling.begun()
-    filling.judged(canvas, ())
+    filling.judged(canvas)
     filling.finished(canvas, [])
     decisions, _ = filling.decided(jnp.int32(0))
-    canvas, *queues = filling.marked(canvas, decisions, jnp.int32(0), worst, SHARE)
-    filling.shot(canvas, decisions, *queues)
-    filling.judged(canvas, (decisions,) * filling.frame.plan.bands)
+    canvas, scattered, whole, _ = filling.marked(canvas, decisions, jnp.int32(0), worst, SHARE)
+    filling.shot(canvas, decisions, scattered, whole)
     filling.finished(canvas, [decisions.of_bundles.verdict] * filling.frame.plan.bands)

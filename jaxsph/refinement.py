@@ -141,15 +141,15 @@ def mark(
     sizes: QuadtreePlan,
     number: int | None,
     tuning: Tuning,
-) -> tuple[Canvas, Queue, Queue]:
-    """Rays that the worst leaves of all sides want, so many or as few as hold a share of the error; of a band."""
+) -> tuple[Canvas, Queue, Queue, Quality]:
+    """Rays that the worst leaves of all sides want, so many or as few as hold a share of the error. And what the image is worth."""
     view = BandView(lists, canvas.shape, first_row)
     canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
     of_pixels = view.over_image(lax.stop_gradient(bound), 0)
-    leaves, _ = leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, of_pixels)
+    leaves, quality = leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, of_pixels)
     marked = holding(leaves, share) if number is None else worst(leaves, number)
     wanted = wanted_by(marked, canvas, sizes.sides)
-    return canvas, *queued(by_bundle(lists, view.in_band(wanted)))
+    return canvas, *queued(by_bundle(lists, view.in_band(wanted))), quality
 
 
 @stage("sizes", quickly=True)
@@ -269,16 +269,16 @@ class Refinement:
 
     def marked(
         self, canvas: Canvas, decisions: Decisions, first_row: Int[Array, ""], number: int | None, share: float
-    ) -> tuple[Canvas, Queue, Queue]:
-        """Rays that the worst leaves want."""
+    ) -> tuple[Canvas, Queue, Queue, Quality]:
+        """Rays that the worst leaves want, and how good the canvas is said to be."""
         filled, bound = decisions.of_bundles.schedule.filled, decisions.of_bundles.verdict.bound
         inputs = canvas, filled, bound, first_row, self._allowed(bound.dtype), jnp.asarray(share, bound.dtype)
         static = {"lists": self.frame.plan.lists, "sizes": self.sizes.with_room(1, 1), "number": number}
         return self.run.one("adapt", mark, inputs, **static, **self._tuned)  # type: ignore[no-any-return]
 
-    def judged(self, canvas: Canvas, bands: tuple[Decisions, ...]) -> Quality:
-        """How good the canvas is said to be."""
-        bound = self._over_pixels([band.of_bundles.verdict for band in bands])[0]
+    def judged(self, canvas: Canvas) -> Quality:
+        """How good the canvas is said to be, before any band is known."""
+        bound = self._over_pixels([])[0]
         inputs = canvas, bound, self._allowed(bound.dtype)
         quality: Quality = self.run.one("adapt", judge, inputs, sizes=self.sizes.with_room(1, 1), **self._tuned)
         return quality
