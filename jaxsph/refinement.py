@@ -142,7 +142,7 @@ def mark(
     number: int | None,
     tuning: Tuning,
 ) -> tuple[Canvas, Queue, Queue, Quality]:
-    """Rays that the worst leaves of all sides want, so many or as few as hold a share of the error. And what the image is worth."""
+    """Rays that the worst leaves want, so many or as few as hold a share of the error; and how good the image is."""
     view = BandView(lists, canvas.shape, first_row)
     canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
     of_pixels = view.over_image(lax.stop_gradient(bound), 0)

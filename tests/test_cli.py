@@ -199,3 +199,14 @@ def test_a_volume_is_rendered_described_and_cut_at_a_level(tmp_path, monkeypatch
     assert code == 2 and err == ["jaxsph render: --support is for particles, and this is a volume (see `jaxsph render --help`)"]
     code, _, err = run(capsys, "render", "ball.vti", "--quantity", "rho", *TINY)
     assert code == 1 and err == ["jaxsph render: ball.vti: has no quantity 'rho'; it has values"]
+
+
+def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(tmp_path, capsys):
+    output = tmp_path / "stages.png"
+    tiny = ("--particles", "400", "--size", "40x32", "--samples", "16")
+    code, out, err = run(capsys, "render", "scene:mixer", *tiny, "--progressive", "-o", str(output))
+    assert (code, err) == (0, [])
+    stages = [line for line in out.splitlines() if line.startswith("stage ")]
+    assert len(stages) > 1
+    assert all(said in stages[0] for said in ("estimated error", "rays cast", "left at most"))
+    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".png"] == ["stages.png"] and output.stat().st_size > 0

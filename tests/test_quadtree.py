@@ -151,6 +151,7 @@ def narrow(height=37, width=1):
     return camera, lists, QuadtreePlan(4, "hierarchical", ListPlan(-(-height // 32), 1, 200, 600), 4)
 
 
+@pytest.mark.slow
 def test_one_column_in_several_bands_orthographic(frames):
     camera, lists, coarse = narrow()
     size = {"width": camera.width, "height": camera.height, "lists": lists}

@@ -30,7 +30,7 @@ def dense(grid, camera):
 
 
 def apart(grid, camera):
-    """The same rays, sixteen a packet, those of a bundle in four packets; and four more packets that are room."""
+    """The same rays, those of a bundle in several packets; and four more packets that are room."""
     every, number = dense(grid, camera), grid.row.shape[0]
     u, v = (value.reshape(-1, number) for value in (jnp.tile(every.u[None], (BUNDLE, 1, 1)), jnp.repeat(every.v, BUNDLE, 0)))
     parts = [slice(first, first + SCATTERED) for first in range(0, RAYS, SCATTERED)]
@@ -88,7 +88,8 @@ def test_light_and_cotangents_are_those_of_tensor_products(frames, stages, x64):
         rays = cast(there, schedule, looking, transfer, (), method)
         layers = jnp.concatenate([rays.color, rays.transmittance[None]])
         if packets_of is apart:
-            layers = layers[:, : 4 * number, 0].reshape(4, 4, number, SCATTERED)
+            parts = RAYS // SCATTERED
+            layers = layers[:, : parts * number, 0].reshape(4, parts, number, SCATTERED)
             layers = jnp.moveaxis(layers, 1, 2)
         layers = layers.reshape(4, number, RAYS)
         return (layers * cotangent).sum(), layers
