@@ -1,6 +1,7 @@
 """Progressive images: a picture at once, better ones after it, and the image of every pixel at last."""
 
 import dataclasses
+import itertools
 
 import jax
 import numpy as np
@@ -29,7 +30,7 @@ def test_every_stage_is_better_and_the_last_keeps_the_tolerance(view):
     images = list(js.progressive(*view, SETTINGS, worst=60))
     errors = [np.sqrt(((light(image) - reference) ** 2).mean()) for image in images]
     assert len(images) > 3 and errors[-1] < 0.1 * errors[0]
-    assert all(after <= 1.05 * before for before, after in zip(errors, errors[1:], strict=False))
+    assert all(after <= 1.05 * before for before, after in itertools.pairwise(errors))
     rays, left = ([image.stats[name] for image in images] for name in ("rays", "rays_left"))
     assert rays == sorted(rays) and left == sorted(left, reverse=True)
     assert [image.stats["stage"] for image in images] == list(range(len(images)))
@@ -63,5 +64,5 @@ def test_what_cannot_be_is_refused(view):
         js.progressive(*view, SETTINGS, worst=0)
     with pytest.raises(ValueError, match="`share` must lie in"):
         js.progressive(*view, SETTINGS, share=0.0)
-    with pytest.raises(ValueError, match="call `jaxsph.render` under jit"):
+    with pytest.raises(ValueError, match=r"call `jaxsph.render` under jit"):
         jax.jit(lambda camera: js.progressive(view[0], camera, SETTINGS))(view[1])
