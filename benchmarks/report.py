@@ -284,13 +284,9 @@ Rendered for real at {timed["size"]} x {timed["size"]} with {found["samples"] //
 ({len(timed["on_paper"]) - 1} on paper, as fewer samples leave more to resolve): {seconds},
 {total:.2f} s in all; an image whose every pixel has a ray takes {timed["every_pixel"]:.2f} s.
 Of the time: {shares} (`adapt` is estimator and marking, `image` reconstruction).
-<<<<<<< HEAD
-Rendered iterations cast more rays than simulated ones: leaves that look empty and may not be come first, and bundles of which
-more than eight rays are wanted are cast whole.
-=======
-The first iterations go to leaves that look empty and may not be, of which the simulation knows nothing, and bundles of which more
-than sixteen rays are wanted are cast whole; rays of bundles that are certain to be empty are not cast, nor counted.
->>>>>>> convergence
+In the run that this was measured in, the first iterations went to leaves that look empty and may not be, of which the simulation
+knows nothing, and bundles of which more than sixteen rays were wanted were cast whole; now the former compete with all others,
+and eight are enough. Rays of bundles that are certain to be empty are not cast, nor counted.
 
 ![Iterations of a real image](../benchmarks/results/convergence/iterations.png)"""
 

@@ -141,7 +141,8 @@ def image():
     return js.render(scene(), camera(), SETTINGS)
 
 
-@pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
+@pytest.mark.slow  # what a step takes is tested above, slab by slab
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_an_image_is_that_of_very_many_samples(projection, image):
     view = camera(projection)
     image = image if projection == "perspective" else js.render(scene(), view, SETTINGS)
