@@ -46,7 +46,7 @@ class Layers(NamedTuple):
     bound: Float[Array, "rows columns"]
     full: Float[Array, "rows columns"]
     levels: Int[Array, "bundle_rows bundle_columns cells"] | None
-    rays: Float[Array, ""] | None = None
+    rays: Int[Array, ""] | None = None
 
 
 @compiled_quickly

@@ -153,7 +153,7 @@ class _State:
 
     def image(self, settings: Settings) -> Image:
         """What it looks like."""
-        layers = self.filling.finished(self.canvas, [band.decisions.of_bundles.verdict for band in self.bands])
+        layers = self.filling.finished(self.canvas, [band.decisions for band in self.bands])
         image = assemble(layers, self.word)
         stats: dict[str, Any] = {
             "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
@@ -200,4 +200,4 @@ def _rehearse(filling: Refinement, worst: int | None) -> None:
     decisions, _ = filling.decided(jnp.int32(0))
     canvas, scattered, whole, _ = filling.marked(canvas, decisions, jnp.int32(0), worst, SHARE)
     filling.shot(canvas, decisions, scattered, whole)
-    filling.finished(canvas, [decisions.of_bundles.verdict] * filling.frame.plan.bands)
+    filling.finished(canvas, [decisions] * filling.frame.plan.bands)

@@ -64,6 +64,16 @@ class Decisions(NamedTuple):
     of_rays: Decided
     lattice: Lattice | None
 
+    @property
+    def verdict(self) -> Verdict:
+        """What the image tells of them."""
+        return self.of_bundles.verdict
+
+    @property
+    def of_nodes(self) -> Float[Array, " bundles"]:
+        """Evaluations of the lattice of nodes, a pixel of each bundle."""
+        return jnp.zeros_like(self.verdict.full) if self.lattice is None else self.lattice.evaluations
+
 
 @stage("lists", quickly=True)
 def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, tuning: Tuning) -> Canvas:
@@ -72,7 +82,7 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
     transmittance, depth = (unshard(tuple(getattr(one.rays, name) for one in rays), 0) for name in ("transmittance", "depth"))
     spent, cast = unshard(tuple(one.evaluations for one in rays)), unshard(filled).any(0)
     value = lists.as_image(canvases.channels_of(color, transmittance, depth))
-    spent, cast = (lists.as_image(jnp.broadcast_to(one[:, None, None], (one.shape[0], BUNDLE, BUNDLE))) for one in (spent, cast))
+    spent, cast = _at_pixels(lists, spent), _at_pixels(lists, cast)
     rows, columns = camera.nodes
     made = canvases.blank((camera.height, camera.width), value.dtype)
     value, spent, cast = (one[:rows, :columns] for one in (value, spent, cast))
@@ -94,6 +104,11 @@ class BandView(NamedTuple):
     def in_band(self, image: Array) -> Array:
         """The rows of an image that it has."""
         return lax.dynamic_slice_in_dim(jnp.pad(image, ((0, self.rows), (0, 0))), self.first_row, self.rows, 0)
+
+    def seen(self, canvas: Canvas, filled: Array, bound: Array) -> tuple[Canvas, Float[Array, "height width"]]:
+        """The canvas, on which rays are known that are certain to meet nothing; and how wrong rays can be, a pixel."""
+        empty = self.over_image(~filled.any(0), False)
+        return dataclasses.replace(canvas, known=canvas.known | empty), self.over_image(lax.stop_gradient(bound), 0)
 
     def over_image(self, of_bundles: Array, beyond: Any) -> Array:
         """What its bundles have, at their pixels; and something else beyond."""
@@ -122,8 +137,7 @@ def choose(
 ) -> tuple[Canvas, Queue, Queue]:
     """Rays that leaves of one side want, of a band; pixels whose rays are certain to be empty are known without."""
     view = BandView(lists, canvas.shape, first_row)
-    canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
-    of_pixels = view.over_image(lax.stop_gradient(bound), 0)
+    canvas, of_pixels = view.seen(canvas, filled, bound)
     wanted = canvases.wanted_by_tolerance(canvas, side, coarsest, ESTIMATORS[estimator], tolerance, of_pixels)
     return canvas, *queued(by_bundle(lists, view.in_band(wanted)))
 
@@ -144,8 +158,7 @@ def mark(
 ) -> tuple[Canvas, Queue, Queue, Quality]:
     """Rays that the worst leaves want, so many or as few as hold a share of the error; and how good the image is."""
     view = BandView(lists, canvas.shape, first_row)
-    canvas = dataclasses.replace(canvas, known=canvas.known | view.over_image(~filled.any(0), False))
-    of_pixels = view.over_image(lax.stop_gradient(bound), 0)
+    canvas, of_pixels = view.seen(canvas, filled, bound)
     leaves, quality = leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, of_pixels)
     marked = holding(leaves, share) if number is None else worst(leaves, number)
     wanted = wanted_by(marked, canvas, sizes.sides)
@@ -198,10 +211,11 @@ def paint(canvas: Canvas, shots: tuple[Shot, ...], *, tuning: Tuning) -> Canvas:
 
 
 @stage("coarsest", "estimator", quickly=True)
-def finish(canvas: Canvas, bound: Array, full: Array, *, coarsest: int, estimator: str, tuning: Tuning) -> Layers:
+def finish(canvas: Canvas, told: Told, *, coarsest: int, estimator: str, tuning: Tuning) -> Layers:
     """The layers of the image."""
     color, transmittance, depth, error = canvases.finished(canvas, coarsest, ESTIMATORS[estimator])
-    return Layers(color, transmittance, depth, canvas.spent, bound + error, full, None, canvas.rays)
+    spent = canvas.spent + told.of_nodes
+    return Layers(color, transmittance, depth, spent, told.bound + error, told.full, None, canvas.rays)
 
 
 @stage(quickly=True)
@@ -210,16 +224,30 @@ def join(decided: tuple[Decided, ...], *, tuning: Tuning) -> Decided:
     return unshard(decided)  # type: ignore[no-any-return]
 
 
+class Told(NamedTuple):
+    """What is told of each pixel besides its light: how wrong its ray can be; evaluations at full rate, and those of nodes."""
+
+    bound: Float[Array, "height width"]
+    full: Float[Array, "height width"]
+    of_nodes: Float[Array, "height width"]
+
+
 @stage("height", "width", "lists", quickly=True)
 def spread_over(
-    verdicts: tuple[Verdict, ...], *, height: int, width: int, lists: ListPlan, tuning: Tuning
-) -> tuple[Array, Array]:
-    """Bounds and evaluations at full rate of all pixels, of those of the bundles of bands."""
+    verdicts: tuple[Verdict, ...],
+    of_nodes: tuple[Float[Array, " bundles"], ...],
+    *,
+    height: int,
+    width: int,
+    lists: ListPlan,
+    tuning: Tuning,
+) -> Told:
+    """What is told of all pixels, of the bundles of bands."""
 
     def image(of_bands: tuple[Array, ...]) -> Array:
         return jnp.concatenate([_at_pixels(lists, one) for one in of_bands])[:height, :width]
 
-    return image(tuple(one.bound for one in verdicts)), image(tuple(one.full for one in verdicts))
+    return Told(image(tuple(one.bound for one in verdicts)), image(tuple(one.full for one in verdicts)), image(of_nodes))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,13 +276,13 @@ class Refinement:
         canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=lists, **self._tuned)
         return canvas, made
 
-    def band(self, canvas: Canvas, first_row: Int[Array, ""]) -> tuple[Canvas, BandGrid, Verdict]:
+    def band(self, canvas: Canvas, first_row: Int[Array, ""]) -> tuple[Canvas, BandGrid, Decisions]:
         """With the leaves of a band split as long as they are not good enough."""
         decisions, made = self.decided(first_row)
         for side in self.sizes.sides:
             canvas, *queues = self._choose(canvas, decisions.of_bundles, first_row, side)
             canvas = self.shot(canvas, decisions, *queues)
-        return canvas, made, decisions.of_bundles.verdict
+        return canvas, made, decisions
 
     def decided(self, first_row: Int[Array, ""]) -> tuple[Decisions, BandGrid]:
         """The grid of a band, and how rays are to be marched there."""
@@ -278,7 +306,7 @@ class Refinement:
 
     def judged(self, canvas: Canvas) -> Quality:
         """How good the canvas is said to be, before any band is known."""
-        bound = self._over_pixels([])[0]
+        bound = self._told([]).bound
         inputs = canvas, bound, self._allowed(bound.dtype)
         quality: Quality = self.run.one("adapt", judge, inputs, sizes=self.sizes.with_room(1, 1), **self._tuned)
         return quality
@@ -286,15 +314,16 @@ class Refinement:
     def _allowed(self, dtype: Any) -> Float[Array, ""]:
         return jnp.asarray(-1, dtype) if self.frame.allowed is None else self.frame.allowed
 
-    def _over_pixels(self, verdicts: list[Verdict]) -> tuple[Array, Array]:
-        """Bounds and evaluations at full rate of all pixels; nothing where no band is known yet."""
+    def _told(self, bands: list[Decisions]) -> Told:
+        """What is told of all pixels; nothing where no band is known yet."""
         plan = self.frame.plan
-        if not verdicts:
+        if not bands:
             nothing = jnp.zeros((plan.height, plan.width), self.frame.ordered.x.dtype)
-            return nothing, nothing
+            return Told(nothing, nothing, nothing)
         size = {"height": plan.height, "width": plan.width, "lists": plan.lists}
-        both: tuple[Array, Array] = self.run.one("image", spread_over, (tuple(verdicts),), **size, **self._tuned)
-        return both
+        inputs = tuple(one.verdict for one in bands), tuple(one.of_nodes for one in bands)
+        told: Told = self.run.one("image", spread_over, inputs, **size, **self._tuned)
+        return told
 
     def shot(self, canvas: Canvas, decisions: Decisions, scattered: Queue, whole: Queue) -> Canvas:
         """With the rays cast that are queued."""
@@ -302,11 +331,10 @@ class Refinement:
         whole_ones = self._shoot("whole", whole, decisions.grid, decisions.of_bundles.schedule, decisions.lattice)
         return self._paint(self._paint(canvas, apart), whole_ones)
 
-    def finished(self, canvas: Canvas, verdicts: list[Verdict]) -> Layers:
+    def finished(self, canvas: Canvas, bands: list[Decisions]) -> Layers:
         """The layers of the image."""
-        bound, full = self._over_pixels(verdicts)
         static = {"coarsest": self.sizes.leaf, "estimator": self.sizes.estimator, **self._tuned}
-        layers: Layers = self.run.one("image", finish, (canvas, bound, full), **static)
+        layers: Layers = self.run.one("image", finish, (canvas, self._told(bands)), **static)
         return layers
 
     @property
@@ -355,14 +383,14 @@ def refined(frame: Frame, run: Executor, progress: Callable[[int, int], None] | 
     """All bands of a frame, of which the first is that of its coarse lattice; and the layers of the image."""
     filling = Refinement.of(frame, run)
     canvas, coarse = filling.begun()
-    bands, verdicts, plan = [_counted(coarse)], [], frame.plan
+    bands, decided, plan = [_counted(coarse)], [], frame.plan
     for nth in range(plan.bands):
-        canvas, made, verdict = filling.band(canvas, jnp.int32(nth * plan.band_height))
+        canvas, made, decisions = filling.band(canvas, jnp.int32(nth * plan.band_height))
         bands.append(_counted(made))
-        verdicts.append(verdict)
+        decided.append(decisions)
         if progress is not None:
             progress(nth + 1, plan.bands)
-    return bands, filling.finished(canvas, verdicts)
+    return bands, filling.finished(canvas, decided)
 
 
 def _counted(made: BandGrid) -> Band:

@@ -11,7 +11,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.screen.estimators import Estimator, allowed
 from jaxsph.screen.pyramid import (
@@ -43,7 +43,7 @@ class Canvas:
     value: Float[Array, "height width 6"]
     known: Bool[Array, "height width"]
     spent: Float[Array, "height width"]
-    rays: Float[Array, ""]
+    rays: Int[Array, ""]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -65,14 +65,14 @@ def channels_of(color: Array, transmittance: Array, depth: Array) -> Float[Array
 def blank(shape: tuple[int, int], dtype: jnp.dtype) -> Canvas:
     """Nothing is known."""
     nothing = jnp.zeros((CHANNELS,), dtype).at[3].set(1)
-    return Canvas(jnp.broadcast_to(nothing, (*shape, CHANNELS)), jnp.zeros(shape, bool), jnp.zeros(shape), jnp.float32(0))
+    return Canvas(jnp.broadcast_to(nothing, (*shape, CHANNELS)), jnp.zeros(shape, bool), jnp.zeros(shape), jnp.int32(0))
 
 
 def painted_on_lattice(canvas: Canvas, value: Float[Array, "rows columns 6"], spent: Array, cast: Array, stride: int) -> Canvas:
     """With all nodes known that are `stride` apart, and those counted that had to be `cast`."""
     rows, columns = (places(size, stride) for size in canvas.shape)
     here = rows[:, None], columns[None]
-    number = cast.sum(dtype=jnp.float32)
+    number = cast.sum(dtype=jnp.int32)
     return Canvas(
         canvas.value.at[here].set(value), canvas.known.at[here].set(True), canvas.spent.at[here].set(spent), canvas.rays + number
     )
@@ -84,7 +84,7 @@ def painted(canvas: Canvas, pixel: Array, value: Float[Array, "rays 6"], spent: 
     flat = canvas.value.reshape(size, CHANNELS).at[pixel].set(value, mode="drop").reshape(canvas.value.shape)
     known = canvas.known.reshape(size).at[pixel].set(True, mode="drop").reshape(canvas.shape)
     spent = canvas.spent.reshape(size).at[pixel].add(spent, mode="drop").reshape(canvas.shape)
-    return Canvas(flat, known, spent, canvas.rays + (pixel < size).sum(dtype=jnp.float32))
+    return Canvas(flat, known, spent, canvas.rays + (pixel < size).sum(dtype=jnp.int32))
 
 
 def wanted_by_tolerance(
