@@ -3,7 +3,7 @@
 from jaxsph import io, reference, scenes
 from jaxsph.access.morton import prepare
 from jaxsph.field.iso_surface import IsoSurface
-from jaxsph.model import Camera, Image, Particles, Scene, Settings, TransferFunction, Volume
+from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -19,6 +19,7 @@ __all__ = [
     "IsoSurface",
     "Particles",
     "Plan",
+    "Points",
     "Progressive",
     "Scene",
     "Settings",

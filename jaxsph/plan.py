@@ -364,6 +364,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
+        "`Scene(points=...)`": bool(scene.point_sets),
     }
     if settings.screen == "quadtree":
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast

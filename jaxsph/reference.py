@@ -49,8 +49,8 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     inside = denominator > 0
     quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
     parts = [] if scene.transfer is None else [(quantity, inside, scene.transfer)]
-    if scene.volume is not None and scene.volume_transfer is not None:
-        parts.append((*_in_volume(scene.volume, camera, settings.samples, every), scene.volume_transfer))
+    for volume, look in scene.volumes:
+        parts.append((*_in_volume(volume, camera, settings.samples, every), look))
     edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
     color, transmittance, depth = _composite(parts, edges, _ray_lengths(camera, every))
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)

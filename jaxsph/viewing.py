@@ -39,7 +39,7 @@ class Seen(NamedTuple):
 
     def with_data(self, scene: Scene) -> Seen:
         """With the arrays of the scene that media read, which no stage is to copy."""
-        given = scene.media if scene.volume is None else (scene.volume, *scene.media)
+        given = (*(volume for volume, _ in scene.volumes), *scene.media)
         return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
 
 
@@ -61,10 +61,8 @@ def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) 
 
 def _media(scene: Scene, camera: Camera) -> tuple[Medium, ...]:
     """All media but particles, in view space."""
-    media = tuple(medium.seen_by(camera) for medium in scene.media)
-    if scene.volume is None or scene.volume_transfer is None:
-        return media
-    return VolumeMedium.seen(scene.volume, scene.volume_transfer, camera), *media
+    volumes = (VolumeMedium.seen(volume, transfer, camera) for volume, transfer in scene.volumes)
+    return *volumes, *(medium.seen_by(camera) for medium in scene.media)
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
@@ -78,7 +76,7 @@ def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
     if camera.is_perspective:
         usable &= camera.near > 0
     word = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~usable)
-    for transfer in (scene.transfer, scene.volume_transfer):
+    for transfer in (scene.transfer, *(look for _, look in scene.volumes)):
         if transfer is not None:
             word |= faults.raised(faults.BAD_TRANSFER, ~_shows(transfer))
     return word

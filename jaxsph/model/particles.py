@@ -111,7 +111,7 @@ class Particles:
         rest = None
         if not is_traced(*arrays.values()) and count:
             _require_representable(arrays, packed)
-            rest = _rest(arrays["position"], packed["position"], packed["support"])
+            rest = rest_of(arrays["position"], packed["position"], packed["support"])
         return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel, position_rest=rest)
 
     def padded(self, capacity: int) -> Particles:
@@ -179,7 +179,7 @@ def _repeated(name: str, value: Any, capacity: int, xp: Any) -> Any:
     return xp.concatenate([value, xp.broadcast_to(value[:1], missing)])
 
 
-def _rest(given: Any, packed: Array, support: Array) -> Array | None:
+def rest_of(given: Any, packed: Array, support: Array) -> Array | None:
     """What rounding `given` to `packed` has left, or None where that is negligible."""
     given, rounded = np.asarray(given, np.float64), np.asarray(packed, np.float64)
     rest = _repeated("position", given - rounded[: len(given)], len(rounded), np)

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import NOTHING, Particles
+from jaxsph.model.points import Points
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
+MIXES = "extinction", "opacity"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,23 +25,34 @@ class Scene:
     Attributes:
         particles: the particle set.
         transfer: maps its quantity to colour and extinction; given with particles, and only then.
-        media: other media in the same rays, see `docs/extending.md`; extinctions add up, and colours weigh by extinction.
-        volume: a quantity on a regular grid, rendered as a medium that shares the rays.
-        volume_transfer: maps it to colour and extinction; given with a volume, and only then.
+        media: other media in the same rays, see `docs/extending.md`.
+        volume: a quantity on a regular grid, rendered as a medium that shares the rays; or a tuple of several.
+        volume_transfer: maps it to colour and extinction; given with a volume, and only then, and for several one each.
+        points: a point set, or a tuple of several.
+        mix: how parts that share a sample are mixed. Extinctions add up either way; "extinction" has colours weigh by extinction,
+            "opacity" adds colours times opacities (Kaehler, Abel & Hege 2007, equations 1 to 4), see `model.mixture`.
     """
 
     particles: Particles | None = None
     transfer: TransferFunction | None = None
     media: tuple[Medium, ...] = ()
-    volume: Volume | None = None
-    volume_transfer: TransferFunction | None = None
+    volume: Volume | tuple[Volume, ...] | None = None
+    volume_transfer: TransferFunction | tuple[TransferFunction, ...] | None = None
+    points: Points | tuple[Points, ...] | None = None
+    mix: str = "extinction"
 
     def __post_init__(self) -> None:
-        kinds = {"particles": Particles, "transfer": TransferFunction, "volume": Volume, "volume_transfer": TransferFunction}
-        for name, kind in kinds.items():
+        if self.mix not in MIXES:
+            raise ValueError(f"`mix` must be one of {', '.join(map(repr, MIXES))}, got {self.mix!r}")
+        kinds = {"particles": Particles, "transfer": TransferFunction}
+        several = {"volume": Volume, "volume_transfer": TransferFunction, "points": Points}
+        for name, kind in (kinds | several).items():
             value = getattr(self, name)
-            if isinstance(value, str | int | float | tuple | list | dict):
-                raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`, got {type(value).__name__}")
+            wrong = [one for one in _all_of(value) if isinstance(one, str | int | float | tuple | list | dict)]
+            if wrong or (isinstance(value, tuple) and name in kinds):
+                given = type(wrong[0] if wrong else value).__name__
+                more = ", or a tuple of them" if name in several else ""
+                raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`{more}, got {given}")
         media = self.media if isinstance(self.media, tuple) else (self.media,)
         if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
@@ -50,14 +63,28 @@ class Scene:
             if (getattr(self, part) is None) != (getattr(self, look) is None):
                 missing, given = (look, part) if getattr(self, look) is None else (part, look)
                 raise ValueError(f"`{missing}` must be given with `{given}`, got None; give both to `jaxsph.Scene`, or neither")
-        if self.particles is None and self.volume is None and not self.media:
-            raise ValueError("`particles`, `volume` and `media` are all absent; give `jaxsph.Scene` something to look at")
+        volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
+        if volumes != looks:
+            raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")
+        if self.particles is None and not volumes and not self.point_sets and not self.media:
+            absent = "`particles`, `volume`, `points` and `media` are all absent"
+            raise ValueError(f"{absent}; give `jaxsph.Scene` something to look at")
 
     @property
     def dtype(self) -> Any:
-        """float32, or float64 if particles or volume are."""
-        given = [part.dtype for part in (self.particles, self.volume) if part is not None]
+        """float32, or float64 if particles, a volume or points are."""
+        given = [part.dtype for part in (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets)]
         return jnp.result_type(*given) if given else jnp.dtype(jnp.float32)
+
+    @property
+    def volumes(self) -> tuple[tuple[Volume, TransferFunction], ...]:
+        """Each with what it looks like."""
+        return tuple(zip(_all_of(self.volume), _all_of(self.volume_transfer), strict=True))
+
+    @property
+    def point_sets(self) -> tuple[Points, ...]:
+        """All of them."""
+        return _all_of(self.points)
 
     @property
     def particle_set(self) -> Particles:
@@ -68,6 +95,15 @@ class Scene:
         return Particles(**entry | {"position": jnp.zeros((1, 3), self.dtype)}, valid=jnp.zeros(1, bool))
 
 
+def _all_of(part: Any) -> tuple[Any, ...]:
+    """One part or several, as a tuple."""
+    if part is None:
+        return ()
+    return part if isinstance(part, tuple) else (part,)
+
+
 jax.tree_util.register_dataclass(
-    Scene, data_fields=["particles", "transfer", "media", "volume", "volume_transfer"], meta_fields=[]
+    Scene,
+    data_fields=["particles", "transfer", "media", "volume", "volume_transfer", "points"],
+    meta_fields=["mix"],
 )

@@ -1,0 +1,213 @@
+"""Points: stars, galaxies, tracers, spray: each with a radius, a colour and an extinction of its own.
+
+Flow: files, arrays -> [points] -> field -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model.particles import Particles, capacity_class, rest_of
+from jaxsph.model.profiles import Profile, profile_of
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+
+SPREADS = "chords", "feet", "centres"
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """A set of points; make it with `from_arrays`.
+
+    At an offset d from its centre a point has the extinction `extinction * profile(|d| / radius)` a unit length, and none where
+    its radius ends. Where points overlap, extinctions add up, and colours weigh by extinction. Unlike the field of `Particles`,
+    nothing is normalised: more points are more light. Arrays are padded to a capacity, with the first point; values may be
+    changed by `dataclasses.replace` under jit without recompiling.
+
+    Attributes:
+        position: of centres, world coordinates, length units.
+        radius: > 0, length units.
+        color: red, green, blue in [0, 1].
+        extinction: at the centre, >= 0, a unit length.
+        valid: which entries are points; the rest is padding.
+        attributes: further numbers of each point by name, for a profile that reads them.
+        profile: how extinction falls off, see `jaxsph.model.profiles`.
+        position_rest: what rounding float64 positions has left; None where that is a negligible part of every radius.
+        splats_beyond: distance from the eye (depth, if the view is orthographic) beyond which points are splats: spread as
+            "centres"; None where none are.
+        spread: how a point's thickness is laid along a ray. "chords": where it is, to the last sample: each stretch of the ray
+            between samples has the integral of extinction along it. "feet": all of it at the foot of the centre on the ray
+            (Kaehler, Abel & Hege 2007, section 3.2). "centres": all of it at the depth of the centre, as a splat has it. What
+            a ray meets in all is the same; how it is ordered in depth is not.
+    """
+
+    position: Float[Array, "points 3"]
+    radius: Float[Array, " points"]
+    color: Float[Array, "points 3"]
+    extinction: Float[Array, " points"]
+    valid: Bool[Array, " points"]
+    attributes: dict[str, Float[Array, " points"]]
+    profile: Profile
+    position_rest: Float[Array, "points 3"] | None = None
+    splats_beyond: Float[Array, ""] | None = None
+    spread: str = "chords"
+
+    @classmethod
+    def from_arrays(
+        cls,
+        position: Any,
+        radius: Any,
+        color: Any = (1.0, 1.0, 1.0),
+        extinction: Any = None,
+        profile: Any = "gaussian",
+        *,
+        opacity: Any = None,
+        attributes: dict[str, Any] | None = None,
+        spread: str = "chords",
+        splats_beyond: Any = None,
+        capacity: int | None = None,
+    ) -> Points:
+        """Check and pack arrays of points.
+
+        Args:
+            position: (N, 3), length units; N = 0 is an empty set.
+            radius: (N,) or a number, > 0, length units.
+            color: (N, 3) or (3,), in [0, 1].
+            extinction: (N,) or a number, >= 0: at the centre, a unit length. Give this or `opacity`.
+            profile: `"gaussian"` (exp(-4.5 q^2), q in radii, cut off at 1), `"ball"` (constant), numbers at distances evenly
+                spaced from the centre to the radius, or a function of the offset and the attributes, see `profiles.Shaped`.
+            opacity: (N,) or a number in [0, 1): that of a whole point along a ray through its centre.
+            attributes: (N,) or a number each, by name.
+            spread: "chords", "feet" or "centres", see `Points`.
+            splats_beyond: distance >= 0 beyond which points are splats; None for none.
+            capacity: pad to this many entries; default the class of N, so that sets of similar size share programs.
+
+        Returns:
+            Points of dtype float64 if `position` is float64 and x64 is enabled, else float32.
+
+        Raises:
+            ValueError: wrong shapes, numbers that are not finite or out of range, neither or both of extinction and opacity,
+                an unknown profile or spread, capacity < N.
+        """
+        if spread not in SPREADS:
+            raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
+        if (extinction is None) == (opacity is None):
+            what = "neither" if extinction is None else "both"
+            raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
+        center = _array("position", position)
+        if center.size == 0 and not isinstance(center, jax.Array):
+            center = center.reshape(0, 3)
+        require_shape("position", center, (None, 3), "one row (x, y, z) a point")
+        strength = {"extinction": extinction} if opacity is None else {"opacity": opacity}
+        given = {"radius": radius, **strength, **(attributes or {})}
+        columns = {"position": center, "color": _column("color", color, center.shape[0], (3,))}
+        columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
+        _require_usable(columns)
+        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(center.dtype), jnp.float32)
+        room = capacity_class(center.shape[0]) if capacity is None else capacity
+        if room < max(center.shape[0], 1):
+            raise ValueError(f"`capacity` must be at least the number of points ({center.shape[0]}) and 1, got {room}")
+        packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
+        shape = profile_of(profile, dtype)
+        if opacity is not None:
+            packed["extinction"] = -jnp.log1p(-packed.pop("opacity")) / (packed["radius"] * shape.through_centre().astype(dtype))
+        rest = None
+        if not is_traced(center, packed["radius"]) and center.shape[0]:
+            rest = rest_of(center, packed["position"], packed["radius"])
+        main = {name: packed.pop(name) for name in ("position", "radius", "color", "extinction")}
+        valid, beyond = jnp.arange(room) < center.shape[0], _distance(splats_beyond, dtype)
+        return cls(**main, valid=valid, attributes=packed, profile=shape, position_rest=rest, splats_beyond=beyond, spread=spread)
+
+    @property
+    def capacity(self) -> int:
+        """Number of entries, padding included (static)."""
+        return int(self.radius.shape[0])
+
+    @property
+    def num_points(self) -> int:
+        """Number of points that exist (host side)."""
+        return int(np.asarray(self.valid).sum())
+
+    @property
+    def dtype(self) -> Any:
+        """float32 or float64."""
+        return self.position.dtype
+
+    def spheres(self) -> Particles:
+        """What they can be met in, as particles that carry nothing."""
+        nothing = jnp.zeros_like(self.radius)
+        return Particles(self.position, self.radius, nothing, nothing, self.valid, position_rest=self.position_rest)
+
+    def exact_position(self) -> np.ndarray:
+        """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""
+        return self.spheres().exact_position()
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all points, (3,) and (3,), float64, length units (host side)."""
+        return self.spheres().bounds()
+
+
+def _array(name: str, value: Any) -> Any:
+    value = value if isinstance(value, jax.Array) else np.asarray(value)
+    require_real(name, value)
+    return value
+
+
+def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any:
+    """One entry a point, of one for all where so much is given."""
+    value = _array(name, value)
+    if value.shape == row:
+        value = (jnp if is_traced(value) else np).broadcast_to(value, (count, *row))
+    each = "one row" if row else "one value"
+    require_shape(name, value, (count, *row), f"{each} for each of the {count} points, or one for all")
+    return value
+
+
+def _require_usable(columns: dict[str, Any]) -> None:
+    """Raise where numbers are out of range."""
+    for name, value in columns.items():
+        if is_traced(value):
+            continue
+        require_finite(name, value)
+        if name == "radius":
+            require_positive(name, value, "give the radius of every point, where its light ends")
+        if name in ("extinction", "opacity"):
+            require_positive(name, value, "points can only take light away or emit it", strict=False)
+        above = np.asarray(value) > 1 if name == "color" else np.asarray(value) >= (1 if name == "opacity" else np.inf)
+        if above.any() or (name == "color" and (np.asarray(value) < 0).any()):
+            allowed = "in [0, 1]" if name == "color" else "in [0, 1)"
+            raise ValueError(f"`{name}` must be {allowed}, got {np.asarray(value).min():.6g} .. {np.asarray(value).max():.6g}")
+
+
+def _packed(name: str, value: Any, room: int, dtype: Any) -> Array:
+    """Padded with the first point: whoever forgets what is `valid` meets no number of our own making."""
+    xp = jnp if is_traced(value) else np
+    missing = (room - value.shape[0], *value.shape[1:])
+    first = value[:1] if value.shape[0] else xp.full((1, *value.shape[1:]), 1 if name == "radius" else 0, value.dtype)
+    with np.errstate(over="ignore"):  # what overflows is refused by name
+        packed = jnp.asarray(xp.concatenate([value, xp.broadcast_to(first, missing)]).astype(dtype))
+    if not is_traced(value):
+        require_finite(name, packed, f"it overflows {packed.dtype}: rescale it, or use float64 under jax.enable_x64")
+        if name == "radius":
+            require_positive(name, packed, f"it underflows {packed.dtype}: rescale the scene or use float64")
+    return packed
+
+
+def _distance(value: Any, dtype: Any) -> Array | None:
+    if value is None:
+        return None
+    if not is_traced(value) and not float(value) >= 0:
+        raise ValueError(f"`splats_beyond` must be >= 0 or None, got {value!r}; it is a distance from the eye")
+    return jnp.asarray(value, dtype)
+
+
+jax.tree_util.register_dataclass(
+    Points,
+    data_fields=["position", "radius", "color", "extinction", "valid", "attributes", "profile", "position_rest", "splats_beyond"],
+    meta_fields=["spread"],
+)
