@@ -12,6 +12,8 @@ section 3.2) for each by itself. Their projection has all of it at the foot, a s
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +25,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.field.fetch import particle_at
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
+from jaxsph.field.uneven import turns_of
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.points import Points
@@ -30,7 +33,7 @@ from jaxsph.model.profiles import Chord, Profile, Shaped
 from jaxsph.numerics import faults
 from jaxsph.numerics.fusion import fusion_barrier
 
-BLOCK = 8  # points whose chords are held at once
+BLOCK = 4  # points whose chords are held at once
 NUM_COLUMNS = 8  # of a row of the table: read, and added to, as one
 
 
@@ -125,23 +128,28 @@ class PointsMedium(Medium):
 
     def gather(self, task: SlabTask) -> Float[Array, "4 tasks stretches rays"]:
         """Thickness of all stretches, and thickness times red, green and blue."""
+        sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
+        for turns in turns_of(task, BLOCK):
+            some = jax.tree.map(lambda value, number=turns.number: value[:number], sums)
+            some = lax.fori_loop(turns.begin, turns.end, functools.partial(self._add, turns.task), some)
+            sums = jax.tree.map(lambda old, new: jnp.concatenate([new, old[new.shape[0] :]]), sums, some)
+        return jnp.stack(sums.all)
+
+    def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
+        """With a block of points more."""
         rays = _Rays.of(task, self.axes)
 
         def found(nth: Array) -> tuple[list[Array], Array]:
             some = self._fetch(task, nth)
             return [some.row.red, some.row.green, some.row.blue], self._thickness(some, rays)
 
-        def add(nth: Array, sums: Sums) -> Sums:
-            colors, thickness = fusion_barrier(nth >= 0, found, nth)
-            channels = list(sums.all)
-            for k in range(BLOCK):
-                here = thickness[:, k]
-                weighed = (here * color[:, k, None, None] for color in colors)
-                channels = [channels[0] + here, *(old + new for old, new in zip(channels[1:], weighed, strict=True))]
-            return sums_of(channels)
-
-        nothing = jnp.zeros(task.shape, self.table.dtype)
-        return jnp.stack(lax.fori_loop(0, self._blocks(task), add, sums_of([nothing] * 4)).all)
+        colors, thickness = fusion_barrier(nth >= 0, found, nth)
+        channels = list(sums.all)
+        for k in range(BLOCK):
+            here = thickness[:, k]
+            weighed = (here * color[:, k, None, None] for color in colors)
+            channels = [channels[0] + here, *(old + new for old, new in zip(channels[1:], weighed, strict=True))]
+        return sums_of(channels)
 
     def extinction(self, gathered: Array, task: SlabTask) -> tuple[Float[Array, "tasks stretches rays"], Array]:
         """Mean extinction of stretches."""
@@ -169,32 +177,32 @@ class PointsMedium(Medium):
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
         of_sums, places = jax.vjp(optics, gathered, there)[1](cotangents)
 
-        def add(nth: Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        def add(nth: Array, carry: tuple[Any, ...], number: int, part: SlabTask) -> tuple[Any, ...]:
             table, attributes, axes, profile, places = carry
-            some = self._fetch(task, nth)
+            some = self._fetch(part, nth)
 
             def sums(inputs: tuple[Any, ...]) -> Array:
                 row, of_some, axes, profile, places = inputs
                 medium = dataclasses.replace(self, profile=profile)
-                rays = _Rays.of(_moved(task, places), axes)
+                rays = _Rays.of(_moved(task, places).first(number), axes)
                 thickness = medium._thickness(some._replace(row=row, attributes=of_some), rays)
                 colors = jnp.stack([jnp.ones_like(row.red), row.red, row.green, row.blue])
                 return jnp.einsum("cbk,bksr->cbsr", colors, thickness, precision=lax.Precision.HIGHEST)
 
             inputs = some.row, some.attributes, self.axes, self.profile, there
-            row, of_some, of_axes, of_profile, moved = jax.vjp(sums, inputs)[1](of_sums)[0]
+            row, of_some, of_axes, of_profile, moved = jax.vjp(sums, inputs)[1](of_sums[:, :number])[0]
             at, rows = some.point.ravel(), jnp.stack(row, -1).reshape(-1, NUM_COLUMNS)
             table = table.at[at].add(jnp.where(some.inside.ravel()[:, None], rows, 0), mode="promise_in_bounds")
             attributes = jax.tree.map(lambda old, new: old.at[at].add(new.ravel()), attributes, of_some)
             axes, profile, places = jax.tree.map(jnp.add, (axes, profile, places), (of_axes, of_profile, moved))
             return table, attributes, axes, profile, places
 
-        start = total.table, total.attributes, total.axes, total.profile, places
-        table, attributes, axes, profile, places = lax.fori_loop(0, self._blocks(task), add, start)
+        carry = total.table, total.attributes, total.axes, total.profile, places
+        for turns in turns_of(task, BLOCK):
+            some = functools.partial(add, number=turns.number, part=turns.task)
+            carry = lax.fori_loop(turns.begin, turns.end, some, carry)
+        table, attributes, axes, profile, places = carry
         return dataclasses.replace(total, table=table, attributes=attributes, axes=axes, profile=profile), places
-
-    def _blocks(self, task: SlabTask) -> Array:
-        return (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
 
     def _fetch(self, task: SlabTask, nth: Array) -> _Some:
         """A block of the spheres in the windows of slabs."""
@@ -219,17 +227,33 @@ class PointsMedium(Medium):
         square = away[0] ** 2 + away[1] ** 2 + away[2] ** 2
         inside = square < 1
         half = jnp.where(inside, jnp.sqrt(jnp.where(inside, 1 - square, 1)), 0)[:, :, None]
-        scale = (rays.slant[:, None] * row.inverse)[:, :, None]
-        at = rays.border[:, None] - foot[:, :, None]
-        chords = self.spread == "chords"
-        found = self._along(some, rays, away, square, jnp.clip(at * scale, -half, half)) if chords else half * 0
-        if not chords or some.splat is not None:
+
+        def chords() -> Array:
+            scale = (rays.slant[:, None] * row.inverse)[:, :, None]
+            at = (rays.border[:, None] - foot[:, :, None]) * scale
+            return self._along(some, rays, away, square, jnp.clip(at, -half, half))
+
+        def whole() -> Array:
             middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
             behind = (rays.border[:, None] >= middle[:, :, None]).astype(half.dtype)
-            whole = self._along(some, rays, away, square, jnp.concatenate([-half, half], 2))
-            whole = whole * (behind[:, :, 1:] - behind[:, :, :-1])  # in the stretch that it begins in front of, and ends behind
-            found = whole if not chords or some.splat is None else jnp.where(some.splat[:, :, None, None], whole, found)
+            there = behind[:, :, 1:] - behind[:, :, :-1]  # in the stretch that begins in front of it, and ends behind
+            return self._along(some, rays, away, square, jnp.concatenate([-half, half], 2)) * there
+
+        found = self._spread(some, chords, whole)
         return jnp.where(inside[:, :, None], found, 0) * row.strength[:, :, None]
+
+    def _spread(self, some: _Some, chords: Callable[[], Array], whole: Callable[[], Array]) -> Array:
+        """What a set has along its chords or whole; of splats and others, both only where there are both."""
+        if self.spread == "centres" or (some.splat is None and self.spread == "feet"):
+            return whole()
+        if some.splat is None:
+            return chords()
+        splat = some.splat[:, :, None, None]
+
+        def both() -> Array:
+            return jnp.where(splat, whole(), chords())
+
+        return lax.cond((some.splat | ~some.inside).all(), whole, both)
 
     def _along(self, some: _Some, rays: _Rays, away: list[Array], square: Array, ends: Array) -> Array:
         """Integrals of the profile between neighbouring `ends`, in radii."""

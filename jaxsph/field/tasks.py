@@ -119,6 +119,12 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
+    def first(self, number: int) -> SlabTask:
+        """The first so many slabs."""
+        entry = jax.tree.map(lambda leaf: leaf[..., :number], self.entry)
+        names = "slab", "bundle", "u", "v", "depth", "border"
+        return dataclasses.replace(self, entry=entry, **{name: getattr(self, name)[:number] for name in names})
+
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
         rays, u, v = self.shape[2], self.u, self.v

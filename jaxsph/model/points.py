@@ -96,6 +96,8 @@ class Points:
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
+        if spread == "feet" and splats_beyond is not None:
+            raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
         if (extinction is None) == (opacity is None):
             what = "neither" if extinction is None else "both"
             raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
