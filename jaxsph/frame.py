@@ -22,6 +22,7 @@ from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Formulas
+from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Executor
 from jaxsph.plan import Plan
@@ -35,6 +36,8 @@ from jaxsph.stages import (
     decide_by_bounds,
     decide_by_pilot,
     decide_full_rate,
+    ends,
+    limits_of,
     probe_shard,
     sum_shard,
     wanted_cells,
@@ -75,19 +78,22 @@ class Frame:
     formulas: Formulas
     shards: int
     allowed: Float[Array, ""] | None
+    min_transmittance: Float[Array, ""] | None
 
     @classmethod
     def begun(
-        cls, seen: Seen, camera: Camera, limits: Limits | None, plan: Plan, formulas: Formulas, shards: int, run: Executor
+        cls, seen: Seen, camera: Camera, settings: Settings, plan: Plan, formulas: Formulas, shards: int, run: Executor
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
         static["between_samples"] = _between_samples(seen.media)
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
+        limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
         allowed = None if limits is None else limits.tolerance
+        least = jnp.asarray(settings.min_transmittance, dtype) if ends(settings) else None
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
-        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
@@ -115,7 +121,9 @@ class Frame:
         plan = self.plan
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
         scene = (grid, camera or self.camera, self.transfer, self.media)
-        inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
+        inputs = [
+            (*scene, schedule, lattice, self.min_transmittance, nth) for schedule, nth in zip(schedules, self._each, strict=True)
+        ]
         method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays

@@ -24,11 +24,10 @@ from jaxsph.numerics.executors import Clock, Executor, Forecast
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.planning import PLANS
 from jaxsph.refinement import Decisions, Refinement
-from jaxsph.render import metadata_of, raise_for
+from jaxsph.render import metadata_of, raise_for, with_ended_rays
 from jaxsph.screen.canvas import Canvas
 from jaxsph.screen.marking import Quality
 from jaxsph.screen.packets import Queue
-from jaxsph.stages import limits_of
 
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 
@@ -154,7 +153,7 @@ class _State:
     def image(self, settings: Settings) -> Image:
         """What it looks like."""
         layers = self.filling.finished(self.canvas, [band.decisions for band in self.bands])
-        image = assemble(layers, self.word)
+        image = with_ended_rays(assemble(layers, self.word), settings)
         stats: dict[str, Any] = {
             "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
             "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -178,10 +177,10 @@ def _with_quadtree(settings: Settings) -> Settings:
 def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) -> _State:
     clock = Clock()
     plan, seen = PLANS.for_frame(scene, camera, settings, clock)
-    limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
+    shards = shards_at_hand(plan.cast.tuning)
 
     def filling(run: Executor) -> Refinement:
-        frame = Frame.begun(seen, camera, limits, plan, scene.formulas, shards, run)
+        frame = Frame.begun(seen, camera, settings, plan, scene.formulas, shards, run)
         return Refinement.of(frame, run)
 
     clock.foresee(lambda known: _rehearse(filling(Forecast(known)), worst))

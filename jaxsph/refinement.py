@@ -183,6 +183,7 @@ def shoot(
     schedule: SlabSchedule,
     lattice: Lattice | None,
     queue: Queue,
+    min_transmittance: Float[Array, ""] | None,
     first: Int[Array, ""],
     *,
     shape: tuple[int, int],
@@ -198,9 +199,11 @@ def shoot(
     pick, packets_of = KINDS[kind]
     chosen, made = pick(queue, first, packets), registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan, made, packets_of, formulas.mix)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen, min_transmittance)
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
+    if rays.left_out is not None:
+        spent = spent - rays.left_out
     spent = jnp.where(chosen.real.T, spent[:, None], 0)
     return Shot(chosen.pixels(grid, shape), canvases.channels_of(color, *others), spent)
 
@@ -360,7 +363,7 @@ class Refinement:
         cast_plan = plan.cast.of_shard(frame.shards)
         if kind == "scattered":
             cast_plan = cast_plan.for_rays(SCATTERED)
-        scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue
+        scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue, frame.min_transmittance
         inputs = [(*scene, jnp.int32(turn * packets)) for turn in range(turns)]
         static = {"shape": (plan.height, plan.width), "packets": packets, "kind": kind, "cast_plan": cast_plan}
         method = {"integrator": plan.chosen_integrator, "formulas": frame.formulas, **self._tuned}

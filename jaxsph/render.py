@@ -33,7 +33,7 @@ from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
-from jaxsph.stages import limits_of
+from jaxsph.stages import ends
 from jaxsph.version import __version__
 from jaxsph.viewing import Seen
 
@@ -107,7 +107,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
     raise_for(word, planned)
-    image = assemble(layers, word)
+    image = with_ended_rays(assemble(layers, word), settings)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -133,8 +133,8 @@ def _draw(
     progress: Progress | None,
 ) -> tuple[list[Band], Layers]:
     """All bands one by one, and the layers of the image."""
-    limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
-    frame, bands = Frame.begun(seen, camera, limits, plan, formulas, shards, run), []
+    shards: int = shards_at_hand(plan.cast.tuning)
+    frame, bands = Frame.begun(seen, camera, settings, plan, formulas, shards, run), []
     if plan.quadtree is not None:
         return refined(frame, run, progress)
     for band in range(plan.bands):
@@ -149,10 +149,9 @@ def _draw(
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
     run = Traced()
     seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
-    limits = limits_of(settings, seen.viewed.x.dtype)
-    frame = Frame.begun(seen, camera, limits, plan, scene.formulas, 1, run)
+    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
     if plan.quadtree is not None:
-        return _refined_traced(frame, seen, run)
+        return _refined_traced(frame, seen, settings, run)
 
     def one_band(band: Int[Array, ""]) -> Any:
         found = frame.band(band * plan.band_height, run)
@@ -167,7 +166,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     layers, words, counts = results
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)]) | seen.viewed.faults
     layers = crop(layers, plan)
-    image = blank_if(word & faults.UNUSABLE != 0, assemble(layers, word))
+    image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
     filled, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
     stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": filled, "pairs": pairs}
@@ -175,13 +174,22 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     return dataclasses.replace(image, certified=certified, stats=stats)
 
 
-def _refined_traced(frame: Frame, seen: Seen, run: Traced) -> Image:
+def _refined_traced(frame: Frame, seen: Seen, settings: Settings, run: Traced) -> Image:
     bands, layers = refined(frame, run, None)
     word = functools.reduce(operator.or_, [band.faults for band in bands]) | seen.viewed.faults
-    image = blank_if(word & faults.UNUSABLE != 0, assemble(layers, word))
+    image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
     counts = {"cells": sum(band.filled for band in bands), "pairs": sum(band.pairs for band in bands)}
     stats = {"evaluations": image.evaluations.sum(), "evaluations_full": layers.full.sum(), **counts, "rays": layers.rays}
     return dataclasses.replace(image, certified=jnp.asarray(False), stats=stats)
+
+
+def with_ended_rays(image: Image, settings: Settings) -> Image:
+    """With what rays that may have ended can have left out: colour and alpha change by at most what is let through."""
+    if not ends(settings):
+        return image
+    let_through = lax.stop_gradient(image.transmittance)
+    left_out = jnp.where(let_through < settings.min_transmittance, let_through, 0)
+    return dataclasses.replace(image, error_bound=image.error_bound + left_out)
 
 
 def _certifies(plan: Plan) -> bool:

@@ -73,10 +73,18 @@ def limits_of(settings: Settings, dtype: Any) -> Limits | None:
     if settings.tolerance is None:
         return None
     tolerance = settings.tolerance
+    if ends(settings):  # which take a part of it
+        tolerance = tolerance - settings.min_transmittance
     if not is_traced(tolerance):
         rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
         tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
     return Limits(jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype))
+
+
+def ends(settings: Settings) -> bool:
+    """Whether rays may end before their ends."""
+    least = settings.min_transmittance
+    return is_traced(least) or float(least) > 0
 
 
 class BandGrid(NamedTuple):
@@ -302,6 +310,7 @@ def cast_shard(
     media: tuple[Medium, ...],
     schedule: SlabSchedule,
     lattice: Lattice | None,
+    min_transmittance: Float[Array, ""] | None,
     nth: Int[Array, ""],
     *,
     shards: int,
@@ -319,7 +328,9 @@ def cast_shard(
     made = registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice)
-    spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)
-    spent = method.packets_of(grid, camera).per_pixel(spent, BUNDLE * BUNDLE)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, min_transmittance=min_transmittance)
+    spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
+    spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
+    if rays.left_out is not None:
+        spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
     return Cast(rays, spent if of_nodes is None else spent + of_nodes)

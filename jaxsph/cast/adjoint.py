@@ -80,6 +80,7 @@ class NonDiffInputs:
     camera: Camera
     lattice: Lattice | None
     chosen: Any
+    min_transmittance: Float[Array, ""] | None
 
 
 def cast(
@@ -91,6 +92,7 @@ def cast(
     method: CastMethod,
     lattice: Lattice | None = None,
     chosen: Any = None,
+    min_transmittance: Float[Array, ""] | None = None,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
@@ -105,7 +107,7 @@ def cast(
     """
     columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
-    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen))
+    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance))
     return _cast(method, inputs, fixed)
 
 
@@ -119,7 +121,8 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
         medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
-        return march(grid, fixed.schedule, packets, medium, method.integrator, method.plan, camera.is_perspective)
+        how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance
+        return march(grid, fixed.schedule, packets, *how)
 
 
 def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
@@ -221,7 +224,8 @@ def _pull(
     grid, camera = _seen(inputs, fixed)
     packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
     on_borders = bool(method.integrator.halo)
-    batches = batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, on_borders)
+    how = camera.is_perspective, on_borders, fixed.min_transmittance
+    batches = batches_of(grid, fixed.schedule, packets, plan, *how)
     dtype = grid.half_steps.dtype
     medium = Mixture.of(media, method.mix)
     start = Accumulated(medium.no_cotangents(), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
@@ -259,7 +263,7 @@ class _Backward:
 
         def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
             rays, held, total = carry
-            batch = batches.batch(nth)
+            batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
 
             def march_chunk(chunk: Array, held: Any) -> Any:
                 items, begin = batches.chunk(batch, chunk)

@@ -66,7 +66,7 @@ class Batch:
     Attributes:
         items: `slab * packets + packet` of each, in the order of the compacted slabs.
         marched: the same, in the order in which they are marched, and dummies such that chunks hold slabs of one method.
-        slot: where in that order each of `items` is.
+        slot: where in that order each of `items` is; past the last where it is not marched, as its rays have ended.
         first, number: where the batch begins in the compacted slabs, and how many of its slabs are real.
         chunks: how many chunks are marched.
     """
@@ -89,6 +89,7 @@ class Batches:
             sample has length zero.
         order: the items of `compacted`, and dummies up to a whole batch.
         on_borders: whether samples lie on the borders between what they stand for, one more than else.
+        min_transmittance: rays end below it; None where they go on to their ends.
     """
 
     schedule: SlabSchedule
@@ -99,6 +100,7 @@ class Batches:
     plan: CastPlan
     perspective: bool
     on_borders: bool
+    min_transmittance: Float[Array, ""] | None = None
 
     @property
     def num_packets(self) -> int:
@@ -115,19 +117,35 @@ class Batches:
         """How many batches there are."""
         return (self.compacted.start[-1] + self.plan.batch_slabs - 1) // self.plan.batch_slabs
 
-    def batch(self, nth: Array) -> Batch:
-        """The slabs of one batch, in the order of the compacted slabs and by fullness."""
+    def batch(self, nth: Array, ended: Bool[Array, " packets"] | None = None) -> Batch:
+        """The slabs of one batch, in the order of the compacted slabs and by fullness; of packets that have `ended`, none."""
         first = nth * self.plan.batch_slabs
         items = lax.dynamic_slice(self.order, (first,), (self.plan.batch_slabs,))
         dummy = self.schedule.count.size
         inside, real = jnp.minimum(items, dummy - 1), items < dummy
         method = None if self.schedule.method is None else self.schedule.method.ravel()[inside]
         number = real.sum(dtype=jnp.int32)
-        order = _by_fullness(self.schedule.count.ravel()[inside], method, real)
-        place, end = self._slots(method, real, number)
+        wanted = real if ended is None else real & ~ended[inside % self.num_packets]
+        order = _by_fullness(self.schedule.count.ravel()[inside], method, wanted)
+        place, end = self._slots(method, wanted, wanted.sum(dtype=jnp.int32))
         slot = jnp.zeros(self.plan.batch_slabs, jnp.int32).at[order].set(place)
-        marched = jnp.full(self.num_slots, dummy, jnp.int32).at[place].set(items[order])
+        marched = jnp.full(self.num_slots, dummy, jnp.int32).at[place].set(jnp.where(wanted, items, dummy)[order])
+        if ended is not None:
+            slot = jnp.where(wanted, slot, self.num_slots)  # where light is that of nothing
         return Batch(items, marched, slot, first, number, (end + self.plan.chunk - 1) // self.plan.chunk)
+
+    def ended(self, transmittance: Float[Array, "packets_and_room rays"]) -> Bool[Array, " packets"] | None:
+        """Packets all of whose rays let too little through for more to be met; given those by height."""
+        if self.min_transmittance is None:
+            return None
+        return (transmittance.max(1) < self.min_transmittance)[self.compacted.bundle_rank]
+
+    def left_out(self, batch: Batch, of_slabs: Float[Array, "slabs packets"]) -> Float[Array, " packets"]:
+        """Of what is spent on each slab, what a batch leaves out, by packet."""
+        dummy = of_slabs.size
+        out = (batch.items < dummy) & (batch.slot == self.num_slots)
+        spent = jnp.where(out, of_slabs.ravel()[jnp.minimum(batch.items, dummy - 1)], 0)
+        return jnp.zeros(self.num_packets, spent.dtype).at[batch.items % self.num_packets].add(spent)
 
     def _slots(self, method: Int[Array, " batch"] | None, real: Bool[Array, " batch"], number: Array) -> tuple[Array, Array]:
         """Where the slabs are marched, method after method, each from the beginning of a chunk on; and where that ends."""
@@ -189,7 +207,13 @@ class Batches:
 
 
 def batches_of(
-    grid: Grid, schedule: SlabSchedule, packets: RayPackets, plan: CastPlan, perspective: bool, on_borders: bool = False
+    grid: Grid,
+    schedule: SlabSchedule,
+    packets: RayPackets,
+    plan: CastPlan,
+    perspective: bool,
+    on_borders: bool = False,
+    min_transmittance: Float[Array, ""] | None = None,
 ) -> Batches:
     """The batches that a `schedule` of bundles is marched in, by packets that read the bundles' lists."""
     schedule = packets.schedule_of(schedule)
@@ -197,7 +221,7 @@ def batches_of(
     compacted = compact(schedule.filled)
     order = jnp.pad(compacted.item, (0, plan.batch_slabs), constant_values=slabs * num_packets)
     half_steps = with_room(grid.half_steps, grid.samples, slabs, plan)
-    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, on_borders)
+    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, on_borders, min_transmittance)
 
 
 def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Array:

@@ -60,6 +60,11 @@ class RayPackets:
             return per_ray if share == 1 else per_ray * share
         return jnp.zeros_like(per_ray).at[self.list_id].add(share * per_ray[self.list_id])
 
+    def sum_per_pixel(self, of_packets: Float[Array, " packets"], bundles: int, pixels: int) -> Float[Array, " bundles"]:
+        """Of what a ray of each packet takes, what rays take in all, a pixel of each bundle."""
+        share = of_packets * (self.num_rays / pixels)
+        return share if self.list_id is None else jnp.zeros(bundles, share.dtype).at[self.list_id].add(share)
+
 
 @dataclasses.dataclass(frozen=True)
 class SlabTask:

@@ -18,7 +18,9 @@ ALLOCATIONS = ("budget", "greedy", "paper", "independent")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Choices of the user; hashable where they fix a shape. `tolerance` and `relax` are leaves: changing them compiles nothing.
+    """Choices of the user; hashable where they fix a shape. `tolerance`, `relax` and `min_transmittance` are leaves.
+
+    Changing leaves compiles nothing (but for `min_transmittance` from and to 0, which has nothing looked at).
 
     Attributes:
         samples: fine samples N along every ray, at least 1.
@@ -46,6 +48,9 @@ class Settings:
         leaf_pixels: on each side of the quadtree's first leaves, 4, 8, 16 or 32.
         leaf_estimator: by what leaves are split; `"hierarchical"` compares two approximations (Kratz et al. 2011, section 3),
             `"corner_variance"` is that of Levoy 1990, `"uniform"` splits all.
+        min_transmittance: rays end where all of their bundle let less through than this, in [0, 1/2): what is left out of a
+            pixel is at most what is let through there, and is in its `error_bound`. A tolerance is kept with it, of which it
+            takes so much; with 0 no ray ends.
         memory_limit: bytes that a frame's working arrays may take; the image is rendered in bands to keep it. None is 4 GiB, or
             half of an accelerator's memory.
     """
@@ -62,6 +67,7 @@ class Settings:
     screen: str = "pixels"
     leaf_pixels: int = 8
     leaf_estimator: str = "hierarchical"
+    min_transmittance: Any = 0.0
     memory_limit: int | None = None
 
     def __post_init__(self) -> None:
@@ -89,6 +95,11 @@ class Settings:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.leaf_estimator not in LEAF_ESTIMATORS:
             raise ValueError(f"`leaf_estimator` must be one of {', '.join(LEAF_ESTIMATORS)}, got {self.leaf_estimator!r}")
+        least = self.min_transmittance
+        if _is_number(least) and not 0 <= least < 0.5:
+            raise ValueError(f"`min_transmittance` must lie in [0, 1/2), got {least}; 0 follows rays to their ends")
+        if _is_number(least) and _is_number(self.tolerance) and 0 < self.tolerance <= least:
+            raise ValueError(f"`min_transmittance` must be less than `tolerance`, of which it takes a part, got {least}")
         if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
@@ -102,7 +113,7 @@ def _is_number(value: Any) -> bool:
 
 jax.tree_util.register_dataclass(
     Settings,
-    data_fields=["tolerance", "relax"],
+    data_fields=["tolerance", "relax", "min_transmittance"],
     meta_fields=[
         "samples",
         "estimator",
