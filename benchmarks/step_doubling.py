@@ -52,7 +52,7 @@ class CountedSamples(Integrator):
     def segment(self, optics, path):
         raise NotImplementedError("counts have no derivatives")
 
-    def __call__(self, media: tuple[Medium, ...], gathered: tuple[object, ...], task: SlabTask) -> Segment:
+    def __call__(self, medium: Medium, gathered: object, task: SlabTask) -> Segment:
         """See `Integrator`."""
         real = (task.border[:, 1:] > task.border[:, :-1]).sum(1).astype(task.border.dtype)
         return counted(jnp.broadcast_to(real[:, None], task.shape[::2]), task)
@@ -61,9 +61,9 @@ class CountedSamples(Integrator):
 class CountedSteps(StepDoubling):
     """Those of step doubling."""
 
-    def __call__(self, media: tuple[Medium, ...], gathered: tuple[object, ...], task: SlabTask) -> Segment:
+    def __call__(self, medium: Medium, gathered: object, task: SlabTask) -> Segment:
         """See `Integrator`."""
-        return counted(self.march(media, task).evaluations.reshape(task.shape[::2]).astype(task.border.dtype), task)
+        return counted(self.march(medium, task).evaluations.reshape(task.shape[::2]).astype(task.border.dtype), task)
 
 
 COUNTING = {"samples": "counted_samples", "step_doubling": "counted_steps"}

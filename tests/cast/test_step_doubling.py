@@ -13,6 +13,7 @@ import jaxsph as js
 from jaxsph.cast.step_doubling import SHORTEST, StepDoubling
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
+from jaxsph.model.mixture import Mixture
 
 NEAR, FAR, SAMPLES, POINTS = 1.0, 3.0, 8, 64
 COLOR = 0.2, 0.5, 0.9
@@ -64,7 +65,8 @@ def slab(perspective=False):
 def marched(media, task, tolerance):
     """Light of rays, and evaluations of each."""
     made = StepDoubling(tolerance, SAMPLES)
-    return made(media, (), task), made.march(media, task).evaluations
+    medium = Mixture.of(media)
+    return made(medium, medium.gather(task), task), made.march(medium, task).evaluations
 
 
 NOTHING = along([NEAR, FAR], [0.0, 0.0])
