@@ -21,6 +21,7 @@ from jaxsph.layers import OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
+from jaxsph.model.scene import Formulas
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Executor
 from jaxsph.plan import Plan
@@ -71,21 +72,22 @@ class Frame:
     media: tuple[Medium, ...]
     limits: Limits | None
     plan: Plan
-    kernel: str
+    formulas: Formulas
     shards: int
     allowed: Float[Array, ""] | None
 
     @classmethod
     def begun(
-        cls, seen: Seen, camera: Camera, limits: Limits | None, plan: Plan, kernel: str, shards: int, run: Executor
+        cls, seen: Seen, camera: Camera, limits: Limits | None, plan: Plan, formulas: Formulas, shards: int, run: Executor
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
+        static["between_samples"] = _between_samples(seen.media)
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         allowed = None if limits is None else limits.tolerance
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
-        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, kernel, shards, allowed)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
@@ -101,7 +103,7 @@ class Frame:
     ) -> BandGrid:
         """Of the band that begins at a row of pixels, or of another camera's nodes."""
         plan = self.plan
-        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "halo": self._halo}
+        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "beside": self._beside}
         sizes["tuning"] = plan.cast.tuning
         made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
         return made
@@ -114,7 +116,7 @@ class Frame:
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
         scene = (grid, camera or self.camera, self.transfer, self.media)
         inputs = [(*scene, schedule, lattice, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
-        method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "kernel": self.kernel}
+        method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays
 
@@ -125,6 +127,10 @@ class Frame:
     @property
     def _halo(self) -> int:
         return int(registry.integrator(*self.plan.chosen_integrator).halo)
+
+    @property
+    def _beside(self) -> bool:
+        return bool(self._halo) or _between_samples(self.media)
 
     @property
     def _cast(self) -> dict[str, Any]:
@@ -148,7 +154,13 @@ class Frame:
     def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
         view = (grid, self.camera, self.transfer)
         inputs = [(*view, nth) for nth in self._each]
-        static = {"shards": self.shards, "lists": self.plan.lists, "control": control, "kernel": self.kernel, **self._cast}
+        static = {
+            "shards": self.shards,
+            "lists": self.plan.lists,
+            "control": control,
+            "kernel": self.formulas.kernel,
+            **self._cast,
+        }
         lattices = run.each("adapt", sum_shard, inputs, **static)
         several, tuning = self.shards > 1, self.plan.cast.tuning
         lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
@@ -164,3 +176,8 @@ class Frame:
         view = (grid, self.camera, self.transfer, self.limits)
         inputs = [(*view, of_shard, nth) for of_shard, nth in zip(wanted, self._each, strict=True)]
         return run.each("adapt", decide_by_bounds, inputs, **static)
+
+
+def _between_samples(media: tuple[Medium, ...]) -> bool:
+    """Whether any medium meets spheres between samples."""
+    return any(medium.between_samples for medium in media)

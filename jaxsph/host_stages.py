@@ -26,7 +26,7 @@ from jaxsph.stages import BandGrid, grid_of_lists, make_grid, order, stage
 Found = Int[Array, " particles"] | None
 
 
-@stage("lists", "samples", "halo")
+@stage("lists", "samples", "beside")
 def find_windows(
     ordered: Ordered,
     made: BundleLists,
@@ -35,11 +35,11 @@ def find_windows(
     *,
     lists: ListPlan,
     samples: int,
-    halo: int,
+    beside: bool,
     tuning: Tuning,
 ) -> BandGrid:
     """All but the lists of the grid of the band that begins at a row of pixels; what a program returns it would copy."""
-    return grid_of_lists(ordered, made, camera, first_row, lists, samples, halo)._replace(lists=None)  # type: ignore[arg-type]
+    return grid_of_lists(ordered, made, camera, first_row, lists, samples, beside)._replace(lists=None)  # type: ignore[arg-type]
 
 
 def _order(run: Clock, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:

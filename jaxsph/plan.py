@@ -25,6 +25,7 @@ from jaxsph.model.particles import capacity_class
 from jaxsph.model.registry import AT_POINTS
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.model.spheres import num_spheres
 from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
 from jaxsph.screen.quadtree import QuadtreePlan
 
@@ -93,7 +94,7 @@ class Plan:
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
         self.check_image(camera, along_rays(scene, settings))
-        capacity = scene.particle_set.capacity
+        capacity = num_spheres(scene)
         if capacity > self.num_particles:
             raise ValueError(
                 f"`plan` was made for scene.particles.capacity = {self.num_particles} at most, got {capacity}; "

@@ -25,6 +25,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.model.spheres import spheres_of
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
@@ -63,7 +64,7 @@ def plan(
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     settings = along_rays(scene, settings)
-    shape = dataclasses.replace(shape_of(scene.particle_set, camera, settings), headroom=1.0)
+    shape = dataclasses.replace(shape_of(spheres_of(scene), camera, settings), headroom=1.0)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
@@ -79,9 +80,9 @@ def plan(
 
 def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: int, run: Executor) -> Seen:
     """Have the scene viewed, with its particles padded to a capacity."""
-    if scene.particles is not None and scene.particles.capacity < capacity:
-        scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particles,), capacity=capacity))
-    seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, num_classes=num_classes)
+    if not scene.point_sets and scene.particle_set.capacity < capacity:
+        scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particle_set,), capacity=capacity))
+    seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, capacity=capacity, num_classes=num_classes)
     return seen.with_data(scene)
 
 
@@ -112,7 +113,7 @@ class Plans:
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings = along_rays(scene, settings)
-        shape = self._similar(shape_of(scene.particle_set, camera, settings))
+        shape = self._similar(shape_of(spheres_of(scene), camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
         seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))

@@ -181,7 +181,7 @@ def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) 
     limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
 
     def filling(run: Executor) -> Refinement:
-        frame = Frame.begun(seen, camera, limits, plan, scene.particle_set.kernel, shards, run)
+        frame = Frame.begun(seen, camera, limits, plan, scene.formulas, shards, run)
         return Refinement.of(frame, run)
 
     clock.foresee(lambda known: _rehearse(filling(Forecast(known)), worst))

@@ -28,6 +28,7 @@ from jaxsph.layers import Layers, OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
+from jaxsph.model.scene import Formulas
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Executor
 from jaxsph.numerics.tuning import Tuning
@@ -173,7 +174,7 @@ def judge(
     return leaves_of(canvas, sizes.sides, sizes.leaf, ESTIMATORS[sizes.estimator], tolerance, bound)[1]
 
 
-@stage("shape", "packets", "kind", "cast_plan", "integrator", "kernel")
+@stage("shape", "packets", "kind", "cast_plan", "integrator", "formulas")
 def shoot(
     grid: Grid,
     camera: Camera,
@@ -189,14 +190,15 @@ def shoot(
     kind: str,
     cast_plan: CastPlan,
     integrator: tuple[Any, ...],
-    kernel: str,
+    formulas: Formulas,
     tuning: Tuning,
 ) -> Shot:
     """Cast the rays of so many bundles of a queue."""
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     pick, packets_of = KINDS[kind]
     chosen, made = pick(queue, first, packets), registry.integrator(*integrator)
-    rays = cast(grid, schedule, camera, transfer, media, CastMethod(kernel, cast_plan, made, packets_of), lattice, chosen)
+    method = CastMethod(formulas.kernel, cast_plan, made, packets_of, formulas.mix)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen)
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
     spent = jnp.where(chosen.real.T, spent[:, None], 0)
@@ -361,7 +363,7 @@ class Refinement:
         scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue
         inputs = [(*scene, jnp.int32(turn * packets)) for turn in range(turns)]
         static = {"shape": (plan.height, plan.width), "packets": packets, "kind": kind, "cast_plan": cast_plan}
-        method = {"integrator": plan.chosen_integrator, "kernel": frame.kernel, **self._tuned}
+        method = {"integrator": plan.chosen_integrator, "formulas": frame.formulas, **self._tuned}
         return [
             shot
             for first in range(0, turns, frame.shards)

@@ -23,7 +23,7 @@ from jaxsph.frame import Band, Frame
 from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Formulas, Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
@@ -102,7 +102,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         plan.check(scene, camera, settings)
         clock.mark("plan")
         seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, clock)
-    draw = functools.partial(_draw, seen, camera, settings, plan, scene.particle_set.kernel)
+    draw = functools.partial(_draw, seen, camera, settings, plan, scene.formulas)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
@@ -128,13 +128,13 @@ def _draw(
     camera: Camera,
     settings: Settings,
     plan: Plan,
-    kernel: str,
+    formulas: Formulas,
     run: Executor,
     progress: Progress | None,
 ) -> tuple[list[Band], Layers]:
     """All bands one by one, and the layers of the image."""
     limits, shards = limits_of(settings, seen.viewed.x.dtype), shards_at_hand(plan.cast.tuning)
-    frame, bands = Frame.begun(seen, camera, limits, plan, kernel, shards, run), []
+    frame, bands = Frame.begun(seen, camera, limits, plan, formulas, shards, run), []
     if plan.quadtree is not None:
         return refined(frame, run, progress)
     for band in range(plan.bands):
@@ -150,7 +150,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     run = Traced()
     seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
     limits = limits_of(settings, seen.viewed.x.dtype)
-    frame = Frame.begun(seen, camera, limits, plan, scene.particle_set.kernel, 1, run)
+    frame = Frame.begun(seen, camera, limits, plan, scene.formulas, 1, run)
     if plan.quadtree is not None:
         return _refined_traced(frame, seen, run)
 

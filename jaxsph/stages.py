@@ -36,13 +36,14 @@ from jaxsph.field.schedule import SlabSchedule, evaluations, full_rate, referenc
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
+from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning
-from jaxsph.viewing import half_steps
+from jaxsph.viewing import half_steps, sphere_depths
 
 
 def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]], Any]:
@@ -119,7 +120,7 @@ class Decided(NamedTuple):
     verdict: Verdict
 
 
-@stage("samples", "slab_samples", quickly=True)
+@stage("samples", "slab_samples", "between_samples", quickly=True)
 def order(
     viewed: Viewed,
     camera: Camera,
@@ -127,30 +128,31 @@ def order(
     *,
     samples: int,
     slab_samples: int,
+    between_samples: bool,
     tuning: Tuning,
 ) -> Ordered:
     """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
-    depths = half_steps(camera, viewed.x.dtype, samples)[1::2]
+    depths = sphere_depths(camera, viewed.x.dtype, samples, between_samples)
     if found is None:
         return rank_particles(viewed, camera, depths, slab_samples)
     return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
 
 
-@stage("lists", "samples", "halo")
+@stage("lists", "samples", "beside")
 def make_grid(
-    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, halo: int, tuning: Tuning
+    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, beside: bool, tuning: Tuning
 ) -> BandGrid:
-    """The grid of the band that begins at a row of pixels; `halo` is that of the integrator."""
+    """The grid of the band that begins at a row of pixels; of spheres that lie `beside` samples, too."""
     still, looking = jax.tree.map(lax.stop_gradient, (ordered, camera))
-    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, halo)
+    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, beside)
 
 
 def grid_of_lists(
-    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, halo: int
+    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, beside: bool
 ) -> BandGrid:
     """The same, given the lists of its bundles."""
     depths = half_steps(camera, ordered.x.dtype, samples)
-    windows = (slab_windows_with_borders if halo else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
+    windows = (slab_windows_with_borders if beside else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
     pairs = (made.end - made.start).sum(dtype=jnp.int32)
     return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
 
@@ -292,7 +294,7 @@ class Cast(NamedTuple):
     evaluations: Float[Array, " bundles"]
 
 
-@stage("shards", "cast_plan", "integrator", "screen", "kernel")
+@stage("shards", "cast_plan", "integrator", "screen", "formulas")
 def cast_shard(
     grid: Grid,
     camera: Camera,
@@ -306,7 +308,7 @@ def cast_shard(
     cast_plan: CastPlan,
     integrator: tuple[Any, ...],
     screen: str,
-    kernel: str,
+    formulas: Formulas,
     tuning: Tuning,
 ) -> Cast:
     """The `nth` of `shards` of a band. The grid is of the whole band, and so is the schedule with a lattice."""
@@ -315,7 +317,7 @@ def cast_shard(
     if lattice is not None:
         schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
     made = registry.integrator(*integrator)
-    method = CastMethod(kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets)
+    method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
     rays = cast(grid, schedule, camera, transfer, media, method, lattice)
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)

@@ -16,10 +16,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.quantities import rescaled, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.access.view import Viewed, view_particles
+from jaxsph.field.points import PointsMedium
 from jaxsph.field.volume import VolumeMedium
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Scene
+from jaxsph.model.spheres import first_spheres, spheres_of
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.programs import compiled_quickly
@@ -39,20 +41,21 @@ class Seen(NamedTuple):
 
     def with_data(self, scene: Scene) -> Seen:
         """With the arrays of the scene that media read, which no stage is to copy."""
-        given = (*(volume for volume, _ in scene.volumes), *scene.media)
+        given = (*(volume for volume, _ in scene.volumes), *scene.point_sets, *scene.media)
         return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
 
 
 @compiled_quickly
-@functools.partial(jax.jit, static_argnames=("samples", "num_classes"))
-def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) -> Seen:
+@functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes"))
+def view_scene(scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
-    dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), scene.particle_set
+    dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     if transfer is not None:
         quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
         particles = dataclasses.replace(particles, quantity=quantity)
-    viewed = view_particles(particles, camera, half_steps(camera, dtype, samples)[1::2], num_classes)
+    depths = sphere_depths(camera, dtype, samples, bool(scene.point_sets))
+    viewed = view_particles(particles, camera, depths, num_classes)
     media = _media(scene, camera)
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
@@ -62,12 +65,21 @@ def view_scene(scene: Scene, camera: Camera, *, samples: int, num_classes: int) 
 def _media(scene: Scene, camera: Camera) -> tuple[Medium, ...]:
     """All media but particles, in view space."""
     volumes = (VolumeMedium.seen(volume, transfer, camera) for volume, transfer in scene.volumes)
-    return *volumes, *(medium.seen_by(camera) for medium in scene.media)
+    first = first_spheres(scene)
+    sets = (PointsMedium.seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
+    return *volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
     """View depths s(0), s(1/2), ... s(N): fine samples sit at the odd entries, between borders at the even ones."""
     return camera.depth(jnp.arange(2 * samples + 1, dtype=dtype) / 2, samples).astype(dtype)
+
+
+def sphere_depths(camera: Camera, dtype: Any, samples: int, between_samples: bool) -> Float[Array, " samples"]:
+    """Depths of the fine samples, by which spheres are ordered; out to the borders of the first and the last where they count."""
+    steps = half_steps(camera, dtype, samples)
+    depths = steps[1::2]
+    return depths.at[0].set(steps[0]).at[-1].set(steps[-1]) if between_samples and samples > 1 else depths
 
 
 def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:

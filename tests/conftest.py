@@ -179,7 +179,7 @@ def grid_of(particles, camera, *, plan):
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    sizes = {"lists": plan.lists, "samples": plan.samples, "halo": 0, "tuning": plan.cast.tuning}
+    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
     grid = make_grid(ordered, camera, 0, **sizes).of(ordered)
     return grid, reference_quantities(grid.windows, grid.lists.rank, ordered.quantity)
 

@@ -30,13 +30,14 @@ class Ordered(Columns):
     """Particles in rank order (class, then depth); those that no sample can meet come last.
 
     Ranks from `first_rank` up to `last_rank` can touch a sample of the slab; from `first_beside` up to `last_beside` any point
-    between the samples before and after it, where samples of wider spacing lie.
+    between the samples before and after it, where samples of wider spacing lie. `index` is each one's place before.
     """
 
     first_rank: Int[Array, "classes slabs"]
     last_rank: Int[Array, "classes slabs"]
     first_beside: Int[Array, "classes slabs"]
     last_beside: Int[Array, "classes slabs"]
+    index: Int[Array, " particles"]
 
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Columns))
@@ -64,7 +65,8 @@ def in_order(
     """The same, given the sorted keys and the order that sorts them."""
     ranked = {name: getattr(viewed, name)[order] for name in COLUMNS}
     begin, end = _windows(key, viewed.widest, camera, depths, slab_samples)
-    return Ordered(**ranked, first_rank=begin[0], last_rank=end[0], first_beside=begin[1], last_beside=end[1])
+    windows = {"first_rank": begin[0], "last_rank": end[0], "first_beside": begin[1], "last_beside": end[1]}
+    return Ordered(**ranked, **windows, index=order)
 
 
 def _windows(

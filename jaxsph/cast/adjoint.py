@@ -34,7 +34,8 @@ from jaxsph.field.schedule import SlabSchedule
 from jaxsph.field.tasks import RayPackets, SlabTask
 from jaxsph.field.transposed import COLUMNS
 from jaxsph.model.camera import Camera
-from jaxsph.model.medium import Medium, mixed
+from jaxsph.model.medium import Medium
+from jaxsph.model.mixture import Mixture
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
@@ -46,12 +47,13 @@ Layers = tuple[Array, Array]  # colour and transmittance of an image, or their c
 
 @dataclasses.dataclass(frozen=True)
 class CastMethod:
-    """How rays are cast, static: by which kernel, sizes and integrator, and through which packets of rays."""
+    """How rays are cast, static: by which kernel, sizes, integrator and mixing of media, and through which packets of rays."""
 
     kernel: str
     plan: CastPlan
     integrator: Integrator
     packets_of: Callable[..., RayPackets]
+    mix: str = "extinction"
 
     def packets(self, grid: Grid, camera: Camera, chosen: Any) -> RayPackets:
         """Of a grid and a camera, and of what was chosen if anything was."""
@@ -115,8 +117,9 @@ def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayRe
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
     grid, camera = _seen(inputs, fixed)
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
-        media, packets = _media(method, inputs, fixed, Wanted()), method.packets(grid, camera, fixed.chosen)
-        return march(grid, fixed.schedule, packets, media, method.integrator, method.plan, camera.is_perspective)
+        medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
+        packets = method.packets(grid, camera, fixed.chosen)
+        return march(grid, fixed.schedule, packets, medium, method.integrator, method.plan, camera.is_perspective)
 
 
 def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
@@ -127,10 +130,11 @@ def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
 
 def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
     """All media, particles first if there are any."""
-    if inputs.transfer is None:
-        return inputs.media
     grid, _ = _seen(inputs, fixed)
-    return ParticleMedium(grid, inputs.transfer.segments(), fixed.lattice, method.kernel, wanted), *inputs.media
+    media = tuple(medium.in_band(grid) for medium in inputs.media)
+    if inputs.transfer is None:
+        return media
+    return ParticleMedium(grid, inputs.transfer.segments(), fixed.lattice, method.kernel, wanted), *media
 
 
 def _moved(
@@ -199,12 +203,12 @@ class Accumulated:
     """Cotangents added up over slabs.
 
     Attributes:
-        media: of each medium, see `Medium.no_cotangents`.
+        medium: of all that is met, see `Medium.no_cotangents`.
         half_steps: of the depths of samples and borders.
         factor: of a common factor of all ray coordinates.
     """
 
-    media: tuple[Any, ...]
+    medium: Any
     half_steps: Float[Array, " two_samples_and_more"]
     factor: Float[Array, ""]
 
@@ -219,19 +223,19 @@ def _pull(
     on_borders = bool(method.integrator.halo)
     batches = batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, on_borders)
     dtype = grid.half_steps.dtype
-    start = Accumulated(
-        tuple(medium.no_cotangents() for medium in media), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype)
-    )
+    medium = Mixture.of(media, method.mix)
+    start = Accumulated(medium.no_cotangents(), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
     with barriers(plan.tuning.fusion_barriers):
-        found = _Backward(batches, media, method.integrator, wanted.field).pull(image, cotangent, start)
-    columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, found.media
+        found = _Backward(batches, medium, method.integrator, wanted.field).pull(image, cotangent, start)
+    of_media = found.medium if len(media) > 1 else (found.medium,)
+    columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, of_media
     if inputs.transfer is not None:
-        particles, others = found.media[0], found.media[1:]
+        particles, *others = of_media
         columns, transfer = particles.columns(), particles.of_transfer()
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)
-    total = DiffInputs(columns, half_steps, half_height, transfer, others)
+    total = DiffInputs(columns, half_steps, half_height, transfer, tuple(others))
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
@@ -240,7 +244,7 @@ class _Backward:
     """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are, too."""
 
     batches: Batches
-    media: tuple[Medium, ...]
+    medium: Medium
     integrator: Integrator
     geometry: bool
 
@@ -275,44 +279,33 @@ class _Backward:
         rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
         return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
 
-    def march(self, items: Array) -> tuple[tuple[Array, ...], tuple[Any, ...]]:
-        """Red, green, blue and transmittance of slabs, and what media gather there."""
+    def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
+        """Red, green, blue and transmittance of slabs, and what their medium gathers there."""
         task = self.batches.task(items)
-        gathered = tuple(medium.gather(task) for medium in self.media)
-        light = self.integrator(self.media, gathered, task)
+        gathered = self.medium.gather(task)
+        light = self.integrator(self.medium, gathered, task)
         return (*light.color, light.transmittance), gathered
 
-    def pull_slabs(
-        self, items: Array, gathered: tuple[Any, ...], of_slabs: Float[Array, "4 tasks rays"], total: Accumulated
-    ) -> Accumulated:
+    def pull_slabs(self, items: Array, gathered: Any, of_slabs: Float[Array, "4 tasks rays"], total: Accumulated) -> Accumulated:
         """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
         task = self.batches.task(items)
         through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
         of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
-        of_media, of_depth, of_factor = [], jnp.zeros_like(task.depth), total.factor
-        for medium, so_far, found, cotangents in zip(self.media, total.media, gathered, of_optics, strict=True):
-            added, (depth, factor) = medium.pull(so_far, found, task, cotangents)
-            of_media.append(added)
-            of_depth, of_factor = of_depth + depth, of_factor + factor
+        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics)
         if not self.geometry:
-            return dataclasses.replace(total, media=tuple(of_media))
+            return dataclasses.replace(total, medium=of_medium)
 
         def path(border: Array, factor: Array) -> Array:
             return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
 
-        of_border, factor = jax.vjp(path, task.border, jnp.ones_like(of_factor))[1](of_path)
+        of_border, factor = jax.vjp(path, task.border, jnp.ones_like(places.factor))[1](of_path)
         pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
-        (of_half_steps,) = pull_depths((of_depth, of_border))
-        return Accumulated(tuple(of_media), total.half_steps + of_half_steps, of_factor + factor)
+        (of_half_steps,) = pull_depths((places.depth, places.border + of_border))
+        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + places.factor + factor)
 
-    def pull_integrator(self, gathered: tuple[Any, ...], task: SlabTask, of_slabs: Array) -> tuple[list[Optics], Array]:
-        """Cotangents of each medium's red, green, blue and extinction at samples, and of path lengths."""
-
-        def light(optics: list[Optics], path: Array) -> tuple[Optics, Array]:
-            return self.integrator.segment(mixed(optics), path)
-
-        optics = [medium.optics(found, task) for medium, found in zip(self.media, gathered, strict=True)]
-        (_, thickness), pull = jax.vjp(light, optics, task.path())
+    def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
+        """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
+        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.optics(gathered, task), task.path())
         of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
         return of_optics, of_path
 

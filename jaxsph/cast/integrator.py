@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.field.tasks import SlabTask
-from jaxsph.model.medium import Medium, mixed
+from jaxsph.model.medium import Medium
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
 
@@ -57,10 +57,9 @@ class Integrator(abc.ABC):
             path: path length of each interval.
         """
 
-    def __call__(self, media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Segment:
-        """Light of slabs, by what media have gathered there; for an integrator that wants its passes over memory otherwise."""
-        optics = [medium.optics(found, task) for medium, found in zip(media, gathered, strict=True)]
-        color, thickness = self.segment(mixed(optics), task.path())
+    def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
+        """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
+        color, thickness = self.segment(medium.optics(gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
 
 

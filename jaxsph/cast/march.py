@@ -37,7 +37,7 @@ def march(
     grid: Grid,
     schedule: SlabSchedule,
     packets: RayPackets,
-    media: tuple[Medium, ...],
+    medium: Medium,
     integrator: Integrator,
     plan: CastPlan,
     perspective: bool,
@@ -56,7 +56,7 @@ def march(
 
         def march_chunk(chunk: Array, light: Segment) -> Segment:
             items, begin = batches.chunk(batch, chunk)
-            found = segments_of(batches, items, media, integrator)
+            found = segments_of(batches, items, medium, integrator)
             return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
 
         def borders(place: Array) -> Array:
@@ -72,10 +72,10 @@ def march(
     return result_of(rays, batches)
 
 
-def segments_of(batches: Batches, items: Array, media: tuple[Medium, ...], integrator: Integrator) -> Segment:
+def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Integrator) -> Segment:
     """What slabs emit and let through."""
     task = batches.task(items)
-    return integrator(media, tuple(medium.gather(task) for medium in media), task)
+    return integrator(medium, medium.gather(task), task)
 
 
 def result_of(rays: RayState, batches: Batches) -> RayResult:

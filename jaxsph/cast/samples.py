@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.cast.integrator import Integrator, Optics, Segment
 from jaxsph.field.tasks import SlabTask
-from jaxsph.model.medium import Medium, mixed_colors, mixed_extinction
+from jaxsph.model.medium import Medium
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
 
 
@@ -33,31 +33,29 @@ class PointSamples(Integrator):
         thickness = optics[3] * path
         return emitted(optics[:3], transmitted(thickness))[:3], thickness
 
-    def __call__(self, media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Segment:
+    def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`."""
         if not barriers_kept():
-            return super().__call__(media, gathered, task)
+            return super().__call__(medium, gathered, task)
         always = task.slab[0] >= 0
-        thickness, found = fusion_barrier(always, _thickness, media, gathered, task)
+        thickness, samples = fusion_barrier(always, _thickness, medium, gathered, task)
         left = fusion_barrier(always, transmitted, thickness)
         red_green, blue = (
-            fusion_barrier(always, functools.partial(_emitted, channels=channels), media, found, task, left)
+            fusion_barrier(always, functools.partial(_emitted, channels=channels), medium, samples, task, left)
             for channels in (slice(0, 2), slice(2, 3))
         )
         return Segment((red_green.real, red_green.imag, blue.real), left[:, -1], thickness)
 
 
-def _thickness(media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> tuple[Array, list[Any]]:
-    """Optical thickness of samples; and of each medium its extinction, if there are several, and what its colours are read by."""
-    found = [medium.extinction(sums, task) for medium, sums in zip(media, gathered, strict=True)]
-    thickness = mixed_extinction([extinction for extinction, _ in found]) * task.path()
-    return thickness, [(extinction if len(media) > 1 else (), samples) for extinction, samples in found]
+def _thickness(medium: Medium, gathered: Any, task: SlabTask) -> tuple[Array, Any]:
+    """Optical thickness of samples, and what colours are read by."""
+    extinction, samples = medium.extinction(gathered, task)
+    return extinction * task.path(), samples
 
 
-def _emitted(media: tuple[Medium, ...], found: list[Any], task: SlabTask, left: Array, *, channels: slice) -> Array:
+def _emitted(medium: Medium, samples: Any, task: SlabTask, left: Array, *, channels: slice) -> Array:
     """One or two colours of slabs, as real and imaginary part."""
-    colors = [medium.colors(samples, task, channels) for medium, (_, samples) in zip(media, found, strict=True)]
-    first, *second, _ = emitted(mixed_colors(colors, [extinction for extinction, _ in found]), left)
+    first, *second, _ = emitted(medium.colors(samples, task, channels), left)
     return lax.complex(first, second[0] if second else jnp.zeros_like(first))
 
 

@@ -85,20 +85,20 @@ class StepDoubling(Integrator):
         """
         raise NotImplementedError(self.forward_only)
 
-    def __call__(self, media: tuple[Medium, ...], gathered: tuple[Any, ...], task: SlabTask) -> Segment:
+    def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`. What is gathered at samples is not read.
 
         Differentiation:
             Forward mode only, by what media are made of and by where rays go; the steps that are taken are held fixed.
         """
-        steps, (tasks, samples, rays) = self.march(media, task), task.shape
+        steps, (tasks, samples, rays) = self.march(medium, task), task.shape
         red, green, blue = (channel.reshape(tasks, rays) for channel in steps.color)
         thickness = jnp.moveaxis(steps.thickness.reshape(samples, tasks, rays), 0, 1)
         return Segment((red, green, blue), jnp.exp(-thickness.sum(1)), thickness)
 
-    def march(self, media: tuple[Medium, ...], task: SlabTask) -> Steps:
+    def march(self, medium: Medium, task: SlabTask) -> Steps:
         """All rays of slabs at their ends."""
-        slabs = _Slabs.of(media, task, self.tolerance / self.samples)
+        slabs = _Slabs.of(medium, task, self.tolerance / self.samples)
         return lax.while_loop(lambda steps: (steps.sample < slabs.real).any(), slabs.turn, slabs.begin())
 
 
@@ -113,7 +113,7 @@ class _Slabs:
         share: of the tolerance, for each sample.
     """
 
-    media: tuple[Medium, ...]
+    medium: Medium
     task: SlabTask
     border: Float[Array, "samples_and_one rays"]
     real: Int[Array, " rays"]
@@ -121,12 +121,12 @@ class _Slabs:
     share: float
 
     @classmethod
-    def of(cls, media: tuple[Medium, ...], task: SlabTask, share: float) -> _Slabs:
+    def of(cls, medium: Medium, task: SlabTask, share: float) -> _Slabs:
         rays = task.one_by_one()
         border = rays.border.T
         unit = jnp.arange(2, dtype=border.dtype)[None]
         slant = jnp.broadcast_to(dataclasses.replace(rays, border=unit).path()[:, 0, 0], border.shape[1:])
-        return cls(media, rays, border, (border[1:] > border[:-1]).sum(0, dtype=jnp.int32), slant, share)
+        return cls(medium, rays, border, (border[1:] > border[:-1]).sum(0, dtype=jnp.int32), slant, share)
 
     def begin(self) -> Steps:
         """At the slabs' front borders, with a step of a sample."""
@@ -139,16 +139,13 @@ class _Slabs:
         return Steps(nth, border[0], border[1], step, known, here, still, still[:3], thickness, spent, nth + 1)
 
     def light(self, depth: Float[Array, " rays"]) -> Float[Array, "4 rays"]:
-        """Emission and extinction a unit length of all media together: both add up."""
+        """Emission and extinction a unit length."""
         there = dataclasses.replace(self.task, depth=depth[:, None], border=jnp.stack([depth, depth], 1))
-
-        always, total = self.task.slab[0] >= 0, jnp.zeros((4, depth.shape[0]), depth.dtype)
-        for medium in self.media:
-            gathered = fusion_barrier(always, medium.gather, there)
-            *colors, extinction = fusion_barrier(always, medium.optics, gathered, there)
-            emission = [jnp.where(extinction > 0, extinction * color, 0) for color in colors]
-            total = total + jnp.stack([value[:, 0, 0] for value in (*emission, extinction)])
-        return total
+        always = self.task.slab[0] >= 0
+        gathered = fusion_barrier(always, self.medium.gather, there)
+        *colors, extinction = fusion_barrier(always, self.medium.optics, gathered, there)
+        emission = [jnp.where(extinction > 0, extinction * color, 0) for color in colors]
+        return jnp.stack([value[:, 0, 0] for value in (*emission, extinction)])
 
     def turn(self, steps: Steps) -> Steps:
         """One more point of each ray: the far end of a step, or its middle, which tells whether the step is accepted."""

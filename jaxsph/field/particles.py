@@ -23,7 +23,7 @@ from jaxsph.field.methods import methods_of
 from jaxsph.field.sums import Sums
 from jaxsph.field.tasks import SlabTask
 from jaxsph.field.transposed import COLUMNS, WIDTH, pull_gather
-from jaxsph.model.medium import Medium
+from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -115,19 +115,20 @@ class ParticleMedium(Medium):
 
     def pull(  # type: ignore[override]
         self, total: ParticleCotangents, gathered: Sums, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[ParticleCotangents, tuple[Array, Array]]:
+    ) -> tuple[ParticleCotangents, OfPlaces]:
         """See `Medium.pull`. What is interpolated or painted has none."""
         samples = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
         if self.wanted.transfer:
             total = total._replace(transfer=total.transfer + pull_control_points(samples, self.segments))
         if not self.wanted.field:
-            return total, (jnp.zeros_like(task.depth), jnp.zeros_like(task.depth[0, 0]))
+            return total, OfPlaces.none(task)
         ordered, of_sums = self.grid.ordered, (samples.weight, samples.weighted)
         found = pull_gather(total.table, ordered, self.grid.lists.rank, task, of_sums, self.kernel)
         of_depth = found.along
         if task.perspective:  # lateral coordinates are u s and v s
             of_depth = of_depth + found.lateral / task.depth.T
-        return total._replace(table=found.table), (of_depth.T, found.lateral.sum())
+        places = OfPlaces(of_depth.T, jnp.zeros_like(task.border), found.lateral.sum())
+        return total._replace(table=found.table), places
 
 
 @dataclasses.dataclass(frozen=True)

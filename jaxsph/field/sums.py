@@ -1,4 +1,4 @@
-"""Sums over particles at samples: of weights, and of one or more quantities times weights.
+"""Sums over particles or points at samples: of weights, and of one or more quantities times weights.
 
 Flow: gather, nodes -> [sums] -> media.
 

@@ -101,6 +101,14 @@ class SlabTask:
         y = (self.v[:, None, :, None] * lateral_scale[..., None, None]) * jnp.ones_like(self.u)[:, None, None, :]
         return x.reshape(self.shape), y.reshape(self.shape), z
 
+    def ray_coordinates(self) -> tuple[Float[Array, "tasks rays"], Float[Array, "tasks rays"]]:
+        """U and v of each ray."""
+        if self.scattered:
+            return self.u, self.v
+        both = self.u.shape[0], self.v.shape[1], self.u.shape[1]
+        u, v = jnp.broadcast_to(self.u[:, None, :], both), jnp.broadcast_to(self.v[:, :, None], both)
+        return u.reshape(both[0], -1), v.reshape(both[0], -1)
+
     def path(self) -> Float[Array, "tasks samples rays"]:
         """Path lengths between borders; of one ray for all where rays do not spread."""
         step = (self.border[:, 1:] - self.border[:, :-1])[:, :, None]

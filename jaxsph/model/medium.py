@@ -3,15 +3,16 @@
 Flow: scene -> [medium] -> field, cast.
 
 A medium is a frozen dataclass and a pytree, whose floating leaves an image can be differentiated by. It is asked for its
-extinction and colours at the samples of slabs; how samples become light is the integrator's affair, and media that share a
-sample are mixed by it. What takes no loop of its own needs only `extinction` and `colors`, and no derivative written by hand.
+extinction and colours at the samples of slabs; how samples become light is the integrator's affair, and media that share samples
+are one to it (`model.mixture`). What takes no loop of its own needs only `extinction` and `colors`, and no derivative written by
+hand.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,19 @@ COLORS = slice(0, 3)
 Total = TypeVar("Total")
 
 
+class OfPlaces(NamedTuple):
+    """Cotangents of where samples are: of their depths, of the borders between them, and of a common factor of all u and v."""
+
+    depth: Float[Array, "tasks samples"]
+    border: Float[Array, "tasks samples_and_one"]
+    factor: Float[Array, ""]
+
+    @classmethod
+    def none(cls, task: Any) -> OfPlaces:
+        """Zeros."""
+        return cls(jnp.zeros_like(task.depth), jnp.zeros_like(task.border), jnp.zeros_like(task.depth[0, 0]))
+
+
 class Medium(abc.ABC):
     """A participating medium that emits and absorbs.
 
@@ -32,9 +46,11 @@ class Medium(abc.ABC):
     Attributes:
         at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
+        between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
     """
 
     at_points: ClassVar[bool] = True
+    between_samples: ClassVar[bool] = False
 
     def seen_by(self, camera: Camera) -> Medium:
         """The medium in view space; by default as it is."""
@@ -46,6 +62,10 @@ class Medium(abc.ABC):
 
     def with_data(self, given: Any) -> Medium:
         """The same with those arrays again, from what of the scene it was made of."""
+        return self
+
+    def in_band(self, grid: Any) -> Medium:
+        """What `seen_by` made, with what it needs of the grid of a band (`access.grid.Grid`); by default as it is."""
         return self
 
     def faults(self) -> Int[Array, ""]:
@@ -86,7 +106,7 @@ class Medium(abc.ABC):
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)
 
-    def pull(self, total: Total, gathered: Any, task: Any, cotangents: list[Array]) -> tuple[Total, tuple[Array, Array]]:
+    def pull(self, total: Total, gathered: Any, task: Any, cotangents: list[Array]) -> tuple[Total, OfPlaces]:
         """Cotangents of red, green, blue and extinction at samples, pulled back.
 
         By default by differentiating `gather`, `extinction` and `colors`.
@@ -95,49 +115,19 @@ class Medium(abc.ABC):
             total: of the slabs before, see `no_cotangents`.
 
         Returns:
-            `total` with those of these slabs; and cotangents of the samples' depths (tasks, samples) and of a common factor
-            of all ray coordinates u and v.
+            `total` with those of these slabs, and those of where samples are.
         """
 
-        def optics(medium: Medium, depth: Array, factor: Array) -> list[Array]:
-            moved = dataclasses.replace(task, depth=depth, u=task.u * factor, v=task.v * factor)
+        def optics(medium: Medium, places: OfPlaces) -> list[Array]:
+            moved = dataclasses.replace(
+                task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor
+            )
             return medium.optics(medium.gather(moved), moved)
 
-        of_medium, of_depth, of_factor = jax.vjp(optics, self, task.depth, jnp.ones_like(task.depth[0, 0]))[1](cotangents)
+        there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
+        of_medium, of_places = jax.vjp(optics, self, there)[1](cotangents)
         added = [
             value if more.dtype == jax.dtypes.float0 else value + more
             for value, more in zip(jax.tree.leaves(total), jax.tree.leaves(of_medium), strict=True)
         ]
-        return jax.tree.unflatten(jax.tree.structure(total), added), (of_depth, of_factor)
-
-
-def mixed(optics: list[list[Float[Array, "..."]]]) -> list[Float[Array, "..."]]:
-    """Red, green, blue and extinction of all media that share samples, from those of each."""
-    extinctions = [of_one[3] for of_one in optics]
-    return [*mixed_colors([of_one[:3] for of_one in optics], extinctions), mixed_extinction(extinctions)]
-
-
-def mixed_extinction(extinctions: list[Float[Array, "..."]]) -> Float[Array, "..."]:
-    """Of all media that share samples: extinctions add up (Kaehler et al. 2007, equation 2)."""
-    total = extinctions[0]
-    for extinction in extinctions[1:]:
-        total = total + extinction
-    return total
-
-
-def mixed_colors(colors: list[list[Float[Array, "..."]]], extinctions: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
-    """Of all media that share samples: colours weigh by extinction, which is exact for constant ones. By medium, then channel.
-
-    Raises:
-        ValueError: where media give different channels.
-    """
-    if len(colors) == 1:
-        return colors[0]
-    given = [len(of_one) for of_one in colors]
-    if len(set(given)) > 1:
-        raise ValueError(f"`Medium.colors` must give the channels that it is asked for, but media gave {given} of them")
-    total = mixed_extinction(extinctions)
-    inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
-    shares = [extinction * inverse for extinction in extinctions]
-    weighed = [[share * color for color in of_one] for share, of_one in zip(shares, colors, strict=True)]
-    return [mixed_extinction(list(of_channel)) for of_channel in zip(*weighed, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(total), added), of_places

@@ -141,10 +141,18 @@ class Points:
         """float32 or float64."""
         return self.position.dtype
 
+    def usable(self) -> Bool[Array, " points"]:
+        """Points that exist, with numbers that mean something."""
+        finite = jnp.isfinite(self.position).all(1) & jnp.isfinite(self.radius) & jnp.isfinite(self.extinction)
+        for value in self.attributes.values():
+            finite &= jnp.isfinite(value)
+        shown = ((self.color >= 0) & (self.color <= 1)).all(1)
+        return self.valid & finite & shown & (self.radius > 0) & (self.extinction >= 0)
+
     def spheres(self) -> Particles:
         """What they can be met in, as particles that carry nothing."""
         nothing = jnp.zeros_like(self.radius)
-        return Particles(self.position, self.radius, nothing, nothing, self.valid, position_rest=self.position_rest)
+        return Particles(self.position, self.radius, nothing, nothing, self.usable(), position_rest=self.position_rest)
 
     def exact_position(self) -> np.ndarray:
         """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""

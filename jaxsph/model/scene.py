@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,13 @@ from jaxsph.model.volume import Volume
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
 MIXES = "extinction", "opacity"
+
+
+class Formulas(NamedTuple):
+    """What of a scene is compiled rather than given: the name of its smoothing kernel, and of how its parts are mixed."""
+
+    kernel: str
+    mix: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +82,11 @@ class Scene:
         """float32, or float64 if particles, a volume or points are."""
         given = [part.dtype for part in (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets)]
         return jnp.result_type(*given) if given else jnp.dtype(jnp.float32)
+
+    @property
+    def formulas(self) -> Formulas:
+        """What programs are compiled for."""
+        return Formulas(self.particle_set.kernel, self.mix)
 
     @property
     def volumes(self) -> tuple[tuple[Volume, TransferFunction], ...]:

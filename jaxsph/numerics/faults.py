@@ -18,6 +18,7 @@ BAD_TRANSFER = 16
 UNRESOLVED = 32
 WEAK_PARTICLES = 64
 BAD_VOLUME = 128
+BAD_POINTS = 256
 
 MESSAGES = {
     TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
@@ -35,6 +36,8 @@ MESSAGES = {
     WEAK_PARTICLES: "the strengths volume / support^3 of the particles are too far apart for this precision, and the weakest "
     "would vanish: give each particle its own `volume` (about support^3), or use float64 under jax.enable_x64",
     BAD_VOLUME: "a volume holds values that are not finite, or its lower corner or spacing is not finite or not > 0; repair them",
+    BAD_POINTS: "a point has a position, attribute or extinction that is not finite, a radius that is not > 0 and finite, an "
+    "extinction < 0 or a colour outside [0, 1]; remove or repair these points",
 }
 OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything

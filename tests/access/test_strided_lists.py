@@ -47,8 +47,8 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
     lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Clock(), []
     for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
         size = {"samples": SAMPLES, "tuning": tuning}
-        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), slab_samples=4, **size)
-        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, jnp.int32(0)), lists=lists, halo=0, **size)
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), slab_samples=4, between_samples=False, **size)
+        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, jnp.int32(0)), lists=lists, beside=False, **size)
         assert int(grid.lists.faults) == 0
         found.append(members(grid))
     assert found[0] == found[1]

@@ -12,6 +12,7 @@ import pytest
 from jaxsph.cast.samples import PointSamples, emitted, transmitted
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
+from jaxsph.model.mixture import Mixture
 from jaxsph.numerics.fusion import barriers
 
 TASKS, SAMPLES, ROWS, COLUMNS = 5, 4, 3, 2
@@ -53,7 +54,8 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
 
     def light(in_few_passes):
         with barriers(in_few_passes):
-            found = PointSamples()(several, ((),) * media, where)
+            medium = Mixture.of(several)
+            found = PointSamples()(medium, medium.gather(where), where)
         return np.stack([*found.color, found.transmittance]), np.broadcast_to(found.thickness, where.shape)
 
     for few, plain in zip(light(True), light(False), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.medium import Medium, mixed_colors, mixed_extinction
+from jaxsph.model.medium import Medium
 
 QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
 STEP, CLOSE = 1e-6, 1e-6
@@ -148,17 +148,3 @@ def test_fog_alone_has_derivatives_by_how_wide_the_view_is(frames, x64):
     slope = float(look(camera.half_height)[1])
     ahead, behind = (float(look(camera.half_height + by)[0]) for by in (STEP, -STEP))
     assert abs(slope) > 0.1 and slope == pytest.approx((ahead - behind) / (2 * STEP), rel=CLOSE)
-
-
-def test_media_that_give_different_channels_are_refused():
-    one = jnp.ones((2, 3))
-    with pytest.raises(ValueError, match=r"`Medium.colors` must give the channels .* gave \[1, 3\]"):
-        mixed_colors([[one], [one] * 3], [one, one])
-
-
-def test_colours_weigh_by_extinction_and_nothing_has_no_weight():
-    extinctions = [np.float32([1, 0, 0]), np.float32([3, 2, 0])]
-    colors = [[np.float32([1, 1, 1])], [np.float32([0, 0.5, 0.5])]]
-    np.testing.assert_array_equal(mixed_extinction(extinctions), [4, 2, 0])
-    np.testing.assert_array_equal(mixed_colors(colors, extinctions)[0], [0.25, 0.5, 0])
-    assert mixed_colors(colors[:1], extinctions[:1]) is colors[0]
