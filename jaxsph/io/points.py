@@ -141,7 +141,9 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
     if given is None:
         given = table.named(*SMOOTHING_NAMES)
     if given is None:
-        raise DataError(f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (--point-radius), or the name of a column")
+        raise DataError(
+            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (--point-radius), or the name of a column"
+        )
     values, name = _values(table, "radius", given)
     return _positive(values, name), f"column `{name}`"
 
