@@ -1,4 +1,4 @@
-"""Command line: a picture from a file of particles or of a volume in one command.
+"""Command line: a picture from files of particles, volumes and points in one command.
 
 Flow: file or scene -> [cli] -> render -> EXR or PNG.
 
@@ -17,13 +17,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
-
 import jaxsph
-from jaxsph import cli_cache, cli_sweep, cli_volume, io, scenes
+from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
 from jaxsph.cli_progressive import render_in_stages
-from jaxsph.console import camera_line, largest, largest_difference, progress, ranges, say, span, time_line
-from jaxsph.model import Camera, Particles, Scene, Settings, Volume
+from jaxsph.console import UsageError, camera_line, largest, largest_difference, progress, say, span, time_line
+from jaxsph.model import Camera, Particles, Scene, Settings
+from jaxsph.model.camera import Bounded
 from jaxsph.scenes.view import snug, snug_box
 
 SCENE = "scene:"
@@ -32,10 +31,6 @@ DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 DEMO_TOLERANCE = 0.004
 DEMO_CHECK = 64
 """Rows and columns of pixels, about, that `demo` compares with the float64 reference."""
-
-
-class UsageError(Exception):
-    """The command line asks for something that makes no sense."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,89 +101,39 @@ def _parser() -> argparse.ArgumentParser:
 
     render = command("render", _render, "make an image", "What you do not say is chosen, and said.")
     render.epilog = f"Built-in scenes: {', '.join(SCENE + name for name in scenes.names())}."
-    _add_source(render)
+    cli_options.add_source(render, optional=True)
+    _add_parts(render)
     render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
-    _add_picture(render)
-    _add_control(render)
+    cli_options.add_picture(render)
+    cli_options.add_control(render)
     info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
-    _add_source(info, optional=True)
+    cli_options.add_source(info, optional=True)
+    _add_parts(info)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
     sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
-    _add_source(sweep)
-    _add_picture(sweep)
+    cli_options.add_source(sweep)
+    cli_options.add_picture(sweep)
     cli_sweep.add_options(sweep)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument
     add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")
-    add("--size", type=_size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
+    add("--size", type=cli_options.size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     return parser
 
 
-def _add_source(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    number: dict[str, Any] = {"nargs": "?"} if optional else {}
-    parser.add_argument("source", metavar="FILE|scene:NAME", help="file of particles or of a volume, or built-in scene", **number)
-    add = parser.add_argument_group("particles of a file").add_argument
-    add("--quantity", metavar="NAME", help="an attribute, density, speed, x, y, z, or log10:NAME of any of these")
-    add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
-    add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
-    add = parser.add_argument_group("volume of a file").add_argument
-    add("--iso", type=float, metavar="LEVEL", help="show the surface on which its values are LEVEL (--quantity: which values)")
-    add = parser.add_argument_group("particles of a built-in scene").add_argument
-    add("--particles", type=int, metavar="N", help="how many")
-    add("--frame", type=float, metavar="K", help="moment of the scene")
-
-
-def _add_picture(parser: argparse.ArgumentParser) -> None:
-    maps, depth = ", ".join(scenes.appearance.COLORMAPS), scenes.appearance.OPTICAL_DEPTH
-    add = parser.add_argument_group("picture").add_argument
-    add("--size", type=_size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
-    add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")
-    add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
-    add(
-        "--range",
-        nargs=2,
-        type=float,
-        metavar=("LOW", "HIGH"),
-        help="values that the colours span (default: nearly all)",
-    )
-    add("--opacity", type=float, metavar="DEPTH", help=f"typical optical depth (default {depth:g})")
-    add = parser.add_argument_group("camera", "default: one that frames the particles").add_argument
-    place: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    add("--eye", **place, help="where the eye is")
-    add("--target", **place, help="what it looks at (default: the middle of the particles)")
-    add("--up", **place, help="upward direction (default 0 1 0)")
-    add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
-    add = parser.add_argument_group("means").add_argument
-    add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
-
-
-def _add_control(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("error control").add_argument
-    add("--tolerance", type=float, metavar="T", help="largest error of any channel of any pixel (default: none)")
-    add("--estimator", choices=("interval", "pilot"), help="how the error is known")
-    add("--screen", choices=("pixels", "quadtree"), help="whether pixels are interpolated where the tolerance allows it")
-    add("--progressive", action="store_true", help="by a quadtree, in stages: OUT is rewritten at each")
-    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
-
-
-def _size(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    try:
-        width, height = (int(part) for part in (parts if len(parts) == 2 else parts * 2))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write it as 640x480") from None
-    if len(parts) > 2 or width < 1 or height < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; both edges must be at least 1 pixel, as in 640x480")
-    return width, height
+def _add_parts(parser: argparse.ArgumentParser) -> None:
+    cli_volume.add_options(parser)
+    cli_points.add_options(parser)
 
 
 def _render(options: argparse.Namespace) -> None:
     settings = _settings(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
-    output = options.output or Path(Path(options.source.removeprefix(SCENE)).stem + ".png")
+    _require_something(options)
+    first = options.source or (options.volume or options.points)[0]
+    output = options.output or Path(Path(first.removeprefix(SCENE)).stem + ".png")
     _require_writable(output)
     scene, camera = _scene(options)
     say("camera", camera_line(camera))
@@ -240,7 +185,38 @@ def _settings(options: argparse.Namespace) -> Settings:
 
 
 def _scene(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    return _scene_of_name(options) if options.source.startswith(SCENE) else _scene_of_file(options)
+    """The source, and what else shares its picture; a camera that frames all of it unless one is asked for."""
+    scene, shown, camera = _source(options)
+    if options.command == "sweep":
+        return scene, camera or _camera(shown, options)
+    volumes, points = cli_volume.beside(options), cli_points.points_of(options)
+    if volumes or points or options.mix:
+        scene = cli_points.with_parts(scene, volumes, [one for _, one in points], options.mix)
+    if not volumes and not points:
+        return scene, camera or _camera(shown, options)
+    named = [] if shown is None else [(options.source, shown)]
+    paths = [(path, volume) for path, (volume, _) in zip(options.volume or (), volumes, strict=True)]
+    parts = cli_points.Together([*named, *paths, *points])
+    cli_points.warn(parts, options.command)
+    return scene, _camera(parts, options)
+
+
+def _source(options: argparse.Namespace) -> tuple[Any, Any, Camera | None]:
+    """Scene of the source, what there is to frame, and the camera where it has one."""
+    if options.source is None:
+        of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame", "colormap", "range", "opacity")
+        _refuse(options, of_source, "is for FILE or scene:NAME, and there is none")
+        return None, None, None
+    if options.source.startswith(SCENE):
+        scene, camera = _scene_of_name(options)
+        return scene, scene.particle_set, camera
+    return *_scene_of_file(options), None
+
+
+def _require_something(options: argparse.Namespace, also: str = "") -> None:
+    cli_points.check_usage(options)
+    if options.source is None and not options.points and not options.volume:
+        raise UsageError(f"a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE{also}")
 
 
 def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
@@ -255,62 +231,34 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     if options.command != "info":
         if any(value is not None for value in (options.colormap, options.range, options.opacity)):
-            scene = dataclasses.replace(scene, transfer=_transfer(particles, options, "concentration"))
+            scene = dataclasses.replace(scene, transfer=cli_particles.transfer(particles, options, "concentration"))
         if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):
             camera = _camera(particles, options)
     return scene, camera
 
 
-def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Camera]:
+def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Bounded]:
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
     if io.is_volume(options.source):
         _refuse(options, ("support", "kernel", "part_type"), "is for particles, and this is a volume")
-        return cli_volume.scene_of(options, _camera)
+        return cli_volume.scene_of(options)
     _refuse(options, ("iso",), "is for volumes, and this is a particle file")
-    if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
-        raise UsageError(f"--support must be > 0, got {options.support:g}")
-    particles, quantity = _particles_of_file(options)
-    return Scene(particles=particles, transfer=_transfer(particles, options, quantity)), _camera(particles, options)
+    return cli_particles.scene_of(options)
 
 
-def _particles_of_file(options: argparse.Namespace) -> tuple[Particles, str]:
-    table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
-    say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    columns = particles.to_numpy()
-    say("support", f"{span(columns['support'])}: {report.support}")
-    say("volume", report.volume)
-    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
-    for note in report.notes:
-        say("note", note)
-    return particles, report.quantity
-
-
-def _transfer(particles: Particles, options: argparse.Namespace, quantity: str) -> Any:
-    name = options.colormap or "viridis"
-    depth = scenes.appearance.OPTICAL_DEPTH if options.opacity is None else options.opacity
-    try:
-        transfer = scenes.default_transfer(particles, name, options.range, depth)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    colors, extinction = f"{name} over {quantity} = {span(transfer.values)}", span(transfer.extinction)
-    say("colours", f"{colors}, extinction {extinction} per unit length")
-    return transfer
-
-
-def _camera(particles: Particles | Volume, options: argparse.Namespace) -> Camera:
-    """The camera asked for; where only a part is given, the rest frames the particles or the volume."""
+def _camera(shown: Bounded, options: argparse.Namespace) -> Camera:
+    """The camera asked for; where only a part is given, the rest frames what there is."""
     width, height = options.size
     up, fov = options.up or (0.0, 1.0, 0.0), 45.0 if options.fov is None else options.fov
     if options.target is not None and options.eye is None:
         raise UsageError("--target needs --eye: from where should it be looked at?")
     try:
         if options.eye is None:
-            return Camera.framing(particles, up=up, fov_degrees=fov, width=width, height=height)
-        lower, upper = particles.bounds()
+            return Camera.framing(shown, up=up, fov_degrees=fov, width=width, height=height)
+        lower, upper = shown.bounds()
         target = (lower + upper) / 2 if options.target is None else options.target
         made = Camera.look_at(options.eye, target, up, fov, width, height, near=1e-3, far=1.0)
-        return snug_box(made, lower, upper) if isinstance(particles, Volume) else snug(made, particles)
+        return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)
     except ValueError as error:
         raise UsageError(str(error)) from error
 
@@ -321,35 +269,28 @@ def _info(options: argparse.Namespace) -> None:
             say(what, text)
         if options.source is None:
             return
-    if options.source is None:
-        raise UsageError("a particle file or scene:NAME is needed, or --cache")
+    _require_something(options, ", or --cache")
+    parts, camera = [], None
+    if options.source is not None:
+        shown, camera = _described(options)
+        parts.append((options.source, shown))
+    parts += [(path, cli_volume.describe(path, options.volume_quantity)) for path in options.volume or ()]
+    parts += cli_points.describe(options)
+    together = cli_points.Together(parts)
+    say("camera", camera_line(camera if camera is not None and len(parts) == 1 else Camera.framing(together)))
+    cli_points.warn(together, options.command)
+
+
+def _described(options: argparse.Namespace) -> tuple[Bounded, Camera | None]:
+    """Say what the source holds; what there is to frame, and its camera where it has one."""
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
         say("quantity", f"concentration, {span(scene.particle_set.to_numpy()['quantity'])}")
-        say("camera", camera_line(camera))
-        return
+        return scene.particle_set, camera
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
     if io.is_volume(options.source):
-        cli_volume.describe(options)
-        return
-    table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
-    print(f"{options.source}: {table.source}, {len(table):,} particles")
-    for sentence in table.conventions:
-        print(f"  {sentence}")
-    print()
-    rows = [("attribute", "shape", "type", "range")]
-    for name, column in (("position", table.position), *table.columns.items()):
-        rows.append((name, " x ".join(map(str, column.shape)), str(column.dtype), ranges(column)))
-    widths = [max(len(row[i]) for row in rows) for i in range(3)]
-    for row in rows:
-        print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
-    print("\n`jaxsph render` would show")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
-    columns = particles.to_numpy()
-    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
-    say("support", f"{span(columns['support'])}: {report.support}")
-    say("volume", report.volume)
-    say("camera", camera_line(Camera.framing(particles)))
+        return cli_volume.describe(options.source, options.quantity), None
+    return cli_particles.describe(options), None
 
 
 def _demo(options: argparse.Namespace) -> None:

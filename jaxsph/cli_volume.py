@@ -1,55 +1,73 @@
 """Files of volumes on the command line: what is shown of them, and what `info` says.
 
-Flow: file, options -> [cli_volume] -> Scene, Camera -> cli.
+Flow: file, options -> [cli_volume] -> Scene -> cli.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.console import camera_line, ranges, say, span
+from jaxsph.console import ranges, say, span
 from jaxsph.field.iso_surface import IsoSurface
-from jaxsph.model import Camera, Scene, Volume
+from jaxsph.model import Scene, TransferFunction, Volume
 
 ISO_COLOR = 0.85, 0.8, 0.7
 
 
-def scene_of(options: argparse.Namespace, camera_of: Callable[[Volume, argparse.Namespace], Camera]) -> tuple[Scene, Camera]:
-    """The volume of a file under a colour map, or its iso-surface."""
-    volume = _volume_of_file(options)
-    camera = camera_of(volume, options)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of volumes that share a picture with other parts."""
+    add = parser.add_argument_group("volumes beside the source").add_argument
+    more = "a volume in the same picture; may be repeated, and be there without a source"
+    add("--volume", action="append", metavar="FILE", help=more)
+    add("--volume-quantity", metavar="NAME", help="which of its values (default: the first of one number a point)")
+    add("--volume-colormap", metavar="NAME", help="(default viridis)")
+
+
+def scene_of(options: argparse.Namespace) -> tuple[Scene, Volume]:
+    """The volume of the source under a colour map, or its iso-surface; and what there is to frame."""
+    volume = _volume_of_file(options.source, options.quantity)
     if options.iso is not None:
         color = ISO_COLOR if options.colormap is None else tuple(scenes.colormap(options.colormap)[-1])
         say("surface", f"where the values are {options.iso:g}")
-        return Scene(media=(IsoSurface.from_volume(volume, options.iso, color),)), camera
-    name = options.colormap or "viridis"
-    depth = scenes.appearance.OPTICAL_DEPTH if options.opacity is None else options.opacity
-    transfer = scenes.default_volume_transfer(volume, name, options.range, depth)
+        return Scene(media=(IsoSurface.from_volume(volume, options.iso, color),)), volume
+    return Scene(volume=volume, volume_transfer=_transfer(volume, options.colormap, options.range, options.opacity)), volume
+
+
+def beside(options: argparse.Namespace) -> list[tuple[Volume, TransferFunction]]:
+    """Volumes besides the source, each with what it looks like."""
+    volumes = [_volume_of_file(path, options.volume_quantity) for path in options.volume or ()]
+    return [(volume, _transfer(volume, options.volume_colormap, None, None)) for volume in volumes]
+
+
+def _transfer(volume: Volume, colormap: str | None, span_asked: Any, depth: float | None) -> TransferFunction:
+    name = colormap or "viridis"
+    depth = scenes.appearance.OPTICAL_DEPTH if depth is None else depth
+    transfer = scenes.default_volume_transfer(volume, name, span_asked, depth)
     say("colours", f"{name} over {span(transfer.values)}, extinction {span(transfer.extinction)} per unit length")
-    return Scene(volume=volume, volume_transfer=transfer), camera
+    return transfer
 
 
-def _volume_of_file(options: argparse.Namespace) -> Volume:
-    table = io.read_volume_table(options.source)
-    say("file", f"{options.source}: {table.source}, {' x '.join(map(str, table.shape))} points")
+def _volume_of_file(path: str, quantity: str | None) -> Volume:
+    table = io.read_volume_table(path)
+    say("file", f"{path}: {table.source}, {' x '.join(map(str, table.shape))} points")
     try:
-        volume, name = io.volume_from_table(table, options.quantity)
+        volume, name = io.volume_from_table(table, quantity)
     except ValueError as error:
-        raise ValueError(f"{options.source}: {error}") from error
+        raise ValueError(f"{path}: {error}") from error
     say("quantity", f"{name}, {volume.values.dtype}, {span(np.asarray(volume.values))}")
     for note in table.conventions:
         say("note", note)
     return volume
 
 
-def describe(options: argparse.Namespace) -> None:
-    """Say what a file of a volume holds, and how it would be looked at."""
-    table = io.read_volume_table(options.source)
-    print(f"{options.source}: {table.source}, {' x '.join(map(str, table.shape))} points")
+def describe(path: str, quantity: str | None) -> Volume:
+    """Say what a file of a volume holds, and what of it would be shown."""
+    table = io.read_volume_table(path)
+    print(f"{path}: {table.source}, {' x '.join(map(str, table.shape))} points")
     for sentence in table.conventions:
         print(f"  {sentence}")
     print()
@@ -58,5 +76,5 @@ def describe(options: argparse.Namespace) -> None:
         print(f"  {name}  {' x '.join(map(str, values.shape))}  {values.dtype}  {ranges(columns)}")
     corner, step = (" ".join(f"{number:.6g}" for number in vector) for vector in (table.lower, table.spacing))
     print(f"\nlower corner {corner}, spacing {step}\n\n`jaxsph render` would show")
-    say("quantity", table.quantity(options.quantity)[0])
-    say("camera", camera_line(Camera.framing(io.volume_from_table(table, options.quantity)[0])))
+    say("quantity", table.quantity(quantity)[0])
+    return io.volume_from_table(table, quantity)[0]

@@ -12,7 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.io import ParticleTable
 from jaxsph.model import Camera, Image
+
+
+class UsageError(Exception):
+    """The command line asks for something that makes no sense."""
 
 
 def largest(layer: Any) -> float:
@@ -66,6 +71,19 @@ def ranges(column: np.ndarray) -> str:
     finite = [part[np.isfinite(part)] for part in columns]
     odd = columns.size - sum(part.size for part in finite)
     return " | ".join(span(part) for part in finite) + (f" ({odd} not finite)" if odd else "")
+
+
+def attributes(table: ParticleTable) -> None:
+    """Print the columns of a table: name, shape, type and range."""
+    for sentence in table.conventions:
+        print(f"  {sentence}")
+    print()
+    rows = [("attribute", "shape", "type", "range")]
+    for name, column in (("position", table.position), *table.columns.items()):
+        rows.append((name, " x ".join(map(str, column.shape)), str(column.dtype), ranges(column)))
+    widths = [max(len(row[i]) for row in rows) for i in range(3)]
+    for row in rows:
+        print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
 
 
 def camera_line(camera: Camera) -> str:

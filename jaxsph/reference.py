@@ -1,5 +1,7 @@
 """The oracle: the same image in float64 NumPy, particle by particle and sample by sample, with no grid and no cleverness.
 
+Flow: scene, camera -> [reference] -> image.
+
 It follows Hochstetter et al. 2016, sections 2.1 and 2.2, line by line and is what every other renderer here is judged by. Slow:
 about 50 M particle-sample evaluations a second, and two float64 numbers of memory a sample.
 """
@@ -7,6 +9,7 @@ about 50 M particle-sample evaluations a second, and two float64 numbers of memo
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,12 +17,17 @@ import numpy as np
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.reference_points import thickness
 
 __all__ = ["field", "render", "sample_depths"]
+
+Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
+"""What a part of a scene has in a sample of every ray: its optical thickness, and the same times colour."""
 
 
 def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cull: bool = True, every: int = 1) -> Image:
@@ -37,6 +45,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
 
     References:
         Hochstetter, Orthmann & Kolb 2016, equations 1 (field), 2 (CSPH), 3 (compositing), 8 (sample depths).
+        Kaehler, Abel & Hege 2007, equations 1 to 4 (parts that share samples).
     """
     started = time.perf_counter()
     settings = settings or Settings()
@@ -44,15 +53,16 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
         raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
     scene.check()
     if scene.media:
-        raise ValueError("`media` are unknown to the reference, which has particles and volume; give a scene with `media=()`")
+        raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
     numerator, denominator, evaluations = field(scene, camera, settings.samples, cull=cull, every=every)
     inside = denominator > 0
     quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
-    parts = [] if scene.transfer is None else [(quantity, inside, scene.transfer)]
+    edges, lengths = _depth(camera, np.arange(settings.samples + 1), settings.samples), _ray_lengths(camera, every)
+    parts = [] if scene.transfer is None else [_in_medium(quantity, inside, scene.transfer, edges, lengths)]
     for volume, look in scene.volumes:
-        parts.append((*_in_volume(volume, camera, settings.samples, every), look))
-    edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
-    color, transmittance, depth = _composite(parts, edges, _ray_lengths(camera, every))
+        parts.append(_in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths))
+    parts += [_of_points(points, camera, every, edges) for points in scene.point_sets]
+    color, transmittance, depth = _composite(parts, edges, lengths.shape, scene.mix)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
     counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
@@ -160,29 +170,40 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
     return quantity, inside
 
 
-def _composite(
-    parts: list[tuple[np.ndarray, np.ndarray, TransferFunction]], edges: np.ndarray, lengths: np.ndarray
-) -> tuple[Any, ...]:
+def _in_medium(
+    quantity: np.ndarray, inside: np.ndarray, transfer: TransferFunction, edges: np.ndarray, lengths: np.ndarray
+) -> Part:
+    def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
+        color, extinction = _look_up(transfer, quantity[..., i])
+        own = np.where(inside[..., i], extinction, 0) * (edges[i + 1] - edges[i]) * lengths
+        return own, own[..., None] * color
+
+    return sample
+
+
+def _of_points(points: Points, camera: Camera, every: int, edges: np.ndarray) -> Part:
+    total, colored = thickness(points, camera, *_ray_coordinates(camera, every), edges)
+    return lambda i: (total[..., i], colored[..., i, :])
+
+
+def _composite(parts: list[Part], edges: np.ndarray, shape: tuple[int, ...], mix: str) -> tuple[Any, ...]:
     """Front to back, equation 3: colour, transmittance and the depth where transmittance falls to 1/2.
 
-    Of parts that share samples, extinctions add up and colours weigh by extinction (Kaehler, Abel & Hege 2007, equation 2).
+    Thicknesses of parts that share a sample add up. Their colours weigh by thickness (`mix` of "extinction"), or are added
+    times the parts' own opacities ("opacity": Kaehler, Abel & Hege 2007, equation 1).
     """
-    color = np.zeros(lengths.shape + (3,))
-    transmittance = np.ones(lengths.shape)
-    depth = np.full(lengths.shape, np.inf)
+    color, transmittance, depth = np.zeros((*shape, 3)), np.ones(shape), np.full(shape, np.inf)
     for i in range(len(edges) - 1):
-        rgb, extinction = np.zeros_like(color), np.zeros_like(transmittance)
-        for quantity, inside, transfer in parts:
-            own, of_part = _look_up(transfer, quantity[..., i])
-            of_part = np.where(inside[..., i], of_part, 0)
-            rgb, extinction = rgb + of_part[..., None] * own, extinction + of_part
-        rgb = rgb / np.where(extinction > 0, extinction, 1)[..., None]
-        thickness = extinction * (edges[i + 1] - edges[i]) * lengths
-        behind = transmittance * np.exp(-thickness)
+        here = [part(i) for part in parts]
+        total: Any = sum(own for own, _ in here)
+        of_all = [(total, sum(colored for _, colored in here))] if mix == "extinction" else here
+        for own, colored in of_all:
+            shown = -np.expm1(-own) / np.where(own > 0, own, 1)  # opacity a unit of thickness
+            color += (transmittance * shown)[..., None] * colored
+        behind = transmittance * np.exp(-total)
         crossed = (transmittance > 0.5) & (behind <= 0.5)
-        part = np.log(2 * transmittance, where=crossed, out=np.zeros_like(transmittance)) / np.where(crossed, thickness, 1)
-        depth = np.where(crossed, edges[i] + part * (edges[i + 1] - edges[i]), depth)
-        color += (transmittance * -np.expm1(-thickness))[..., None] * rgb
+        place = np.log(2 * transmittance, where=crossed, out=np.zeros_like(transmittance)) / np.where(crossed, total, 1)
+        depth = np.where(crossed, edges[i] + place * (edges[i + 1] - edges[i]), depth)
         transmittance = behind
     return color, transmittance, depth
 

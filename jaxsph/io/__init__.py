@@ -1,9 +1,9 @@
-"""Read particles, volumes and images, write volumes and images. One format a file; optional libraries are imported when needed.
+"""Read particles, points, volumes and images, write volumes and images. Optional libraries are imported when needed.
 
 Flow: file -> [read_table] -> ParticleTable -> [particles_from_table] -> Particles ... Image -> [write_image] -> file.
 
 A ParticleTable holds what the file holds; Particles carry one quantity, with supports and volumes settled. The report
-of `particles_from_table` says how they were settled.
+of `particles_from_table` says how they were settled. `read_points` makes Points of the same files.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from jaxtyping import Float
 from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
+from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
@@ -25,12 +27,14 @@ from jaxsph.io.volume_table import VolumeTable
 from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
+from jaxsph.model.points import Points
 
 __all__ = [
     "FORMATS",
     "DataError",
     "Format",
     "ParticleTable",
+    "PointsReport",
     "Report",
     "VolumeTable",
     "available_quantities",
@@ -38,8 +42,10 @@ __all__ = [
     "kernel_sum",
     "nearest_neighbour_supports",
     "particles_from_table",
+    "points_from_table",
     "read_image",
     "read_particles",
+    "read_points",
     "read_table",
     "read_volume",
     "read_volume_table",
@@ -102,6 +108,45 @@ def read_particles(
     """
     table = read_table(path, part_type=part_type, progress=progress)
     return particles_from_table(table, quantity, support, kernel, progress=progress)[0]
+
+
+def read_points(
+    path: str | os.PathLike[str],
+    *,
+    color: Any = None,
+    radius: Any = None,
+    extinction: Any = None,
+    opacity: Any = None,
+    profile: Any = "gaussian",
+    colormap: str = "viridis",
+    part_type: int | None = None,
+) -> Points:
+    """Read points (stars, galaxies, tracers) from a file of any particle format, such as CSV with `x,y,z,radius,r,g,b,opacity`.
+
+    Each of these is a number, or the name of a column; what is `None` is taken from the file where it is there
+    (`jaxsph.io.points` says under which names). Colours and opacities in whole numbers up to 255 are bytes.
+
+    Args:
+        path: the file; see `read_table` for formats.
+        color: three numbers in [0, 1], the name of a column of colours, or of a quantity that a colour map shows; else white.
+        radius: length units; must be given where the file has none.
+        extinction: at the centre, a unit length.
+        opacity: that of a whole point along a ray through its centre; where neither is known, 0.8.
+        profile: as for `Points.from_arrays`.
+        colormap: name of a colour map.
+        part_type: which type of particles to read, see `read_table`; stars are 4 of a Gadget-like file.
+
+    Returns:
+        Points; `points_from_table` also tells how they were found.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: see `read_table` and `points_from_table`.
+        ImportError: a library that the format needs is not installed; the message says how to install it.
+    """
+    table = read_table(path, part_type=part_type)
+    given = {"color": color, "radius": radius, "extinction": extinction, "opacity": opacity}
+    return points_from_table(table, **given, profile=profile, colormap=colormap)[0]
 
 
 def write_image(path: str | os.PathLike[str], image: Image) -> None:

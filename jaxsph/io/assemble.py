@@ -124,7 +124,7 @@ def _assemble(
         volumes, volume_origin = 1 / number_density(), "1 / sum of kernels within the particle's own support"
     if name.endswith("density") and stored_density is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
-    rounding = _check_rounding(table.position, supports)
+    rounding = rounding_note(table.position, supports)
     if rounding:
         notes.append(rounding)
     dtype = table.position.dtype
@@ -178,7 +178,7 @@ def _scaled(volumes: np.ndarray) -> np.ndarray:
     return volumes / np.median(volumes)
 
 
-def _check_rounding(position: np.ndarray, support: np.ndarray) -> str | None:
+def rounding_note(position: np.ndarray, support: np.ndarray, called: str = "supports") -> str | None:
     """A note on what float32 has done to the positions; `ValueError` where it has destroyed them. float64 ones stay whole."""
     if len(position) == 0 or position.dtype == np.float64:
         return None
@@ -186,11 +186,11 @@ def _check_rounding(position: np.ndarray, support: np.ndarray) -> str | None:
     typical = float(np.median(support))
     if rounding > ROUNDING_REFUSED * typical:
         raise DataError(
-            f"positions reach {np.abs(position).max():.6g} with supports of {typical:.6g}: float32 has rounded them by "
-            f"{rounding / typical:.2g} supports; give them in float64, or subtract a common offset before they become float32"
+            f"positions reach {np.abs(position).max():.6g} with {called} of {typical:.6g}: float32 has rounded them by "
+            f"{rounding / typical:.2g} of them; give them in float64, or subtract a common offset before they become float32"
         )
     if rounding > ROUNDING_NOTED * float(support.min()):
-        return f"float32 has rounded positions by up to {rounding / float(support.min()):.2g} of the smallest support"
+        return f"float32 has rounded positions by up to {rounding / float(support.min()):.2g} of the smallest of the {called}"
     return None
 
 

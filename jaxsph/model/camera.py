@@ -11,19 +11,24 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.model.particles import Particles
-from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import is_traced, require_finite
 
 PROJECTIONS = ("perspective", "orthographic")
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
+
+
+class Bounded(Protocol):
+    """What can be framed: particles, a volume, points."""
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around it, (3,) and (3,), float64, length units."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +119,7 @@ class Camera:
     @classmethod
     def framing(
         cls,
-        particles: Particles | Volume,
+        particles: Bounded,
         *,
         direction: Any = (-0.45, -0.35, -1.0),
         up: Any = (0.0, 1.0, 0.0),
@@ -123,10 +128,10 @@ class Camera:
         height: int = 512,
         margin: float = 1.05,
     ) -> Camera:
-        """Perspective camera that frames particles or a volume: everything in view, near and far snug (host side).
+        """Perspective camera that frames particles, a volume or points: everything in view, near and far snug (host side).
 
         Args:
-            particles: what to look at, particles or a volume; an empty set is framed as the unit box.
+            particles: what to look at, particles, a volume or points; an empty set is framed as the unit box.
             direction: line of sight, from the eye to the middle of it.
             up: as `look_at`.
             fov_degrees: vertical field of view.

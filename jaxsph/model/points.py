@@ -18,6 +18,7 @@ from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
 SPREADS = "chords", "feet", "centres"
+MAIN = "position", "radius", "color", "extinction"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +93,8 @@ class Points:
 
         Raises:
             ValueError: wrong shapes, numbers that are not finite or out of range, neither or both of extinction and opacity,
-                an unknown profile or spread, capacity < N.
+                an unknown profile or spread, capacity < N, an attribute named as what every point has, an opacity of points
+                whose profile has none along a ray through the centre, or is not known by the distance alone.
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
@@ -106,7 +108,7 @@ class Points:
             center = center.reshape(0, 3)
         require_shape("position", center, (None, 3), "one row (x, y, z) a point")
         strength = {"extinction": extinction} if opacity is None else {"opacity": opacity}
-        given = {"radius": radius, **strength, **(attributes or {})}
+        given = {"radius": radius, **strength, **_own_names(attributes or {})}
         columns = {"position": center, "color": _column("color", color, center.shape[0], (3,))}
         columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
         _require_usable(columns)
@@ -114,14 +116,15 @@ class Points:
         room = capacity_class(center.shape[0]) if capacity is None else capacity
         if room < max(center.shape[0], 1):
             raise ValueError(f"`capacity` must be at least the number of points ({center.shape[0]}) and 1, got {room}")
-        packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
         shape = profile_of(profile, dtype)
         if opacity is not None:
-            packed["extinction"] = -jnp.log1p(-packed.pop("opacity")) / (packed["radius"] * shape.through_centre().astype(dtype))
+            columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
+        packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
         rest = None
         if not is_traced(center, packed["radius"]) and center.shape[0]:
             rest = rest_of(center, packed["position"], packed["radius"])
-        main = {name: packed.pop(name) for name in ("position", "radius", "color", "extinction")}
+        packed = {name: jnp.asarray(value) for name, value in packed.items()}
+        main = {name: packed.pop(name) for name in MAIN}
         valid, beyond = jnp.arange(room) < center.shape[0], _distance(splats_beyond, dtype)
         return cls(**main, valid=valid, attributes=packed, profile=shape, position_rest=rest, splats_beyond=beyond, spread=spread)
 
@@ -178,6 +181,26 @@ def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any
     return value
 
 
+def _own_names(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Attributes, none of which may stand for what every point has."""
+    taken = [name for name in attributes if name in (*MAIN, "opacity")]
+    if taken:
+        raise ValueError(f"`attributes` must not be named as what every point has, got {taken[0]!r}; give it another name")
+    return attributes
+
+
+def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
+    """That of points which a ray through the centre sees with this opacity; by float64 where numbers are known."""
+    through: Any = profile.through_centre()
+    if not is_traced(through):
+        through = float(through)
+        if not through > 0:
+            raise ValueError("`profile` is 0 along a ray through the centre; give `extinction`, not `opacity`")
+    if is_traced(opacity):
+        return -jnp.log1p(-opacity) / (radius * through)
+    return -np.log1p(-np.asarray(opacity, np.float64)) / (radius * through)
+
+
 def _require_usable(columns: dict[str, Any]) -> None:
     """Raise where numbers are out of range."""
     for name, value in columns.items():
@@ -194,13 +217,13 @@ def _require_usable(columns: dict[str, Any]) -> None:
             raise ValueError(f"`{name}` must be {allowed}, got {np.asarray(value).min():.6g} .. {np.asarray(value).max():.6g}")
 
 
-def _packed(name: str, value: Any, room: int, dtype: Any) -> Array:
+def _packed(name: str, value: Any, room: int, dtype: Any) -> Any:
     """Padded with the first point: whoever forgets what is `valid` meets no number of our own making."""
     xp = jnp if is_traced(value) else np
     missing = (room - value.shape[0], *value.shape[1:])
     first = value[:1] if value.shape[0] else xp.full((1, *value.shape[1:]), 1 if name == "radius" else 0, value.dtype)
     with np.errstate(over="ignore"):  # what overflows is refused by name
-        packed = jnp.asarray(xp.concatenate([value, xp.broadcast_to(first, missing)]).astype(dtype))
+        packed = xp.concatenate([value, xp.broadcast_to(first, missing)]).astype(dtype)
     if not is_traced(value):
         require_finite(name, packed, f"it overflows {packed.dtype}: rescale it, or use float64 under jax.enable_x64")
         if name == "radius":

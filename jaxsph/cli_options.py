@@ -1,0 +1,75 @@
+"""Options that commands share: what is shown, how, from where, and how exactly.
+
+Flow: [cli_options] -> cli.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from jaxsph import scenes
+
+
+def add_source(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Options of the file or built-in scene, and what of it is shown."""
+    number: dict[str, Any] = {"nargs": "?"} if optional else {}
+    what = "file of particles or of a volume, or built-in scene" + ("; --points or --volume may stand for it" if optional else "")
+    parser.add_argument("source", metavar="FILE|scene:NAME", help=what, **number)
+    add = parser.add_argument_group("particles of a file").add_argument
+    add("--quantity", metavar="NAME", help="an attribute, density, speed, x, y, z, or log10:NAME of any of these")
+    add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
+    add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
+    add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
+    add = parser.add_argument_group("volume of a file").add_argument
+    add("--iso", type=float, metavar="LEVEL", help="show the surface on which its values are LEVEL (--quantity: which values)")
+    add = parser.add_argument_group("particles of a built-in scene").add_argument
+    add("--particles", type=int, metavar="N", help="how many")
+    add("--frame", type=float, metavar="K", help="moment of the scene")
+
+
+def add_picture(parser: argparse.ArgumentParser) -> None:
+    """Options of size, colours and camera."""
+    maps, depth = ", ".join(scenes.appearance.COLORMAPS), scenes.appearance.OPTICAL_DEPTH
+    add = parser.add_argument_group("picture").add_argument
+    add("--size", type=size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
+    add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")
+    add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
+    add(
+        "--range",
+        nargs=2,
+        type=float,
+        metavar=("LOW", "HIGH"),
+        help="values that the colours span (default: nearly all)",
+    )
+    add("--opacity", type=float, metavar="DEPTH", help=f"typical optical depth (default {depth:g})")
+    add = parser.add_argument_group("camera", "default: one that frames the particles").add_argument
+    place: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    add("--eye", **place, help="where the eye is")
+    add("--target", **place, help="what it looks at (default: the middle of the particles)")
+    add("--up", **place, help="upward direction (default 0 1 0)")
+    add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
+    add = parser.add_argument_group("means").add_argument
+    add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
+
+
+def add_control(parser: argparse.ArgumentParser) -> None:
+    """Options of error control."""
+    add = parser.add_argument_group("error control").add_argument
+    add("--tolerance", type=float, metavar="T", help="largest error of any channel of any pixel (default: none)")
+    add("--estimator", choices=("interval", "pilot"), help="how the error is known")
+    add("--screen", choices=("pixels", "quadtree"), help="whether pixels are interpolated where the tolerance allows it")
+    add("--progressive", action="store_true", help="by a quadtree, in stages: OUT is rewritten at each")
+    add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
+
+
+def size(text: str) -> tuple[int, int]:
+    """Width and height of `640x480`; of one number, a square."""
+    parts = text.lower().split("x")
+    try:
+        width, height = (int(part) for part in (parts if len(parts) == 2 else parts * 2))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write it as 640x480") from None
+    if len(parts) > 2 or width < 1 or height < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; both edges must be at least 1 pixel, as in 640x480")
+    return width, height

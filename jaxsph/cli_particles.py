@@ -1,0 +1,63 @@
+"""Files of particles on the command line: what is shown of them, and what `info` says.
+
+Flow: file, options -> [cli_particles] -> Scene -> cli.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+import numpy as np
+
+from jaxsph import io, scenes
+from jaxsph.console import UsageError, attributes, say, span
+from jaxsph.model import Particles, Scene
+
+
+def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
+    """The particles of the source under a colour map; and what there is to frame."""
+    if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
+        raise UsageError(f"--support must be > 0, got {options.support:g}")
+    table = _table(options)
+    say("file", f"{options.source}: {table.source}, {len(table):,} particles")
+    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    columns = particles.to_numpy()
+    say("support", f"{span(columns['support'])}: {report.support}")
+    say("volume", report.volume)
+    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    for note in report.notes:
+        say("note", note)
+    return Scene(particles=particles, transfer=transfer(particles, options, report.quantity)), particles
+
+
+def transfer(particles: Particles, options: argparse.Namespace, quantity: str) -> Any:
+    """What particles look like: a colour map over a quantity."""
+    name = options.colormap or "viridis"
+    depth = scenes.appearance.OPTICAL_DEPTH if options.opacity is None else options.opacity
+    try:
+        made = scenes.default_transfer(particles, name, options.range, depth)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    colors, extinction = f"{name} over {quantity} = {span(made.values)}", span(made.extinction)
+    say("colours", f"{colors}, extinction {extinction} per unit length")
+    return made
+
+
+def describe(options: argparse.Namespace) -> Particles:
+    """Say what a file of particles holds, and what of it would be shown."""
+    table = _table(options)
+    print(f"{options.source}: {table.source}, {len(table):,} particles")
+    attributes(table)
+    print("\n`jaxsph render` would show")
+    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    columns = particles.to_numpy()
+    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    say("support", f"{span(columns['support'])}: {report.support}")
+    say("volume", report.volume)
+    return particles
+
+
+def _table(options: argparse.Namespace) -> io.ParticleTable:
+    return io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())

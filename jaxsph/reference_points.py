@@ -1,0 +1,127 @@
+"""Points in the oracle: how much of each lies in each sample of each ray, by quadrature of what a profile is.
+
+Flow: Points, rays, borders of samples -> [reference_points] -> reference.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.model.camera import Camera
+from jaxsph.model.points import Points
+from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
+
+
+class Chords(NamedTuple):
+    """Where rays pass one point; all but the rays' directions in radii of it.
+
+    Attributes:
+        foot: (rays, 3), from the centre to the nearest place of each ray, world axes.
+        direction: (rays, 3), of length 1, world axes.
+        half: (rays,), half of the length inside.
+        attributes: of the point, by name.
+    """
+
+    foot: np.ndarray
+    direction: np.ndarray
+    half: np.ndarray
+    attributes: dict[str, np.ndarray]
+
+
+def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Optical thickness of a point set in every sample, summed over its points, and the same times colour.
+
+    Args:
+        points: their (possibly float32) numbers are taken as exact.
+        camera: of which only pose and projection are looked at.
+        u, v: ray coordinates of columns and rows.
+        edges: (samples + 1,), depths between which samples stand.
+
+    Returns:
+        (height, width, samples) and (height, width, samples, 3).
+
+    References:
+        Kaehler, Abel & Hege 2007, section 3.2, for the spreads "feet" and "centres".
+    """
+    total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
+    directions, starts = _rays(camera, u, v)
+    axes, center = np.asarray(camera.axes, np.float64), points.exact_position() - camera.exact_eye()
+    for point in np.flatnonzero(np.asarray(points.valid)):
+        radius, middle = float(points.radius[point]), axes @ center[point]
+        slant = np.linalg.norm(directions, axis=-1)
+        foot_depth = ((middle - starts) * directions).sum(-1) / slant**2
+        foot = starts + foot_depth[..., None] * directions - middle
+        rows, columns = np.nonzero((foot**2).sum(-1) < radius**2)
+        foot, slant, foot_depth = foot[rows, columns] / radius, slant[rows, columns], foot_depth[rows, columns]
+        attributes = {name: np.asarray(values[point], np.float64) for name, values in points.attributes.items()}
+        half = np.sqrt(np.maximum(1 - (foot**2).sum(-1), 0))
+        chords = Chords(foot @ axes, directions[rows, columns] / slant[:, None] @ axes, half, attributes)
+        place = (edges - foot_depth[:, None]) * slant[:, None] / radius  # of borders along rays, from the foot on
+        spread = _spread(points, middle, camera.is_perspective)
+        if spread == "chords":
+            ends = np.clip(place, -half[:, None], half[:, None])
+            lengths = _integral(points.profile, chords, ends[:, :-1], ends[:, 1:])
+        else:
+            at = foot_depth if spread == "feet" else np.full(len(rows), middle[2])
+            held = (edges[:-1] <= at[:, None]) & (at[:, None] < edges[1:])
+            lengths = held * _integral(points.profile, chords, -half[:, None], half[:, None])
+        own = float(points.extinction[point]) * radius * lengths
+        total[rows, columns] += own
+        colored[rows, columns] += own[..., None] * np.asarray(points.color[point], np.float64)
+    return total, colored
+
+
+def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions a unit of depth, and places at depth 0, in view space; (height, width, 3) each."""
+    aside = np.stack([*np.meshgrid(u, v), np.zeros((len(v), len(u)))], -1)
+    ahead = np.broadcast_to(np.array([0.0, 0.0, 1.0]), aside.shape)
+    return (aside + ahead, np.zeros_like(aside)) if camera.is_perspective else (ahead, aside)
+
+
+def _spread(points: Points, middle: np.ndarray, perspective: bool) -> str:
+    away = np.linalg.norm(middle) if perspective else middle[2]
+    is_splat = points.splats_beyond is not None and away > float(points.splats_beyond)
+    return "centres" if is_splat else points.spread
+
+
+def _integral(profile: Profile, chords: Chords, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Of the profile along rays from `start` to `end`, (rays, samples), in radii; split where a profile may have a kink."""
+    square = (chords.foot**2).sum(-1)[:, None]
+    rings = np.sqrt(np.maximum(_kinks(profile)[:, None, None] ** 2 - square, 0))
+    breaks = [*-rings[::-1], *rings]
+    total = np.zeros(np.broadcast_shapes(start.shape, end.shape))
+    for low, high in itertools.pairwise(breaks):
+        first, last = np.clip(start, low, high), np.clip(end, low, high)
+        for node, weight in zip(NODES, WEIGHTS, strict=True):
+            total += weight * (last - first) / 2 * _value(profile, chords, (first + last) / 2 + node * (last - first) / 2)
+    return total
+
+
+def _kinks(profile: Profile) -> np.ndarray:
+    """Distances in [0, 1] between which a profile is smooth, from 0 to 1."""
+    return np.linspace(0, 1, profile.values.shape[0]) if isinstance(profile, Table) else np.array([0.0, 1.0])
+
+
+def _value(profile: Profile, chords: Chords, t: np.ndarray) -> np.ndarray:
+    """A profile at places along rays, (rays, samples)."""
+    offset = chords.foot[:, None] + t[..., None] * chords.direction[:, None]
+    if isinstance(profile, Shaped):
+        with jax.enable_x64(True):
+            given = {name: jnp.full(t.shape, value) for name, value in chords.attributes.items()}
+            x, y, z = (jnp.asarray(part) for part in np.moveaxis(offset, -1, 0))
+            return np.asarray(profile.function((x, y, z), given), np.float64)
+    distance = np.linalg.norm(offset, axis=-1)
+    if isinstance(profile, Gaussian):
+        return np.exp(-FALLOFF * distance**2)
+    if isinstance(profile, Ball):
+        return np.ones_like(distance)
+    if isinstance(profile, Table):
+        return np.interp(distance, _kinks(profile), np.asarray(profile.values, np.float64))
+    raise ValueError(f"`profile` {type(profile).__name__} is unknown to the reference, which has those of `model.profiles`")
