@@ -98,6 +98,8 @@ class Points:
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
+        if spread == "feet" and splats_beyond is not None:
+            raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
         center = _centers(position)
         given = {"radius": radius, **_strength(extinction, opacity), **_own_names(attributes or {})}
         columns = {"position": center, "color": _column("color", color, center.shape[0], (3,))}
