@@ -105,12 +105,14 @@ def test_of_two_points_one_behind_the_other_the_nearer_hides_the_farther(front, 
 
 
 @pytest.mark.parametrize("mix", ["extinction", "opacity"])
-def test_in_one_sample_colours_mix_as_asked(mix):
+@pytest.mark.parametrize("medium", ["volume", "particles"])
+def test_in_one_sample_colours_mix_as_asked(mix, medium):
     camera, density = view(size=1, near=2.5, far=3.5), 1.5
-    grid = js.Volume.from_array(CUBE.astype(np.float32), (-1, -1, -1), 2.0)
     look = js.TransferFunction.from_points([0.0, 1.0], [RED, RED], [density, density])
+    grid = {"volume": js.Volume.from_array(CUBE.astype(np.float32), (-1, -1, -1), 2.0), "volume_transfer": look}
+    gas_parts = grid if medium == "volume" else {"particles": js.Particles.from_arrays([(0.0, 0, 0)], 2.0, 0.5), "transfer": look}
     stars = points([(0, 0, 0.1), (0, 0, -0.1)], color=(BLUE, (0, 1, 0)), extinction=(EXTINCTION, EXTINCTION / 3))
-    image = reference(camera, 1, volume=grid, volume_transfer=look, points=stars, mix=mix)
+    image = reference(camera, 1, **gas_parts, points=stars, mix=mix)
     gas, ball = density * 1.0, whole(np.zeros(1))[0]
     total, star = gas + ball * 4 / 3, ball * 4 / 3
     shares = np.array([gas, ball / 3, ball])

@@ -100,15 +100,8 @@ class Points:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
         if spread == "feet" and splats_beyond is not None:
             raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
-        if (extinction is None) == (opacity is None):
-            what = "neither" if extinction is None else "both"
-            raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
-        center = _array("position", position)
-        if center.size == 0 and not isinstance(center, jax.Array):
-            center = center.reshape(0, 3)
-        require_shape("position", center, (None, 3), "one row (x, y, z) a point")
-        strength = {"extinction": extinction} if opacity is None else {"opacity": opacity}
-        given = {"radius": radius, **strength, **_own_names(attributes or {})}
+        center = _centers(position)
+        given = {"radius": radius, **_strength(extinction, opacity), **_own_names(attributes or {})}
         columns = {"position": center, "color": _column("color", color, center.shape[0], (3,))}
         columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
         _require_usable(columns)
@@ -120,9 +113,8 @@ class Points:
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
-        rest = None
-        if not is_traced(center, packed["radius"]) and center.shape[0]:
-            rest = rest_of(center, packed["position"], packed["radius"])
+        known = center.shape[0] and not is_traced(center, packed["radius"])
+        rest = rest_of(center, packed["position"], packed["radius"]) if known else None
         packed = {name: jnp.asarray(value) for name, value in packed.items()}
         main = {name: packed.pop(name) for name in MAIN}
         valid, beyond = jnp.arange(room) < center.shape[0], _distance(splats_beyond, dtype)
@@ -171,6 +163,14 @@ def _array(name: str, value: Any) -> Any:
     return value
 
 
+def _centers(position: Any) -> Any:
+    center = _array("position", position)
+    if center.size == 0 and not isinstance(center, jax.Array):
+        center = center.reshape(0, 3)
+    require_shape("position", center, (None, 3), "one row (x, y, z) a point")
+    return center
+
+
 def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any:
     """One entry a point, of one for all where so much is given."""
     value = _array(name, value)
@@ -179,6 +179,14 @@ def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any
     each = "one row" if row else "one value"
     require_shape(name, value, (count, *row), f"{each} for each of the {count} points, or one for all")
     return value
+
+
+def _strength(extinction: Any, opacity: Any) -> dict[str, Any]:
+    """The one that is given, by name."""
+    if (extinction is None) == (opacity is None):
+        what = "neither" if extinction is None else "both"
+        raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
+    return {"extinction": extinction} if opacity is None else {"opacity": opacity}
 
 
 def _own_names(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -49,6 +49,7 @@ CONE = (1.0, 0.0)
         ({"profile": [1.0]}, "at least 2 numbers, got 1"),
         ({"profile": [1.0, -1.0]}, "`profile` must be >= 0"),
         ({"spread": "feat"}, "`spread` must be one of 'chords', 'feet', 'centres', got 'feat'"),
+        ({"spread": "feet", "splats_beyond": 1.0}, "`splats_beyond` goes with `spread='chords'`"),
         ({"splats_beyond": -1.0}, "`splats_beyond` must be >= 0 or None, got -1.0"),
         ({"splats_beyond": np.nan}, "`splats_beyond` must be >= 0 or None, got nan"),
         ({"capacity": 2}, r"`capacity` must be at least the number of points \(3\) and 1, got 2"),

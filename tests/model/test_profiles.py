@@ -30,12 +30,12 @@ def integral(name, square, start, end):
 @given(parts, parts, parts)
 @settings(max_examples=25)
 def test_integrals_along_rays_are_those_of_the_profile(name, b, low, high):
-    """A table's kinks are not met by eight nodes: within 1 % of the largest value times the length of the whole chord."""
+    """A table's kinks are not met by nodes: within 2 % of its largest number."""
     half = np.sqrt(1 - b**2)
     start, end = sorted((half * (2 * low - 1), half * (2 * high - 1)))
     got = PROFILES[name].along(jnp.float32(b) ** 2, jnp.float32(start), jnp.float32(end))
     error = abs(float(got) - integral(name, np.float64(b) ** 2, start, end))
-    assert error <= (0.01 * 2 if name == "table" else 1e-6)
+    assert error <= (0.02 if name == "table" else 1e-6)
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -56,7 +56,17 @@ def test_quadrature_meets_smooth_profiles_closely():
     for b in (0.0, 0.3, 0.9):
         half = np.sqrt(1 - b**2)
         ends = [jnp.float32(value) for value in (b**2, -half, half)]
-        np.testing.assert_allclose(Profile.along(Gaussian(), *ends), Gaussian().along(*ends), rtol=4e-5)
+        np.testing.assert_allclose(Profile.along(Gaussian(), *ends), Gaussian().along(*ends), rtol=2e-6)
+
+
+def test_a_cusp_at_the_centre_is_met():
+    decay = profile_of(np.exp(-5 * np.linspace(0, 1, 33)), jnp.float32)
+    whole = decay.along(*(jnp.float32(value) for value in (0, -1, 1)))
+    np.testing.assert_allclose(whole, decay.through_centre(), rtol=1e-3)
+    shaped = profile_of(lambda offset, _: jnp.exp(-5 * jnp.sqrt(sum(part**2 for part in offset))), jnp.float32)
+    zero, one = jnp.float32(0), jnp.float32(1)
+    got = shaped.along_chord(Chord((zero, zero, zero), (zero, one, zero), {}), -one, one)
+    np.testing.assert_allclose(got, 2 * (1 - np.exp(-5)) / 5, rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", PROFILES)
