@@ -379,8 +379,8 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
 def _require_points(scene: Scene, integrator: str) -> None:
     """Raise where a medium cannot tell its optics at any point."""
     refused = [type(medium).__name__ for medium in scene.media if not medium.at_points]
-    if scene.particles is not None:
-        refused = ["Scene(particles=...)", *refused]
+    given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
+    refused = [*(what for what, there in given.items() if there), *refused]
     if refused:
         raise ValueError(
             f"`integrator={integrator!r}` asks media for points of its own choosing, which `{refused[0]}` cannot answer; "

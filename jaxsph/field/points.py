@@ -1,12 +1,12 @@
-r"""Points as a medium: each stretch of a ray has the integral of their extinction along it, and their colours by extinction.
+r"""Points as a medium: each interval of a ray has the integral of their extinction along it, and their colours by extinction.
 
 Flow: points, camera, lists -> [points: chords -> sums] -> integrator; cotangents -> [points: by jax.vjp, block by block].
 
 The ray of unit direction d passes the centre c of a point at the distance b, at the foot of c on it. With t counted from there
-in radii r, a stretch from $t_0$ to $t_1$ has the optical thickness $\xi r \int_{t_0}^{t_1} f(\sqrt{b^2 + t^2}) dt$: nothing is
+in radii r, an interval from $t_0$ to $t_1$ has the optical thickness $\xi r \int_{t_0}^{t_1} f(\sqrt{b^2 + t^2}) dt$: nothing is
 sampled, so no point is missed however small, and "the step length is that of the smallest point" (Kaehler, Abel & Hege 2007,
 section 3.2) for each by itself. Their projection has all of it at the foot, a splat all of it at the depth of the centre; see
-`model.points`. Shapes, once: (tasks, points of a block, stretches of a slab, rays).
+`model.points`. Shapes, once: (tasks, points of a block, intervals of a slab, rays).
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ class PointsMedium(Medium):
         """Nothing of its own: spheres are in the grid, by which slabs are filled."""
         return jnp.zeros_like(slabs.z_lower, bool)
 
-    def gather(self, task: SlabTask) -> Float[Array, "4 tasks stretches rays"]:
-        """Thickness of all stretches, and thickness times red, green and blue."""
+    def gather(self, task: SlabTask) -> Float[Array, "4 tasks intervals rays"]:
+        """Thickness of all intervals, and thickness times red, green and blue."""
         sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
         for turns in turns_of(task, BLOCK):
             some = jax.tree.map(lambda value, number=turns.number: value[:number], sums)
@@ -151,12 +151,12 @@ class PointsMedium(Medium):
             channels = [channels[0] + here, *(old + new for old, new in zip(channels[1:], weighed, strict=True))]
         return sums_of(channels)
 
-    def extinction(self, gathered: Array, task: SlabTask) -> tuple[Float[Array, "tasks stretches rays"], Array]:
-        """Mean extinction of stretches."""
+    def extinction(self, gathered: Array, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Array]:
+        """Mean extinction of intervals."""
         path = task.path()
         return jnp.where(path > 0, gathered[0] / jnp.where(path > 0, path, 1), 0), gathered
 
-    def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks stretches rays"]]:
+    def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """Weighed by thickness."""
         thickness, *weighed = samples
         inverse = jnp.where(thickness > 0, 1 / jnp.where(thickness > 0, thickness, 1), 0)
@@ -219,8 +219,8 @@ class PointsMedium(Medium):
             Row(*jnp.moveaxis(row, -1, 0)), {name: one[point] for name, one in self.attributes.items()}, point, inside, splat
         )
 
-    def _thickness(self, some: _Some, rays: _Rays) -> Float[Array, "tasks points stretches rays"]:
-        """Of the stretches of rays, by each of some points."""
+    def _thickness(self, some: _Some, rays: _Rays) -> Float[Array, "tasks points intervals rays"]:
+        """Of the intervals of rays, by each of some points."""
         row = Row(*(column[:, :, None] for column in some.row))
         foot, away = rays.nearest(row)
         away = [offset * row.inverse for offset in away]
@@ -236,7 +236,7 @@ class PointsMedium(Medium):
         def whole() -> Array:
             middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
             behind = (rays.border[:, None] >= middle[:, :, None]).astype(half.dtype)
-            there = behind[:, :, 1:] - behind[:, :, :-1]  # in the stretch that begins in front of it, and ends behind
+            there = behind[:, :, 1:] - behind[:, :, :-1]  # in the interval that begins in front of it, and ends behind
             return self._along(some, rays, away, square, jnp.concatenate([-half, half], 2)) * there
 
         found = self._spread(some, chords, whole)
@@ -281,14 +281,14 @@ class _Rays(NamedTuple):
 
     Attributes:
         u, v: ray coordinates.
-        border: depths between stretches.
+        border: depths between intervals.
         slant: path length a unit of depth.
         axes: of the camera.
     """
 
     u: Float[Array, "tasks rays"]
     v: Float[Array, "tasks rays"]
-    border: Float[Array, "tasks stretches_and_one 1"]
+    border: Float[Array, "tasks intervals_and_one 1"]
     slant: Float[Array, "tasks rays"]
     axes: Float[Array, "3 3"]
     perspective: bool

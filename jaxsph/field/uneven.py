@@ -19,6 +19,7 @@ from jaxtyping import Array, Int
 from jaxsph.field.tasks import SlabTask
 
 PARTS = 4, 16  # of the slabs of a task, the first quarter and the first sixteenth have loops of their own
+FEWEST = 16  # slabs that are worth a loop: each is compiled
 
 
 class Turns(NamedTuple):
@@ -32,13 +33,11 @@ class Turns(NamedTuple):
 
 def turns_of(task: SlabTask, block: int) -> Iterator[Turns]:
     """All blocks of `block` spheres of all slabs, in order for each slab."""
-    blocks = (task.entry.length.sum(0) + block - 1) // block
+    blocks = (task.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
     tasks = blocks.shape[0]
-    numbers = [tasks, *(tasks // part for part in PARTS if tasks // part > 0), 0]
+    numbers = [tasks, *(tasks // part for part in PARTS if tasks // part >= FEWEST), 0]
     begin = jnp.int32(0)
     for number, fewer in itertools.pairwise(numbers):
-        if fewer == number:
-            continue
         end = jnp.maximum(blocks[fewer:number].max(), begin)
         yield Turns(number, task.first(number), begin, end)
         begin = end

@@ -2,10 +2,10 @@ r"""Media that share rays, mixed sample by sample: Kaehler, Abel & Hege 2007, se
 
 Flow: media -> [mixture] -> integrator.
 
-A sample stands for a stretch of a ray of length l. Their equation 2: extinctions add up, so the stretch has the opacity
+A sample stands for an interval of a ray of length l. Their equation 2: extinctions add up, so the interval has the opacity
 $\alpha = 1 - \exp(-\sum_k \xi_k l)$. What it emits is mixed in one of two ways.
 
-- `"extinction"`: $\alpha \sum_k \xi_k c_k / \sum_k \xi_k$. Exact for constant extinctions, however long the stretch.
+- `"extinction"`: $\alpha \sum_k \xi_k c_k / \sum_k \xi_k$. Exact for constant extinctions, however long the interval.
 - `"opacity"`: $\sum_k \alpha_k c_k$ with $\alpha_k = 1 - \exp(-\xi_k l)$, their equation 1. Where several
   are not empty these add up to more than $\alpha$, so it shows more light than the first, and more than there can be where all
   are opaque. Both meet as l goes to 0.
@@ -114,14 +114,14 @@ def mixed_colors(colors: list[Optics], extinctions: Optics, path: Float[Array, "
     weights, total = extinctions, mixed_extinction(extinctions)
     if path is not None:
         weights, total = [_opacity(extinction, path) for extinction in extinctions], _opacity(total, path)
-    inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
-    shares = [weight * inverse for weight in weights]
+    divisor = jnp.where(total > 0, total, 1)  # divided by, not multiplied with one over it: one alone is to have a share of 1
+    shares = [jnp.where(total > 0, weight / divisor, 0) for weight in weights]
     weighed = [[share * color for color in of_one] for share, of_one in zip(shares, colors, strict=True)]
     return [mixed_extinction(list(of_channel)) for of_channel in zip(*weighed, strict=True)]
 
 
 def _opacity(extinction: Float[Array, "..."], path: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Of a stretch; a unit length where that has none, which is the limit."""
+    """Of an interval; a unit length where that has none, which is the limit."""
     return jnp.where(path > 0, -jnp.expm1(-extinction * path), extinction)
 
 

@@ -29,7 +29,7 @@ def test_by_opacity_colours_add_up_times_opacities():
     np.testing.assert_allclose(emitted, alpha[0] * colors[0][0] + alpha[1] * colors[1][0], rtol=1e-6)
 
 
-def test_by_opacity_a_stretch_of_no_length_is_mixed_by_extinction():
+def test_by_opacity_a_interval_of_no_length_is_mixed_by_extinction():
     extinctions = [np.float32([1.0]), np.float32([3.0])]
     colors = [[np.float32([1.0])], [np.float32([0.5])]]
     np.testing.assert_allclose(mixed_colors(colors, extinctions, np.float32([0.0]))[0], [0.625])

@@ -1,0 +1,289 @@
+"""Points are what the reference says of them, wherever they are, however they are spread, among whatever else there is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import QUICKLY
+
+import jaxsph as js
+from jaxsph.numerics import faults
+
+SETTINGS = js.Settings(samples=24)
+WIDTH, HEIGHT = 21, 18
+RNG = np.random.default_rng(8)
+COUNT = 40
+POSITION = RNG.uniform(-1.2, 1.2, (COUNT, 3))
+RADIUS = 10.0 ** RNG.uniform(-2.2, -0.2, COUNT)
+COLOR = RNG.uniform(0, 1, (COUNT, 3))
+EXTINCTION = RNG.uniform(0.1, 3, COUNT) / RADIUS
+
+
+def points(position=POSITION, radius=RADIUS, color=COLOR, extinction=EXTINCTION, **more):
+    return js.Points.from_arrays(position, radius, color, extinction, **more)
+
+
+def camera(projection="perspective", distance=3.0, **more):
+    where = {"eye": (0.3 * distance, 0.4 * distance, -distance), "target": (0.0, 0.0, 0.0), "width": WIDTH, "height": HEIGHT}
+    where |= {"near": max(distance - 1.5, 0.05), "far": distance + 1.5} | more
+    if projection == "orthographic":
+        return js.Camera.orthographic(**where, view_height=2.5)
+    return js.Camera.look_at(**where, fov_degrees=50.0)
+
+
+def field(**more):
+    values = np.random.default_rng(2).uniform(0, 1, (6, 7, 5)).astype(np.float32)
+    look = js.TransferFunction.from_points([0.2, 0.5, 0.8], [[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]], [0.0, 2.0, 0.5])
+    return {"volume": js.Volume.from_array(values, (-1.1, -0.9, -1.0), 0.4), "volume_transfer": look} | more
+
+
+def particles():
+    rng = np.random.default_rng(1)
+    look = js.TransferFunction.from_points([0.2, 0.5, 0.8], [[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]], [0.5, 2.0, 0.5])
+    position = rng.uniform(-1, 1, (30, 3)).astype(np.float32)
+    return {"particles": js.Particles.from_arrays(position, 0.6, rng.uniform(0, 1, 30).astype(np.float32)), "transfer": look}
+
+
+def shaped(offset, attributes):
+    x, y, z = offset
+    return jnp.exp(-4 * (x * x + 4 * y * y + z * z)) * attributes["brightness"]
+
+
+def off(image, truth):
+    """Largest difference of colour and transmittance."""
+    color = np.abs(np.asarray(image.color, float) - truth.color).max(-1)
+    return np.maximum(color, np.abs(np.asarray(image.transmittance, float) - truth.transmittance))
+
+
+def assert_is_reference(scene, view, settings=SETTINGS):
+    error = off(js.render(scene, view, settings), js.reference.render(scene, view, settings))
+    assert (error <= 1e-4).mean() >= 0.999, f"{(error > 1e-4).sum()} of {error.size} pixels, worst {error.max()}"
+
+
+@pytest.mark.parametrize(
+    ("spread", "projection"),
+    [
+        ("chords", "perspective"),
+        ("feet", "orthographic"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("chords", "orthographic"), ("feet", "perspective"))),
+        *(pytest.param("centres", projection, marks=pytest.mark.slow) for projection in ("perspective", "orthographic")),
+    ],
+)
+def test_an_image_is_that_of_the_reference(spread, projection):
+    assert_is_reference(js.Scene(points=points(spread=spread)), camera(projection))
+
+
+TABLE = np.exp(-3 * np.linspace(0, 1, 33) ** 2).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        pytest.param("ball", marks=pytest.mark.slow),
+        pytest.param(TABLE, id="table", marks=pytest.mark.slow),
+        pytest.param(shaped, id="shaped"),
+        pytest.param("gaussian", id="splats"),
+    ],
+)
+def test_any_profile_is_that_of_the_reference(profile):
+    more = {"attributes": {"brightness": RNG.uniform(0.5, 1, COUNT)}} if profile is shaped else {}
+    more |= {"splats_beyond": 3.0} if isinstance(profile, str) and profile == "gaussian" else {}
+    assert_is_reference(js.Scene(points=points(profile=profile, **more)), camera())
+
+
+def test_an_eye_among_points_sees_them_from_inside():
+    assert_is_reference(js.Scene(points=points()), camera(distance=0.3))
+
+
+def test_points_that_touch_only_the_ends_of_rays_are_met():
+    """They lie before the first sample and behind the last one, within the intervals that those stand for."""
+    view = js.Camera.look_at((0, 0, 0), (0, 0, 1), width=WIDTH, height=HEIGHT, near=1.0, far=3.0)
+    settings = js.Settings(samples=4)
+    ends = js.Points.from_arrays([[0, 0, 1.03], [0.4, 0, 2.9]], [0.03, 0.1], COLOR[:2], 20.0)
+    assert_is_reference(js.Scene(points=ends), view, settings)
+    assert float(js.render(js.Scene(points=ends), view, settings).alpha.max()) > 0.3
+
+
+@pytest.mark.parametrize("mix", ["extinction", "opacity"])
+def test_points_among_a_volume_and_particles_are_those_of_the_reference(mix):
+    several = (
+        points(position=POSITION[:20], radius=RADIUS[:20], color=COLOR[:20], extinction=EXTINCTION[:20]),
+        points(profile="ball"),
+    )
+    assert_is_reference(js.Scene(points=several, mix=mix, **field(), **particles()), camera())
+
+
+def test_two_volumes_share_rays():
+    first, second = field(), field()
+    both = {name: (first[name], dataclasses.replace(second[name])) for name in first}
+    moved = js.Volume.from_array(np.asarray(first["volume"].values)[::-1], (-0.2, -0.9, -1.4), 0.35)
+    assert_is_reference(js.Scene(**(both | {"volume": (first["volume"], moved)})), camera())
+
+
+def layers(front):
+    """A sheet of red fog, and blue points in front of it or behind."""
+    look = js.TransferFunction.from_points([0.0, 1.0], [[1, 0, 0], [1, 0, 0]], [4.0, 4.0])
+    fog = js.Volume.from_array(np.ones((2, 2, 2), np.float32), (-2, -2, -0.2), (4.0, 4.0, 0.4))
+    place = np.stack([*RNG.uniform(-0.6, 0.6, (2, 200)), np.full(200, -0.8 if front else 0.8)], 1)
+    return js.Scene(volume=fog, volume_transfer=look, points=js.Points.from_arrays(place, 0.15, (0, 0, 1), opacity=0.8))
+
+
+def test_to_swap_two_layers_in_depth_is_seen_and_no_pasting_of_their_images_shows_it():
+    view = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=WIDTH, height=HEIGHT, near=1.5, far=4.5)
+    scenes = [layers(front) for front in (True, False)]
+    front, behind = (js.render(scene, view, SETTINGS) for scene in scenes)
+    middle = slice(HEIGHT // 2 - 2, HEIGHT // 2 + 2), slice(WIDTH // 2 - 2, WIDTH // 2 + 2)
+    assert (np.asarray(front.color)[middle][..., 2] > 0.5).all() and (np.asarray(behind.color)[middle][..., 2] < 0.5).all()
+    for scene, together in zip(scenes, (front, behind), strict=True):
+        assert_is_reference(scene, view)
+        fog = js.render(js.Scene(volume=scene.volume, volume_transfer=scene.volume_transfer), view, SETTINGS)
+        alone = js.render(js.Scene(points=scene.points), view, SETTINGS)
+        pasted = [one.color + one.transmittance[..., None] * other.color for one, other in ((fog, alone), (alone, fog))]
+        wrong = [float(jnp.abs(image - together.color).max()) for image in pasted]
+        assert min(wrong) < 1e-5 < 0.3 < max(wrong)  # one order of pasting is right here, the other one there
+
+
+def test_what_is_mixed_within_a_fog_is_no_pasting_of_any_order():
+    look = js.TransferFunction.from_points([0.0, 1.0], [[1, 0, 0], [1, 0, 0]], [1.0, 1.0])
+    fog = {"volume": js.Volume.from_array(np.ones((2, 2, 2), np.float32), -2.0 * np.ones(3), 4.0), "volume_transfer": look}
+    given = {**fog, "points": points()}, {"points": points()}, fog
+    together, alone, gas = (js.render(js.Scene(**parts), camera(), SETTINGS) for parts in given)
+    for one, other in ((gas, alone), (alone, gas)):
+        assert float(jnp.abs(one.color + one.transmittance[..., None] * other.color - together.color).max()) > 0.1
+
+
+@pytest.mark.parametrize("mix", ["extinction", "opacity"])
+def test_a_medium_that_is_absent_or_empty_changes_no_bit(mix):
+    view, nobody = camera(), js.Points.from_arrays(np.zeros((0, 3)), 1.0, extinction=1.0)
+    empty = field(volume_transfer=js.TransferFunction.from_points([0.0, 1.0], [[1, 1, 1]] * 2, [0.0, 0.0]))
+    gas, alone = (js.render(js.Scene(mix=mix, **parts), view, SETTINGS) for parts in (field(), {"points": points()}))
+    for image, parts in (
+        (gas, {**field(), "points": nobody}),
+        (alone, {**empty, "points": points()}),
+        (alone, {"points": (points(), nobody)}),
+    ):
+        again = js.render(js.Scene(mix=mix, **parts), view, SETTINGS)
+        for name in ("color", "transmittance", "depth"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(image, name))
+
+
+def test_an_image_in_bands_and_one_under_jit_are_the_same():
+    scene, view = js.Scene(points=points(splats_beyond=3.0), **field()), camera()
+    image, plan = js.render(scene, view, SETTINGS), js.plan(scene, view, SETTINGS)
+    limited = dataclasses.replace(SETTINGS, memory_limit=plan.bytes // 2 + 40_000)
+    assert js.plan(scene, view, limited).bands > 1
+    in_bands = js.render(scene, view, limited)
+    traced = jax.jit(lambda shown: js.render(shown, view, SETTINGS, plan=plan))(scene)
+    np.testing.assert_array_equal(in_bands.color, image.color)
+    np.testing.assert_allclose(traced.color, image.color, atol=2e-6)
+    assert int(traced.faults) == 0
+
+
+def test_a_quadtree_of_rays_shows_points_too():
+    scene, view = js.Scene(points=points(), **field()), camera(width=40, height=30)
+    every, chosen = (js.render(scene, view, js.Settings(samples=24, screen=screen)) for screen in ("pixels", "quadtree"))
+    np.testing.assert_allclose(chosen.color, every.color, atol=2e-6)
+
+
+def test_a_tolerance_is_refused_by_name_and_steps_of_any_length_too():
+    scene, view = js.Scene(points=points()), camera()
+    with pytest.raises(ValueError, match=r"`tolerance` does not cover `Scene\(points=...\)` yet"):
+        js.render(scene, view, js.Settings(samples=24, tolerance=0.01))
+    with pytest.raises(ValueError, match=r"`Scene\(points=...\)` cannot answer"):
+        js.render(scene, view, js.Settings(samples=24, integrator="step_doubling"))
+
+
+@pytest.mark.parametrize("name", ["position", "radius", "color", "extinction"])
+def test_numbers_that_mean_nothing_are_a_fault_under_jit(name):
+    scene, view = js.Scene(points=points()), camera()
+    plan = js.plan(scene, view, SETTINGS)
+    broken = dataclasses.replace(scene.points, **{name: getattr(scene.points, name).at[3].set(jnp.nan)})
+    image = jax.jit(lambda shown: js.render(shown, view, SETTINGS, plan=plan))(dataclasses.replace(scene, points=broken))
+    assert "a point has" in faults.describe(int(image.faults)) and bool(jnp.isfinite(image.color).all())
+    with pytest.raises(ValueError, match="a point has"):
+        js.render(dataclasses.replace(scene, points=broken), view, SETTINGS)
+
+
+def test_all_points_in_one_place_are_all_counted():
+    crowd = js.Points.from_arrays(np.zeros((500, 3)), 0.3, (1, 1, 1), 0.02)
+    view = camera()
+    one = js.Points.from_arrays(np.zeros((1, 3)), 0.3, (1, 1, 1), 10.0)
+    together, alone = (js.render(js.Scene(points=some), view, SETTINGS) for some in (crowd, one))
+    np.testing.assert_allclose(together.color, alone.color, atol=1e-5)
+
+
+def gentle():
+    """Points and a volume in float64, none of whose rims is met so sharply that differences would not see a slope."""
+    gas = field()
+    values = np.asarray(gas["volume"].values, float)
+    volume = js.Volume.from_array(values, np.float64((-1.1, -0.9, -1.0)), 0.4)
+    some = points(radius=np.maximum(RADIUS, 0.15), color=0.2 + 0.5 * COLOR, extinction=2.0, capacity=COUNT)
+    return js.Scene(points=some, volume=volume, volume_transfer=gas["volume_transfer"])
+
+
+def moved(scene, view, step):
+    """All numbers of a scene and its camera, moved by one step each."""
+    some, gas = scene.points, scene.volume
+    place = some.position + step["position"] * jnp.sin(jnp.arange(some.position.size)).reshape(-1, 3)
+    some = dataclasses.replace(
+        some,
+        position=place,
+        radius=some.radius * (1 + step["radius"]),
+        color=some.color * (1 + step["color"] * some.position),
+        extinction=some.extinction * (1 + step["extinction"]),
+    )
+    gas = dataclasses.replace(gas, values=gas.values * (1 + step["values"]))
+    view = dataclasses.replace(
+        view,
+        eye=view.eye + step["eye"] * jnp.array([0.3, -0.2, 0.5]),
+        half_height=view.half_height * (1 + step["opening"]),
+        near=view.near * (1 + step["near"]),
+    )
+    return dataclasses.replace(scene, points=some, volume=gas), view
+
+
+@pytest.mark.parametrize("mix", ["extinction", pytest.param("opacity", marks=pytest.mark.slow)])
+def test_derivatives_are_those_of_differences_in_both_modes(mix, x64):
+    names = "position", "radius", "color", "extinction", "values", "eye", "opening", "near"
+    scene, view = dataclasses.replace(gentle(), mix=mix), camera()
+    wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), view)
+    plan, settings = js.plan(scene, wide, SETTINGS), SETTINGS
+    weights = np.random.default_rng(0).uniform(-1, 1, (HEIGHT, WIDTH, 4))
+    still = {name: jnp.float64(0) for name in names}
+
+    def total(step):
+        shown, seen = moved(scene, wide, step)
+        image = js.render(shown, seen, settings, plan=plan)
+        return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * weights).sum()
+
+    program = jax.jit(lambda at, move: (*jax.jvp(total, (at,), (move,)), jax.grad(total)(at)), compiler_options=QUICKLY)
+    gradient = program(still, still)[2]
+    for name in names:
+        unit = still | {name: jnp.float64(1)}
+        forward = float(program(still, unit)[1])
+        ahead, behind = (float(program(still | {name: jnp.float64(step)}, still)[0]) for step in (1e-6, -1e-6))
+        assert forward == pytest.approx(float(gradient[name]), rel=1e-9, abs=1e-9), name
+        assert forward == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-5), name
+        assert abs(forward) > 1e-3, name
+
+
+@pytest.mark.slow
+def test_a_profile_is_learned(x64):
+    table = jnp.linspace(1.0, 0.1, 5)
+    given = points(radius=np.maximum(RADIUS, 0.15), extinction=2.0, profile=np.asarray(table), capacity=COUNT)
+    view = camera()
+    plan = js.plan(js.Scene(points=given), view, SETTINGS)
+
+    def total(values):
+        shown = dataclasses.replace(given, profile=dataclasses.replace(given.profile, values=values))
+        return js.render(js.Scene(points=shown), view, SETTINGS, plan=plan).color.sum()
+
+    program = jax.jit(jax.value_and_grad(total), compiler_options=QUICKLY)
+    gradient = np.asarray(program(table)[1])
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+        assert gradient[k] == pytest.approx(float(program(table + step)[0] - program(table - step)[0]) / 2e-6, rel=1e-4)
