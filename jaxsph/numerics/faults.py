@@ -18,6 +18,7 @@ BAD_TRANSFER = 16
 UNRESOLVED = 32
 WEAK_PARTICLES = 64
 BAD_VOLUME = 128
+OCTREE_OVERFLOW = 512
 
 MESSAGES = {
     TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
@@ -35,8 +36,10 @@ MESSAGES = {
     WEAK_PARTICLES: "the strengths volume / support^3 of the particles are too far apart for this precision, and the weakest "
     "would vanish: give each particle its own `volume` (about support^3), or use float64 under jax.enable_x64",
     BAD_VOLUME: "a volume holds values that are not finite, or its lower corner or spacing is not finite or not > 0; repair them",
+    OCTREE_OVERFLOW: "more (sphere, node) pairs than an octree's plan has room for; make a new plan with "
+    "`jaxsph.access.octree_build.plan_octree`, of these spheres",
 }
-OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
+OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | OCTREE_OVERFLOW
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
 
 
