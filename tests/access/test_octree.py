@@ -312,7 +312,7 @@ def test_a_plan_counts_what_is_built():
 
 def test_where_memory_does_not_suffice_levels_are_left_out_and_the_plan_says_so():
     centre, radius = spheres(7, "sizes", np.float32)
-    full, less = (plan_octree(centre, radius, most=2, max_level=9, memory=memory) for memory in (1 << 30, 1 << 13))
+    full, less = (plan_octree(centre, radius, most=2, max_level=9, memory=memory) for memory in (1 << 30, 1 << 12))
     assert less.lowered and not full.lowered and less.deepest < full.deepest
     assert int(build_octree(jnp.asarray(centre), jnp.asarray(radius), plan=less).fault) == 0
 
