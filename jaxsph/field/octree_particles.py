@@ -115,7 +115,7 @@ class OctreeParticles(Medium):
         table = jnp.stack([getattr(viewed, name) for name in COLUMNS], 1)
         octree, still = lax.stop_gradient((self.octree, camera))
         cells = (still.axes.T * (octree.rate * octree.occupancy_cells)).astype(dtype)
-        grid = VolumeGrid(jnp.zeros((0, 0, 0), dtype), still.to_view(octree.lower).astype(dtype), cells)
+        grid = VolumeGrid(jnp.zeros((1, 1, 1), dtype), still.to_view(octree.lower).astype(dtype), cells)
         fault = octree.fault | viewed.faults
         seen = SeenParticles(jnp.pad(table, ((0, 0), (0, WIDTH - len(COLUMNS)))), transfer.segments(), grid, fault)
         return OctreeParticles(None, None, octree, seen, self.kernel)
