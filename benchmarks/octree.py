@@ -11,9 +11,9 @@ the same with points of a hundredth of a support, and maybe particles of a file.
     needed     pairs of a sample and a point whose sphere it is in.
 
 Building, with a kept plan, is timed in turns with a frame of `jaxsph.render`. The rule by which nodes are split is measured by
-its `ratio`, on a tenth of the particles. Writes `results/octree.json`; ends in an assert.
+its `ratio`, if asked for, on a tenth of the particles. Writes `results/octree.json`; ends in an assert.
 
-    python benchmarks/octree.py [--repeats 3] [--particles 1000000] [--every 16] [--data FILE] [--check]
+    python benchmarks/octree.py [--repeats 3] [--particles 1000000] [--every 16] [--ratios] [--data FILE] [--check]
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def by_ratio(particles: js.Particles, share: float, camera: js.Camera, every: in
     return rows
 
 
-def measured(particles: js.Particles, share: float, repeats: int, every: int) -> dict[str, Any]:
+def measured(particles: js.Particles, share: float, repeats: int, every: int, ratios: bool) -> dict[str, Any]:
     """One contender; a frame is only timed of whole supports."""
     ball, scene = spheres(particles, share), scene_of(particles)
     camera, settings = js.Camera.framing(particles, width=SIZE, height=SIZE), js.Settings(samples=SAMPLES)
@@ -191,7 +191,7 @@ def measured(particles: js.Particles, share: float, repeats: int, every: int) ->
     count = particles.num_particles
     times = {"build": statistics.median(builds[1:]), "frame": statistics.median(frames[1:]), "plan": planning}
     rows: dict[str, Any] = {"counts": counted(tree, ball, camera, every)}
-    if share == 1:
+    if ratios and share == 1:
         rows["by ratio"] = by_ratio(particles, share, camera, every)
     return {"particles": count, "seconds": times, "sizes": sizes(tree, plan, count)} | rows
 
@@ -201,15 +201,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--particles", type=int, default=1_000_000)
     parser.add_argument("--every", type=int, default=16, help="rays are counted along every so many rows and columns")
+    parser.add_argument("--ratios", action="store_true", help="measure the rule by which nodes are split as well")
     parser.add_argument("--data", help="a file of particles")
     parser.add_argument("--check", action="store_true", help="fail where small points take too many evaluations")
     arguments = parser.parse_args()
     found: dict[str, Any] = {}
     for name, (particles, share) in contenders(arguments.particles, arguments.data).items():
-        found[name] = measured(particles, share, arguments.repeats, arguments.every)
+        found[name] = measured(particles, share, arguments.repeats, arguments.every, arguments.ratios)
         print(name, json.dumps(found[name]), flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "every": arguments.every, "found": found}, indent=1) + "\n")
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps({"run": of_this_run(), "every": arguments.every, "found": found}, indent=1) + "\n")
     if arguments.check:
         shares = {name: row["counts"]["segments"] / row["counts"]["flat"] for name, row in found.items() if "points" in name}
         assert max(shares.values()) <= MAX_SHARE, shares

@@ -187,24 +187,25 @@ def split(level: Level, found: Found, *, blocks: int, pairs: int) -> Level:
     parent = jnp.full(blocks + 1, nodes, jnp.int32).at[block].set(jnp.arange(nodes, dtype=jnp.int32)).at[-1].set(nodes)[:-1]
     there = parent < nodes
     ends = jnp.append(level.begin, level.begin[-1])
-    up_to = [fusion_barrier(nodes >= ends[0], running_sum, (found.met >> k) & 1) for k in range(OCTANTS)]
-    before = [jnp.pad(sums, (1, 0)) for sums in up_to]
-    zero = jnp.stack([sums[ends[parent]] for sums in before], 1)
-    count = jnp.stack([sums[ends[parent + 1]] for sums in before], 1) - zero
+    octants = jnp.arange(OCTANTS, dtype=jnp.int32)
+    up_to = fusion_barrier(nodes >= ends[0], lambda met: running_sum((met >> octants[:, None]) & 1, 1), found.met)
+    before = jnp.pad(up_to, ((0, 0), (1, 0)))
+    zero = before[:, ends[parent]].T
+    count = before[:, ends[parent + 1]].T - zero
     total = running_sum(count.ravel())
     begin = total - count.ravel()
     shift = jnp.append(begin.reshape(blocks, OCTANTS) - zero - 1, jnp.full((1, OCTANTS), pairs, jnp.int32), 0)
     shift = jnp.append(shift[block], shift[-1:], 0)
     sphere = jnp.zeros(pairs + 1, jnp.int32)
     for k in range(OCTANTS):
-        target = jnp.where((found.met >> k) & 1 == 1, shift[:, k].at[level.node].get(mode="promise_in_bounds") + up_to[k], pairs)
+        target = shift[:, k].at[level.node].get(mode="promise_in_bounds") + up_to[k]
+        target = jnp.where((found.met >> k) & 1 == 1, target, pairs)
         sphere = sphere.at[jnp.clip(target, 0, pairs)].set(level.sphere, mode="promise_in_bounds")
     sphere = sphere[:-1]
     begin, last = jnp.minimum(begin, pairs), jnp.minimum(total[-1], pairs)
     node = running_sum(jnp.zeros(pairs + 1, jnp.int32).at[begin].add(1))[:-1] - 1
     node = jnp.where(jnp.arange(pairs, dtype=jnp.int32) < last, node, blocks * OCTANTS)
-    octant = jnp.arange(OCTANTS, dtype=jnp.int32)
-    offset = jnp.stack([octant >> 2, (octant >> 1) & 1, octant & 1], 1)
+    offset = jnp.stack([octants >> 2, (octants >> 1) & 1, octants & 1], 1)
     corner = 2 * level.corner[jnp.minimum(parent, nodes - 1)][:, None] + offset
     corner = jnp.where(there[:, None, None], corner, 0)
     return Level(corner.reshape(-1, 3), jnp.append(begin, last), sphere, node)
