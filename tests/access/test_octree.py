@@ -96,6 +96,34 @@ def test_the_leaf_of_a_point_has_every_sphere_that_the_point_is_in(seed, style, 
     assert touched.any()
 
 
+@given(seeds, dtypes)
+@few
+def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype):
+    """Points right on borders of nodes, as far as can be told, and spheres whose surface they are on."""
+    rng = np.random.default_rng(seed)
+    ends = np.array([[-1, -1, -1], [1, 1, 1]]) + rng.choice([0, 3])
+    with jax.enable_x64(dtype == np.float64):
+        centre, radius = np.repeat(ends, SPHERES // 2, axis=0).astype(dtype), np.full(SPHERES, 0.01, dtype)
+        empty = built(jnp.asarray(centre), jnp.asarray(radius))
+        lower, side = np.asarray(empty.lower, np.float64), float(empty.side)
+        at = lower + side * np.where(
+            np.eye(3)[rng.integers(3, size=SPHERES)] > 0, 0.25, 0.1 + 0.1 * rng.uniform(size=(SPHERES, 3))
+        )
+        at = at.astype(dtype)
+        reach = side * rng.uniform(0.005, 0.09, (SPHERES, 1)) * rng.choice([-1, 1], (SPHERES, 1))
+        free = np.arange(1, SPHERES - 1)  # the first and the last keep the box as it is
+        kept = ~np.isin(np.arange(SPHERES), free)
+        moved = (at - np.where(axis, reach, 0)).astype(dtype)
+        exact = np.linalg.norm(at.astype(np.float64) - moved.astype(np.float64), axis=1)
+        centre = np.where(kept[:, None], np.repeat(ends, SPHERES // 2, axis=0), moved).astype(dtype)
+        close = exact.astype(dtype)
+        close = np.where(close.astype(np.float64) < exact, np.nextafter(close, dtype(np.inf)), close)
+        tree = built(jnp.asarray(centre), jnp.asarray(np.where(kept, dtype(0.01), close)))
+        leaf, _ = looked_up(tree, *jnp.asarray(at).T)
+        has = members(tree, leaf.begin, leaf.length)
+    assert has[np.arange(SPHERES), np.arange(SPHERES)][free].all()
+
+
 @given(seeds, styles, dtypes)
 @few
 def test_leaves_tile_the_box_and_have_no_sphere_that_is_far_from_them(seed, style, dtype):
