@@ -106,9 +106,8 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
         centre, radius = np.repeat(ends, SPHERES // 2, axis=0).astype(dtype), np.full(SPHERES, 0.01, dtype)
         empty = built(jnp.asarray(centre), jnp.asarray(radius))
         lower, side = np.asarray(empty.lower, np.float64), float(empty.side)
-        at = lower + side * np.where(
-            np.eye(3)[rng.integers(3, size=SPHERES)] > 0, 0.25, 0.1 + 0.1 * rng.uniform(size=(SPHERES, 3))
-        )
+        axis = np.eye(3)[rng.integers(3, size=SPHERES)] > 0
+        at = lower + side * np.where(axis, 0.25, rng.uniform(0.1, 0.2, (SPHERES, 3)))
         at = at.astype(dtype)
         reach = side * rng.uniform(0.005, 0.09, (SPHERES, 1)) * rng.choice([-1, 1], (SPHERES, 1))
         free = np.arange(1, SPHERES - 1)  # the first and the last keep the box as it is
