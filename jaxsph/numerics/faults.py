@@ -19,6 +19,7 @@ UNRESOLVED = 32
 WEAK_PARTICLES = 64
 BAD_VOLUME = 128
 BAD_POINTS = 256
+OCTREE_OVERFLOW = 512
 
 MESSAGES = {
     TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
@@ -38,8 +39,10 @@ MESSAGES = {
     BAD_VOLUME: "a volume holds values that are not finite, or its lower corner or spacing is not finite or not > 0; repair them",
     BAD_POINTS: "a point has a position, attribute or extinction that is not finite, a radius that is not > 0 and finite, an "
     "extinction < 0 or a colour outside [0, 1]; remove or repair these points",
+    OCTREE_OVERFLOW: "more (sphere, node) pairs than an octree's plan has room for; make a new plan with "
+    "`jaxsph.access.octree_build.plan_octree`, of these spheres",
 }
-OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW
+OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | OCTREE_OVERFLOW
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
 
 
