@@ -25,7 +25,7 @@ from jaxsph.field.tasks import SlabTask
 from jaxsph.field.volume_grid import VolumeGrid
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
-from jaxsph.model.medium import Medium, Total
+from jaxsph.model.medium import Medium, OfPlaces, Total
 from jaxsph.model.particles import Particles
 from jaxsph.model.transfer import Segments, TransferFunction, find, read
 
@@ -175,9 +175,7 @@ class OctreeParticles(Medium):
         """Colours at places in the transfer function."""
         return read(self._viewed().segments, samples, channels)
 
-    def pull(
-        self, total: Total, gathered: LeafSums, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[Total, tuple[Array, Array]]:
+    def pull(self, total: Total, gathered: LeafSums, task: SlabTask, cotangents: list[Array]) -> tuple[Total, OfPlaces]:
         """See `Medium.pull`; the particles of leaves are gone through once more, and what they get is scattered."""
         seen = self._viewed()
 
@@ -199,7 +197,9 @@ class OctreeParticles(Medium):
 
         nothing = jnp.zeros_like(seen.table), tuple(jnp.zeros_like(part) for part in place)
         of_table, of_place = lax.fori_loop(0, leaf.length.max(initial=0), add, nothing)
-        return _added(total, of_table, of_segments), spread(of_place)  # type: ignore[return-value]
+        of_depth, of_factor = spread(of_place)
+        places = OfPlaces.none(task)._replace(depth=of_depth, factor=of_factor)
+        return _added(total, of_table, of_segments), places  # type: ignore[return-value]
 
     def _contribution(self, rows: list[Array], place: Place, reference: Array) -> tuple[Array, Array]:
         """What particles add to both sums."""
