@@ -51,11 +51,10 @@ class Stages:
         seen = self._timed("view", lambda: see(self.scene, camera, *sizes, run))
         seen, _ = self._timed("measure and sort", lambda: measured(seen, camera, plan.samples, self.tuning))
         static: dict[str, Any] = {"samples": plan.samples, "tuning": self.tuning}
-        given = seen.viewed, camera, seen.order
-        cells = plan.cast.slab_samples
-        ordered = self._timed("order", lambda: run.with_host("grid", ORDER, given, slab_samples=cells, **static))
+        given, cells = (seen.viewed, camera, seen.order), {"slab_samples": plan.cast.slab_samples, "between_samples": False}
+        ordered = self._timed("order", lambda: run.with_host("grid", ORDER, given, **cells, **static))
         given = ordered, camera, jnp.int32(0)
-        self._timed("lists", lambda: run.with_host("grid", MAKE_GRID, given, lists=plan.lists, halo=0, **static))
+        self._timed("lists", lambda: run.with_host("grid", MAKE_GRID, given, lists=plan.lists, beside=False, **static))
         image = self._timed("frame", lambda: js.render(self.scene, camera, self.settings, plan=plan))
         self.seconds.setdefault("cast", []).append(image.stats["seconds"]["cast"])
 
