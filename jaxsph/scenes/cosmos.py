@@ -9,6 +9,8 @@ rounding of its arithmetic.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -40,9 +42,8 @@ def reionization(
     warm = np.clip(rng.normal(0.6, 0.25, points), 0, 1)[:, None]
     color = (1 - warm) * (0.6, 0.75, 1.0) + warm * (1.0, 0.93, 0.75)
     shown = Points.from_arrays(position, 0.0022 * mass ** (1 / 3), color, opacity=np.clip(0.35 * mass, 0.1, 0.9))
-    camera = Camera.look_at(
-        (0.05, 0.86, -0.78), (0.52, 0.47, 0.5), fov_degrees=42.0, width=width, height=height, near=0.3, far=2.1
-    )
+    size = {"width": width, "height": height}
+    camera = Camera.look_at((0.05, 0.86, -0.78), (0.52, 0.47, 0.5), fov_degrees=42.0, **size, near=0.3, far=2.1)
     return Scene(volume=volume, volume_transfer=transfer, points=shown), camera
 
 
@@ -53,18 +54,17 @@ def galaxy(
     rng = np.random.default_rng(seed)
     volume = Volume.from_array(_disc_gas(n, rng), (-1.2, -1.2, -1.2), 2.4 / (n - 1))
     transfer = TransferFunction.from_points(
-        [0.0, 0.12, 0.3, 0.6, 1.0],
-        [(0.25, 0.1, 0.08), (0.35, 0.13, 0.09), (0.6, 0.25, 0.16), (0.85, 0.35, 0.45), (1.0, 0.6, 0.75)],
-        [0.0, 0.15, 1.6, 6.0, 22.0],
+        [0.0, 0.05, 0.2, 0.45, 0.7, 1.0],
+        [(0.12, 0.16, 0.35), (0.14, 0.16, 0.34), (0.3, 0.16, 0.14), (0.45, 0.18, 0.13), (0.9, 0.3, 0.42), (1.0, 0.62, 0.75)],
+        [0.0, 0.2, 1.2, 3.0, 7.0, 22.0],
     )
     position, age = _stars(points, rng)
     young, old = np.array((0.62, 0.78, 1.0)), np.array((1.0, 0.86, 0.62))
     color = (1 - age[:, None]) * young + age[:, None] * old
-    bright = np.exp(rng.normal(0, 0.8, points))
-    shown = Points.from_arrays(position, 0.0055 * bright ** (1 / 3), color, opacity=np.clip(0.22 * bright, 0.04, 0.9))
-    camera = Camera.look_at(
-        (0.3, 0.95, -1.9), (0.02, -0.03, 0.0), fov_degrees=38.0, width=width, height=height, near=0.6, far=3.7
-    )
+    bright = np.exp(rng.normal(0, 1.0, points))
+    shown = Points.from_arrays(position, 0.0034 * bright ** (1 / 3), color, opacity=np.clip(0.3 * bright, 0.05, 0.95))
+    size = {"width": width, "height": height}
+    camera = Camera.look_at((0.35, 1.05, -2.1), (0.0, -0.06, 0.0), fov_degrees=36.0, **size, near=0.7, far=4.0)
     return Scene(volume=volume, volume_transfer=transfer, points=shown), camera
 
 
@@ -102,14 +102,11 @@ def _disc_gas(n: int, rng: np.random.Generator) -> Field:
     radius = np.hypot(x, z)
     arms = 0.5 + 0.5 * np.cos(ARMS * (np.arctan2(z, x) - np.log(radius + 0.02) / PITCH))
     torn = _smooth(rng.standard_normal((n, n, n), np.float32), lambda k: k**-1.6)
-    torn = np.exp(0.9 * torn / torn.std())
-    flat = (
-        np.exp(-((height / (0.03 + 0.03 * radius)) ** 2))
-        * np.exp(-((radius / 0.62) ** 3))
-        * (1 - np.exp(-((radius / 0.14) ** 2)))
-    )
-    gas = flat * (0.12 + arms**3) * torn
-    return np.clip(gas / np.quantile(gas[gas > 0.01], 0.985), 0, 1).astype(np.float32)
+    torn = np.exp(0.75 * torn / torn.std())
+    thin = np.exp(-((height / (0.03 + 0.03 * radius)) ** 2))
+    flat = thin * np.exp(-((radius / 0.85) ** 3)) * (1 - np.exp(-((radius / 0.14) ** 2)))
+    gas = flat * (0.1 + arms**2) * torn
+    return np.clip(gas / np.quantile(gas[gas > 0.02], 0.98), 0, 1).astype(np.float32)
 
 
 def _stars(number: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " points"]]:
@@ -117,9 +114,10 @@ def _stars(number: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "po
     kind = rng.uniform(size=number)
     direction = rng.normal(size=(number, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    away = np.where(kind < BULGE, 0.11 * rng.gamma(1.6, size=number), 0.9 * rng.uniform(size=number) ** 0.7)
+    away = np.where(kind < BULGE, 0.075 * rng.gamma(1.5, size=number), 0.9 * rng.uniform(size=number) ** 0.7)
     round_ones = direction * away[:, None] * (1, 0.75, 1)
-    radius = np.minimum(0.24 * rng.gamma(2.0, size=number), 1.15)
+    radius = 0.24 * rng.gamma(2.0, size=number)
+    radius = np.where(radius < 1.15, radius, 1.15 * rng.uniform(size=number) ** 0.5)
     arm = rng.integers(0, ARMS, number) * (2 * np.pi / ARMS) + np.log(radius + 0.02) / PITCH
     in_arm = rng.uniform(size=number) < 0.7
     angle = np.where(in_arm, arm + rng.normal(0, 0.28, number), rng.uniform(0, 2 * np.pi, number))
@@ -130,11 +128,10 @@ def _stars(number: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "po
     return np.where(in_disc[:, None], flat_ones, round_ones), age
 
 
-def _smooth(values: Field, filtered: object) -> Field:
+def _smooth(values: Field, filtered: Callable[[np.ndarray], np.ndarray]) -> Field:
     """Waves of a periodic box, each times a function of its wave number in cycles a box."""
     n = values.shape[0]
     full, half = np.fft.fftfreq(n, 1 / n).astype(np.float32), np.fft.rfftfreq(n, 1 / n).astype(np.float32)
     k = np.sqrt(full[:, None, None] ** 2 + full[:, None] ** 2 + half**2)
     k[0, 0, 0] = 1
-    share = filtered(k)  # type: ignore[operator]
-    return np.fft.irfftn(np.fft.rfftn(values) * share, s=values.shape, axes=(0, 1, 2)).astype(np.float32)
+    return np.fft.irfftn(np.fft.rfftn(values) * filtered(k), s=values.shape, axes=(0, 1, 2)).astype(np.float32)
