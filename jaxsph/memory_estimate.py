@@ -16,6 +16,7 @@ from jaxsph.control.pilot import PilotPlan
 
 RAYS = BUNDLE * BUNDLE
 ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
+NUMBERS_OF_CANVAS = 24  # a pixel: six channels known, predicted and compared, and what is told of each
 
 
 def frame_bytes(
@@ -47,6 +48,12 @@ def frame_bytes(
         + width * height * 8 * number
         + _of_control(control, lists, slabs, cast.slab_samples, num_classes, number)
     )
+
+
+def quadtree_bytes(size: tuple[int, int, int, int], coarse: ListPlan, number: int) -> int:
+    """Bytes that choosing rays takes beside: the canvas and levels of what is estimated from it, and the lists of its lattice."""
+    width, height = size[:2]
+    return width * height * NUMBERS_OF_CANVAS * number + coarse.tile_capacity * (12 * number + 48) + coarse.list_capacity * 8
 
 
 def _of_control(

@@ -19,7 +19,7 @@ from jaxsph.control.adapt import ControlPlan
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import FINEST, Spacing
 from jaxsph.measures import Measures
-from jaxsph.memory_estimate import frame_bytes
+from jaxsph.memory_estimate import frame_bytes, quadtree_bytes
 from jaxsph.model.camera import Camera, num_nodes
 from jaxsph.model.particles import capacity_class
 from jaxsph.model.registry import AT_POINTS
@@ -247,6 +247,7 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     size = shape.width, shape.height, shape.samples, shape.num_particles
     needed = frame_bytes(size, shape.num_classes, lists, cast, control, shape.number)
     quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
+    needed += 0 if quadtree is None else quadtree_bytes(size, quadtree.lists, shape.number)
     method = control, settings.integrator, settings.screen, quadtree
     return Plan(*size, shape.num_classes, bands, lists, cast, needed, *method, step_tolerance=_step_tolerance(settings))
 

@@ -66,7 +66,8 @@ def progressive(
 class Progressive:
     """Images of one view, each better than the one before; an iterator that ends when the image is good enough.
 
-    What is known of the image is kept when a stage is interrupted: the next call begins that stage again.
+    What is known of the image is kept when a stage is interrupted: the next call begins that stage again. The grids of all bands
+    are kept, too: memory is that of a whole frame, however many bands it has.
     `image.stats` of each holds `stage`, `rays` cast so far, `rays_left` at most until every pixel has its own, `l2_error` (the
     estimated relative L2 norm of the error), `max_error` (the largest error that a pixel is expected to have), `leaves_over`
     the tolerance, and `seconds` of all stages; `image.error_bound` is the error that each pixel is expected to have.
