@@ -18,7 +18,7 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
-from jaxsph.scenes import appearance, fields
+from jaxsph.scenes import appearance, cosmos, fields
 from jaxsph.scenes.appearance import colormap, default_transfer, default_volume_transfer
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.dam_break import dam_break
@@ -31,6 +31,7 @@ __all__ = [
     "appearance",
     "checker_board",
     "colormap",
+    "cosmos",
     "dam_break",
     "default_transfer",
     "default_volume_transfer",
