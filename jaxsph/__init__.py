@@ -9,6 +9,7 @@ from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
+from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
@@ -34,5 +35,6 @@ __all__ = [
     "render",
     "resample",
     "scenes",
+    "splat_bound",
     "sweep",
 ]

@@ -32,7 +32,7 @@ class Turns(NamedTuple):
 
 def turns_of(task: SlabTask, block: int) -> Iterator[Turns]:
     """All blocks of `block` spheres of all slabs, in order for each slab."""
-    blocks = (task.entry.length.sum(0) + block - 1) // block
+    blocks = (task.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
     tasks = blocks.shape[0]
     numbers = [tasks, *(tasks // part for part in PARTS if tasks // part > 0), 0]
     begin = jnp.int32(0)
