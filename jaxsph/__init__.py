@@ -2,6 +2,7 @@
 
 from jaxsph import io, reference, scenes
 from jaxsph.access.morton import prepare
+from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
@@ -16,6 +17,7 @@ from jaxsph.version import __version__
 __all__ = [
     "Camera",
     "CapacityError",
+    "Coarsened",
     "Image",
     "IsoSurface",
     "Particles",
@@ -27,6 +29,8 @@ __all__ = [
     "TransferFunction",
     "Volume",
     "__version__",
+    "coarse_bound",
+    "coarsened",
     "io",
     "plan",
     "prepare",

@@ -68,6 +68,10 @@ class Profile(abc.ABC):
         """The integral along a whole ray through the centre."""
         return self.along(jnp.zeros(()), -jnp.ones(()), jnp.ones(()))
 
+    def most(self) -> Float[Array, ""]:
+        """No whole ray has a larger integral; that of those through the centre where the profile falls off."""
+        return self.through_centre()
+
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(Profile):
@@ -119,6 +123,10 @@ class Table(Profile):
         whole = jnp.minimum(place.astype(jnp.int32), max(last - 1, 0))
         low, high = self.values[whole], self.values[jnp.minimum(whole + 1, last)]
         return low + (place - whole) * (high - low)
+
+    def most(self) -> Float[Array, ""]:
+        """See `Profile`: a table may rise."""
+        return 2 * self.values.max()
 
 
 @dataclasses.dataclass(frozen=True)
