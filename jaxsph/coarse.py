@@ -2,10 +2,11 @@ r"""One point for many that are seen as one: the outlook of Kaehler, Abel & Hege
 
 Flow: points or particles, camera -> octree_cut -> [coarse] -> scene.
 
-Of a node of the octree one point stays, at the centroid. Weights are extinction times the cube of the radius, which is the integral
-of extinction over space but for a factor of the profile; their sum is kept, and colour is their mean. The radius keeps the mean of
-the squared distance from the centroid, the profile's own included: with as little as that of two sets alike, a blurred image of one
-is that of the other up to third order in the size of what is seen by the size of the blur.
+Of a node of the octree one point stays, at the centroid. Weights are extinction times the cube of the radius, which is the
+integral of extinction over space but for a factor of the profile; their sum is kept, and colour is their mean. The radius keeps
+the mean of the squared distance from the centroid, the profile's own included. So blurred images of the thickness of a node and
+of its coarse point differ in second order of the node's size by that of the blur, and only as far as the node is not alike in
+all directions.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from jaxsph.model.profiles import Ball, Profile
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
+from jaxsph.plan import Plan
 from jaxsph.render import render
 
 ROUNDINGS = 16  # of a coordinate or a sum, in eps
@@ -52,11 +54,11 @@ class Coarsened(NamedTuple):
 def coarsened(part: Part, camera: Camera, pixels: Any = 1.0) -> Coarsened:
     """Merge what is seen as one: nodes of an octree that are no larger than some pixels, between near and far.
 
-    What is in no such node is as it was, bit for bit. **Points** keep the integral of extinction over space: where a node is thin and
-    smaller than a pixel, an image that is averaged over pixels is hardly changed, while one with a ray a pixel, which meets small
-    points or misses them, is less noisy. `coarse_bound` bounds the change of any pixel. **Particles** keep volume, and quantity
-    weighed by volume, in a support that covers all of the node: the field is normalised, so that its border can move outwards by
-    less than twice `pixels`, and quantities within a node are averaged. That is an estimate; nothing bounds it.
+    What is in no such node is as it was, bit for bit. **Points** keep the integral of extinction over space: where a node is
+    thin and smaller than a pixel, an image that is averaged over pixels is hardly changed, while one with a ray a pixel, which
+    meets small points or misses them, is less noisy. `coarse_bound` bounds the change of any pixel. **Particles** keep volume,
+    and quantity weighed by volume, in a support that covers all of the node: the field is normalised, so that its border can
+    move outwards by less than twice `pixels`, and quantities within a node are averaged. That is an estimate; nothing bounds it.
 
     Args:
         part: `Points` with a radial profile, or `Particles`.
@@ -79,21 +81,25 @@ def coarsened(part: Part, camera: Camera, pixels: Any = 1.0) -> Coarsened:
     return found if is_traced(found.merged) else _compressed(found)
 
 
-def coarse_bound(found: Coarsened, camera: Camera, settings: Settings | None = None) -> Float[Array, "height width"]:
+def coarse_bound(
+    found: Coarsened, camera: Camera, settings: Settings | None = None, *, plan: Plan | None = None
+) -> Float[Array, "height width"]:
     r"""How much any channel of a pixel, or its alpha, differs at most between points and `coarsened` points.
 
-    **Theorem.** Let node n have the thickness $f_n$ along a ray, and its coarse point $g_n$, whatever else there is. Then light differs by
-    at most $1 - \exp(-\sum_n \max(f_n, g_n))$. *Argument.* Light is the expected colour of the first event along the ray, of a
-    Poisson process of all media. Both images may share what is not merged, and of each node as many events as the thinner of both has,
-    if in other places; so where none of the $\max(f_n, g_n)$ events of any node happens, both see the same. $\square$ A node's ball here holds all of
-    its points and the coarse one, and is wider such that every ray that can meet those has the thickness in it that all would have on one ray
-    through their centres. It is not taken into account what hides a node, nor that rays miss most of it: a bound for few
-    merged points beside much else, and one that says nothing where all of a picture is merged points that are thick.
+    **Theorem.** Let node n have the thickness $f_n$ along a ray, and its coarse point $g_n$, whatever else there is. Then light
+    differs by at most $1 - \exp(-\sum_n \max(f_n, g_n))$. *Argument.* Light is the expected colour of the first event along the
+    ray, of a Poisson process of all media. Both images may share what is not merged, and of each node as many events as the
+    thinner of both has, if in other places; so where none of the $\max(f_n, g_n)$ events of any node happens, both see the same.
+    $\square$ A node's ball here holds all of its points and the coarse one, and is wider such that every ray that can meet those
+    has the thickness in it that all would have on one ray through their centres. It is not taken into account what hides a node,
+    nor that rays miss most of it: a bound for few merged points beside much else, and one that says nothing where all of a
+    picture is merged points that are thick.
 
     Args:
         found: of points.
-        camera: the one that they were coarsened for, or another.
+        camera: the one that they were coarsened for: in front of its near depth, and behind the far one, nothing is merged.
         settings: `samples` and `memory_limit` are looked at.
+        plan: as for `jaxsph.render`, for `Scene(points=found.balls)`.
 
     Returns:
         Bounds in [0, 1]; with rounding, but for that of points which both images have.
@@ -101,7 +107,7 @@ def coarse_bound(found: Coarsened, camera: Camera, settings: Settings | None = N
     if found.balls is None:
         raise ValueError("`found` must be of points; nothing bounds merged particles")
     settings = settings or Settings()
-    image = render(Scene(points=found.balls), camera, settings)
+    image = render(Scene(points=found.balls), camera, settings, plan=plan)
     rounding = 4 * (settings.samples + ROUNDINGS) * jnp.finfo(image.color.dtype).eps
     return jnp.minimum(image.alpha + rounding, 1)
 
@@ -192,8 +198,8 @@ def _merged_points(points: Points, camera: Camera, nodes: _Nodes) -> Coarsened:
     radius = unit * jnp.sqrt(nodes.mean(square, weight))
     extinction = nodes.sum(points.extinction * (points.radius / radius[nodes.head]) ** 3)
     color = jnp.clip(nodes.mean(points.color, weight), 0, 1)
-    new = {"radius": radius, "extinction": extinction, "color": color}
-    merged = {name: nodes.put(value, getattr(points, name)) for name, value in new.items()}
+    new: dict[str, Any] = {"radius": radius, "extinction": extinction, "color": color}
+    merged: dict[str, Any] = {name: nodes.put(value, getattr(points, name)) for name, value in new.items()}
     coarse = dataclasses.replace(points, **_moved(points, nodes, centroid.shift), **merged, valid=points.valid & ~nodes.gone)
     return Coarsened(coarse, nodes.merged, _balls(points, coarse, camera, nodes, away))
 
@@ -209,10 +215,9 @@ def _balls(points: Points, coarse: Points, camera: Camera, nodes: _Nodes, away: 
     num = nodes.sum(jnp.ones_like(away))
     needed = needed * (1 + (num + 2 * ROUNDINGS) * eps)
     radius, extinction = jnp.where(nodes.merged, WIDER * reach, 1), jnp.where(nodes.merged, 0.5 * needed / reach, 0)
-    shape: Profile = Ball()
-    valid, color = coarse.valid & nodes.merged, jnp.ones_like(coarse.color)
-    given = {"radius": radius, "extinction": extinction, "color": color, "valid": valid, "profile": shape, "spread": "centres"}
-    return dataclasses.replace(coarse, **given, attributes={}, splats_beyond=None)
+    columns: dict[str, Any] = {"radius": radius, "extinction": extinction, "color": jnp.ones_like(coarse.color)}
+    static: dict[str, Any] = {"attributes": {}, "profile": Ball(), "splats_beyond": None, "spread": "centres"}
+    return dataclasses.replace(coarse, **columns, **static, valid=coarse.valid & nodes.merged)
 
 
 def _second_moment(profile: Profile, dtype: Any) -> Array:
@@ -229,7 +234,7 @@ def _merged_particles(particles: Particles, camera: Camera, nodes: _Nodes) -> Co
     centroid = _Centroid.of(particles, nodes, weight)
     support = nodes.max(jnp.linalg.norm(centroid.offset, axis=1) + particles.support)
     new = {"support": support, "volume": nodes.sum(weight), "quantity": nodes.mean(particles.quantity, weight)}
-    merged = {name: nodes.put(value, getattr(particles, name)) for name, value in new.items()}
+    merged: dict[str, Any] = {name: nodes.put(value, getattr(particles, name)) for name, value in new.items()}
     moved = _moved(particles, nodes, centroid.shift)
     return Coarsened(dataclasses.replace(particles, **moved, **merged, valid=particles.valid & ~nodes.gone), nodes.merged, None)
 

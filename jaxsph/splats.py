@@ -43,7 +43,9 @@ def splat_bound(
         ValueError: a scene that is mixed by opacity, other profiles, and what `jaxsph.render` raises.
     """
     if scene.mix != "extinction":
-        raise ValueError(f"`mix` must be 'extinction' for splats to be bounded, got {scene.mix!r}: it shows more light than there is")
+        raise ValueError(
+            f"`mix` must be 'extinction' for splats to be bounded, got {scene.mix!r}: it shows more light than there is"
+        )
     settings = settings or Settings()
     asked = dataclasses.replace(settings, integrator="splat_bound")
     found = render(scene, camera, asked, plan=plan).color[..., 0]

@@ -2,11 +2,11 @@
 
 Flow: spheres, camera -> keys -> [octree_cut] -> coarse.
 
-A node holds all centres whose Morton keys begin with the same digits: in the order of keys, a run. Its box is the smallest in view
-space around the spheres that it holds. A node is *small* if its box is between near and far, and no wider, higher or deeper than so
-many pixels where it is nearest to the eye. The box of a child is within that of its parent, and no nearer; every one of these sizes
-then is at most that of the parent, in floating point too, as minima, maxima, differences and quotients are rounded monotonically. So
-whatever is below a small node is small, and the highest small nodes are a cut through the tree.
+A node holds all centres whose Morton keys begin with the same digits: in the order of keys, a run. Its box is the smallest in
+view space around the spheres that it holds. A node is *small* if its box is between near and far, and no wider, higher or deeper
+than so many pixels where it is nearest to the eye. The box of a child is within that of its parent, and no nearer; every one of
+these sizes then is at most that of the parent, in floating point too, as minima, maxima, differences and quotients are rounded
+monotonically. So whatever is below a small node is small, and the highest small nodes are a cut through the tree.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@ r"""What a splat moves along a ray: thickness that its chord has elsewhere, and 
 Flow: points -> [moved: pieces -> sums of stretches] -> cast.splat_bound.
 
 A splat has all of its thickness in the stretch of a ray that holds its centre; its chord has some of that in other stretches.
-What the chord has in the splat's own stretch *stays*. What it has in front of that, and what it has behind, are two *pieces* that
-are moved. The *span* of a piece is all stretches from the first that it touches in either place to the last. Where the near and the
-far end of a ray cut a chord or leave a centre out, one of both has more in all: what the other lacks is *extra*. Lengths are in
-radii of a point, counted along a ray from the foot of its centre, as in `model.profiles`. Shapes as in `field.points`.
+What the chord has in the splat's own stretch *stays*. What it has in front of that, and what it has behind, are two *pieces*
+that are moved. The *span* of a piece is all stretches from the first that it touches in either place to the last. Where the near
+and the far end of a ray cut a chord or leave a centre out, one of both has more in all: what the other lacks is *extra*. Lengths
+are in radii of a point, counted along a ray from the foot of its centre, as in `model.profiles`. Shapes as in `field.points`.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class Row(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and depths between all stretches of rays."""
+    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths between stretches."""
 
     rank: Int[Array, " pairs"]
     number: Int[Array, " spheres"]
@@ -174,7 +174,9 @@ class PointsMedium(Medium):
             return None
         if not self.profile.closed:
             name = type(self.profile).__name__
-            raise ValueError(f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums")
+            raise ValueError(
+                f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums"
+            )
         sums = Moved(*(jnp.zeros(task.shape, self.table.dtype) for _ in Moved._fields))
         blocks = (task.entry.length.sum(0, dtype=jnp.int32).max() + BLOCK - 1) // BLOCK
 
@@ -200,14 +202,16 @@ class PointsMedium(Medium):
         ends = (jnp.broadcast_to(depth, foot.shape) for depth in (borders[0], borders[-1]))
         near, far, front, back = (along_ray(depth) for depth in (*ends, borders[own - 1], borders[own]))
         seen, border = (end == own)[:, :, None], rays.border[:, None]
-        before, behind = (seen & case for case in (border[:, :, 1:] < middle[:, :, None], border[:, :, :-1] >= middle[:, :, None]))
+        before, behind = (
+            seen & case for case in (border[:, :, 1:] < middle[:, :, None], border[:, :, :-1] >= middle[:, :, None])
+        )
         lateral = jnp.abs(rays.u[:, None]) + jnp.abs(rays.v[:, None])
         size = jnp.abs(row.z) * (1 + lateral) if rays.perspective else jnp.abs(row.z) + lateral
         off = jnp.finfo(size.dtype).eps * (ROUNDINGS * size * row.inverse + LEAST_ROUNDING)[:, :, None]
         square = ((away[0] ** 2 + away[1] ** 2 + away[2] ** 2) * row.inverse**2)[:, :, None]
         splat = True if self.spread != "chords" else some.splat[:, :, None]  # type: ignore[index]
         strength = jnp.where(splat, jnp.broadcast_to(row.strength, foot.shape), 0)[:, :, None]
-        at = ((border - foot[:, :, None]) * scale[:, :, None])
+        at = (border - foot[:, :, None]) * scale[:, :, None]
         places = Places(before, seen & ~before & ~behind, behind)
         return Splats(square, strength, at, near, far, front, back, seen, places, off, self.profile)
 
