@@ -58,7 +58,8 @@ def coarsened(part: Part, camera: Camera, pixels: Any = 1.0) -> Coarsened:
     thin and smaller than a pixel, an image that is averaged over pixels is hardly changed, while one with a ray a pixel, which
     meets small points or misses them, is less noisy. `coarse_bound` bounds the change of any pixel. **Particles** keep volume,
     and quantity weighed by volume, in a support that covers all of the node: the field is normalised, so that its border can
-    move outwards by less than twice `pixels`, and quantities within a node are averaged. That is an estimate; nothing bounds it.
+    move outwards by less than twice `pixels`, and quantities within a node are averaged. Sparse particles of supports
+    below a pixel look fuller then (`docs/accuracy_and_limits.md`). That is an estimate; nothing bounds it.
 
     Args:
         part: `Points` with a radial profile, or `Particles`.

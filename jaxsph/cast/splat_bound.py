@@ -30,8 +30,8 @@ and what of U it should have, differ only if the first event of U is an extra on
 probability at most $G_i (1 - e^{-e_i})$. $\square$
 
 So a point alone on a ray is not wrong, nor is one within a stretch: only overlaps are, to second order in thickness. In a picture
-of 2000 points of opacity 0.2 that overlap some others (`tests/test_splats.py`, float64), the true difference was 0.37 of the bound
-in the median of pixels, and 0.98 at most. The bound has no use where many thick points overlap: there it is 1.
+of 2000 points of opacity 0.2 that overlap some others (`tests/test_splats.py`, float64), the true difference was 0.37 of the
+bound in the median of pixels, and 0.98 at most. The bound has no use where many thick points overlap: there it is 1.
 
 *Rounding.* Sums of n points are off by at most `(n + 32) eps` of the sum of their terms. What rounding may have moved in or out
 of a stretch, of points (`field.moved`) or media (8 times the sums' roundings of all thickness), is counted as extra.
