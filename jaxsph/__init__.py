@@ -2,6 +2,7 @@
 
 from jaxsph import io, reference, scenes
 from jaxsph.access.morton import prepare
+from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
@@ -9,12 +10,14 @@ from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
+from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
 __all__ = [
     "Camera",
     "CapacityError",
+    "Coarsened",
     "Image",
     "IsoSurface",
     "Particles",
@@ -26,6 +29,8 @@ __all__ = [
     "TransferFunction",
     "Volume",
     "__version__",
+    "coarse_bound",
+    "coarsened",
     "io",
     "plan",
     "prepare",
@@ -34,5 +39,6 @@ __all__ = [
     "render",
     "resample",
     "scenes",
+    "splat_bound",
     "sweep",
 ]

@@ -45,11 +45,11 @@ def prepare(particles: Particles) -> Particles:
 @compiled_quickly
 @jax.jit
 def _prepared(particles: Particles) -> Particles:
-    order = jnp.argsort(lax.stop_gradient(_keys(particles)), stable=True)
+    order = jnp.argsort(lax.stop_gradient(morton_keys(particles)), stable=True)
     return jax.tree.map(lambda column: column[order], particles)
 
 
-def _keys(particles: Particles) -> Int[Array, " particles"]:
+def morton_keys(particles: Particles) -> Int[Array, " particles"]:
     """Morton keys of 3 x `DIGITS` binary digits, within the box around all particles that have a place."""
     position = particles.position
     placed = particles.valid & jnp.isfinite(position).all(1)

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.grid import Grid
 from jaxsph.field.fetch import particle_at
+from jaxsph.field.moved import LEAST_ROUNDING, ROUNDINGS, Moved, Places, Splats
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
 from jaxsph.field.uneven import turns_of
@@ -58,10 +59,11 @@ class Row(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Of a band: spheres by rank in the lists of bundles, and their numbers in the scene."""
+    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths between stretches."""
 
     rank: Int[Array, " pairs"]
     number: Int[Array, " spheres"]
+    border: Float[Array, " samples_and_one"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +118,7 @@ class PointsMedium(Medium):
 
     def in_band(self, grid: Grid) -> PointsMedium:
         """With the lists of a band."""
-        return dataclasses.replace(self, lists=Listed(grid.lists.rank, grid.ordered.index))
+        return dataclasses.replace(self, lists=Listed(grid.lists.rank, grid.ordered.index, grid.half_steps[::2]))
 
     def faults(self) -> Int[Array, ""]:
         """Whether all numbers are usable."""
@@ -161,6 +163,57 @@ class PointsMedium(Medium):
         thickness, *weighed = samples
         inverse = jnp.where(thickness > 0, 1 / jnp.where(thickness > 0, thickness, 1), 0)
         return [value * inverse for value in weighed[channels]]
+
+    def moved(self, task: SlabTask) -> Moved | None:
+        """Of those points whose thickness is not laid along chords.
+
+        Raises:
+            ValueError: where what is laid along pieces of a chord does not add up to what is laid along the whole.
+        """
+        if self.spread == "chords" and self.splat is None:
+            return None
+        if not self.profile.closed:
+            name = type(self.profile).__name__
+            raise ValueError(
+                f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums"
+            )
+        sums = Moved(*(jnp.zeros(task.shape, self.table.dtype) for _ in Moved._fields))
+        blocks = (task.entry.length.sum(0, dtype=jnp.int32).max() + BLOCK - 1) // BLOCK
+
+        def add(nth: Array, sums: Moved) -> Moved:
+            return jax.tree.map(jnp.add, sums, self._splats(self._fetch(task, nth), _Rays.of(task, self.axes)).moved())
+
+        return lax.fori_loop(0, blocks, add, sums)
+
+    def _splats(self, some: _Some, rays: _Rays) -> Splats:
+        """A block of points as splats; of no strength where they are none."""
+        if self.lists is None:
+            raise ValueError("points are asked for without the lists of a band; call `in_band` first")
+        row, borders = Row(*(column[:, :, None] for column in some.row)), self.lists.border
+        foot, away = rays.nearest(row)
+        middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
+        end = jnp.searchsorted(borders, middle)  # the first border that is not in front
+        own = jnp.clip(end, 1, borders.shape[0] - 1)
+        scale = rays.slant[:, None] * row.inverse
+
+        def along_ray(depth: Array) -> Array:
+            return ((depth - foot) * scale)[:, :, None]
+
+        ends = (jnp.broadcast_to(depth, foot.shape) for depth in (borders[0], borders[-1]))
+        near, far, front, back = (along_ray(depth) for depth in (*ends, borders[own - 1], borders[own]))
+        seen, border = (end == own)[:, :, None], rays.border[:, None]
+        before, behind = (
+            seen & case for case in (border[:, :, 1:] < middle[:, :, None], border[:, :, :-1] >= middle[:, :, None])
+        )
+        lateral = jnp.abs(rays.u[:, None]) + jnp.abs(rays.v[:, None])
+        size = jnp.abs(row.z) * (1 + lateral) if rays.perspective else jnp.abs(row.z) + lateral
+        off = jnp.finfo(size.dtype).eps * (ROUNDINGS * size * row.inverse + LEAST_ROUNDING)[:, :, None]
+        square = ((away[0] ** 2 + away[1] ** 2 + away[2] ** 2) * row.inverse**2)[:, :, None]
+        splat = True if self.spread != "chords" else some.splat[:, :, None]  # type: ignore[index]
+        strength = jnp.where(splat, jnp.broadcast_to(row.strength, foot.shape), 0)[:, :, None]
+        at = (border - foot[:, :, None]) * scale[:, :, None]
+        places = Places(before, seen & ~before & ~behind, behind)
+        return Splats(square, strength, at, near, far, front, back, seen, places, off, self.profile)
 
     def no_cotangents(self) -> PointsMedium:
         """None yet; of the points themselves, not of where they are listed."""

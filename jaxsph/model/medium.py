@@ -102,6 +102,10 @@ class Medium(abc.ABC):
         extinction, samples = self.extinction(gathered, task)
         return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
 
+    def moved(self, task: Any) -> Any:
+        """What is laid elsewhere along rays than it is, summed for stretches (`field.moved.Moved`); by default nothing."""
+        return None
+
     def no_cotangents(self) -> Any:
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)

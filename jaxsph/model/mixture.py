@@ -63,6 +63,11 @@ class Mixture(Medium):
         extinctions = [extinction for extinction, _ in samples]
         return mixed_colors(colors, extinctions, None if self.mix == "extinction" else task.path())
 
+    def moved(self, task: Any) -> Any:
+        """Of all that move anything."""
+        moving = [moved for medium in self.media if (moved := medium.moved(task)) is not None]
+        return jax.tree.map(lambda *sums: functools.reduce(operator.add, sums), *moving) if moving else None
+
     def no_cotangents(self) -> tuple[Any, ...]:
         """Of each."""
         return tuple(medium.no_cotangents() for medium in self.media)

@@ -12,7 +12,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,14 @@ class Chord(NamedTuple):
 
 
 class Profile(abc.ABC):
-    """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0."""
+    """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0.
+
+    Attributes:
+        closed: whether `along` is in closed form, so that pieces of a chord add up to the whole; and the profile at most 1 and of
+            a slope of at most 2 a radius.
+    """
+
+    closed: ClassVar[bool] = False
 
     @property
     def is_radial(self) -> bool:
@@ -61,10 +68,16 @@ class Profile(abc.ABC):
         """The integral along a whole ray through the centre."""
         return self.along(jnp.zeros(()), -jnp.ones(()), jnp.ones(()))
 
+    def most(self) -> Float[Array, ""]:
+        """No whole ray has a larger integral; that of those through the centre where the profile falls off."""
+        return self.through_centre()
+
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(Profile):
     r"""$f(q) = \exp(-4.5 q^2)$, which the radius cuts off at three standard deviations (Kaehler et al. 2007, section 3.2)."""
+
+    closed = True
 
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """See `Profile`."""
@@ -80,6 +93,8 @@ class Gaussian(Profile):
 @dataclasses.dataclass(frozen=True)
 class Ball(Profile):
     """f(q) = 1: the same everywhere inside."""
+
+    closed = True
 
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """See `Profile`."""
@@ -112,6 +127,10 @@ class Table(Profile):
     def through_centre(self) -> Float[Array, ""]:
         """Exactly: along such a ray it is linear between its numbers."""
         return (self.values[:-1] + self.values[1:]).sum() / (self.values.shape[0] - 1)
+
+    def most(self) -> Float[Array, ""]:
+        """See `Profile`: a table may rise."""
+        return 2 * self.values.max()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,11 @@ import functools
 import importlib
 from typing import Any
 
-INTEGRATORS = {"samples": "jaxsph.cast.samples:PointSamples", "step_doubling": "jaxsph.cast.step_doubling:StepDoubling"}
+INTEGRATORS = {
+    "samples": "jaxsph.cast.samples:PointSamples",
+    "step_doubling": "jaxsph.cast.step_doubling:StepDoubling",
+    "splat_bound": "jaxsph.cast.splat_bound:SplatBound",
+}
 """Classes without arguments, each a `jaxsph.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
 AT_POINTS = {"step_doubling"}
 """Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
