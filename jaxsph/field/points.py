@@ -132,9 +132,8 @@ class PointsMedium(Medium):
         """Thickness of all intervals, and thickness times red, green and blue."""
         sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
         for turns in turns_of(task, BLOCK):
-            some = jax.tree.map(lambda value, number=turns.number: value[:number], sums)
-            some = lax.fori_loop(turns.begin, turns.end, functools.partial(self._add, turns.task), some)
-            sums = jax.tree.map(lambda old, new: jnp.concatenate([new, old[new.shape[0] :]]), sums, some)
+            add = functools.partial(self._add, turns.task)
+            sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
         return jnp.stack(sums.all)
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
@@ -178,12 +177,16 @@ class PointsMedium(Medium):
                 f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums"
             )
         sums = Moved(*(jnp.zeros(task.shape, self.table.dtype) for _ in Moved._fields))
-        blocks = (task.entry.length.sum(0, dtype=jnp.int32).max() + BLOCK - 1) // BLOCK
 
-        def add(nth: Array, sums: Moved) -> Moved:
-            return jax.tree.map(jnp.add, sums, self._splats(self._fetch(task, nth), _Rays.of(task, self.axes)).moved())
+        def add(nth: Array, sums: Moved, task: SlabTask) -> Moved:
+            def found(nth: Array) -> Moved:
+                return self._splats(self._fetch(task, nth), _Rays.of(task, self.axes)).moved()
 
-        return lax.fori_loop(0, blocks, add, sums)
+            return jax.tree.map(jnp.add, sums, fusion_barrier(nth >= 0, found, nth))
+
+        for turns in turns_of(task, BLOCK):
+            sums = turns.put(lax.fori_loop(turns.begin, turns.end, functools.partial(add, task=turns.task), turns.of(sums)), sums)
+        return sums
 
     def _splats(self, some: _Some, rays: _Rays) -> Splats:
         """A block of points as splats; of no strength where they are none."""
@@ -191,8 +194,9 @@ class PointsMedium(Medium):
             raise ValueError("points are asked for without the lists of a band; call `in_band` first")
         row, borders = Row(*(column[:, :, None] for column in some.row)), self.lists.border
         foot, away = rays.nearest(row)
-        middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
+        middle = foot if self.spread == "feet" else row.z
         end = jnp.searchsorted(borders, middle)  # the first border that is not in front
+        middle, end = jnp.broadcast_to(middle, foot.shape), jnp.broadcast_to(end, foot.shape)
         own = jnp.clip(end, 1, borders.shape[0] - 1)
         scale = rays.slant[:, None] * row.inverse
 

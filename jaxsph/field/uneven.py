@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsph.field.tasks import SlabTask
 
+Sums = TypeVar("Sums")
 PARTS = 4, 16  # of the slabs of a task, the first quarter and the first sixteenth have loops of their own
 FEWEST = 16  # slabs that are worth a loop: each is compiled
 
@@ -29,6 +31,14 @@ class Turns(NamedTuple):
     task: SlabTask
     begin: Int[Array, ""]
     end: Int[Array, ""]
+
+    def of(self, sums: Sums) -> Sums:
+        """Those of these slabs."""
+        return jax.tree.map(lambda value: value[: self.number], sums)  # type: ignore[no-any-return]
+
+    def put(self, some: Sums, sums: Sums) -> Sums:
+        """All sums, with some of these slabs."""
+        return jax.tree.map(lambda new, old: jnp.concatenate([new, old[self.number :]]), some, sums)  # type: ignore[no-any-return]
 
 
 def turns_of(task: SlabTask, block: int) -> Iterator[Turns]:
