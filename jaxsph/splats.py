@@ -26,7 +26,7 @@ def splat_bound(
 
     That is, between the image of this scene, and the one in which all its points have `spread="chords"` and `splats_beyond=None`,
     both with the same samples. Rendered as the image is, in one pass over the same rays; see `jaxsph.cast.splat_bound` for the
-    theorem and its argument. Points apart from each other, or smaller than stretches between samples, are hardly wrong; a
+    theorem and its argument. Points apart from each other, or smaller than intervals between samples, are hardly wrong; a
     bound near 1 says that nothing is known of a pixel. In float32 the bound of points whose radii are a few hundred eps of
     their depth is mostly of rounding; take float64 to know how wrong they are as such.
 

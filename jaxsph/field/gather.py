@@ -13,6 +13,8 @@ $1 - D_{kr}$. Differences to the particle are taken before they are squared, so 
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
@@ -21,6 +23,7 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.field.fetch import fetch, quantities_of
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
+from jaxsph.field.uneven import turns_of
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -29,6 +32,16 @@ BLOCK = 16  # particles unrolled in the inner loop
 
 def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows."""
+    zero = jnp.zeros((*task.depth.shape, task.v.shape[1], task.u.shape[1]), task.depth.dtype)
+    sums = sums_of([zero] * (1 + len(quantities_of(ordered))))
+    for turns in turns_of(task, BLOCK):
+        add = functools.partial(_add, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
+    return sums
+
+
+def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
+    """With a block of particles more."""
     entry, s, perspective = task.entry, task.depth, task.perspective
     lateral_scale = s if perspective else jnp.ones_like(s)
     su, sv = task.u[:, None, :] * lateral_scale[:, :, None], task.v[:, None, :] * lateral_scale[:, :, None]
@@ -43,15 +56,10 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
         along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
         return across, smooth.prepare(along, block.size[:, :, None, None]), block.size, block.quantities
 
-    def add_block(nth: Array, sums: Sums) -> Sums:
-        across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-        channels = list(sums.all)
-        for k in range(BLOCK):
-            w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
-            factors = (quantity[:, k, None, None, None] for quantity in quantities)
-            channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], factors, strict=True))]
-        return sums_of(channels)
-
-    zero = jnp.zeros((*su.shape[:2], task.v.shape[1], task.u.shape[1]), su.dtype)
-    blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-    return lax.fori_loop(0, blocks, add_block, sums_of([zero] * (1 + len(quantities_of(ordered)))))
+    across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+    channels = list(sums.all)
+    for k in range(BLOCK):
+        w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
+        factors = (quantity[:, k, None, None, None] for quantity in quantities)
+        channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], factors, strict=True))]
+    return sums_of(channels)

@@ -1,10 +1,10 @@
 r"""What a splat moves along a ray: thickness that its chord has elsewhere, and past what else that is moved.
 
-Flow: points -> [moved: pieces -> sums of stretches] -> cast.splat_bound.
+Flow: points -> [moved: pieces -> sums of intervals] -> cast.splat_bound.
 
-A splat has all of its thickness in the stretch of a ray that holds its centre; its chord has some of that in other stretches.
-What the chord has in the splat's own stretch *stays*. What it has in front of that, and what it has behind, are two *pieces*
-that are moved. The *span* of a piece is all stretches from the first that it touches in either place to the last. Where the near
+A splat has all of its thickness in the interval of a ray that holds its centre; its chord has some of that in other intervals.
+What the chord has in the splat's own interval *stays*. What it has in front of that, and what it has behind, are two *pieces*
+that are moved. The *span* of a piece is all intervals from the first that it touches in either place to the last. Where the near
 and the far end of a ray cut a chord or leave a centre out, one of both has more in all: what the other lacks is *extra*. Lengths
 are in radii of a point, counted along a ray from the foot of its centre, as in `model.profiles`. Shapes as in `field.points`.
 """
@@ -24,15 +24,15 @@ LEAST_ROUNDING = 8  # the same in radii, in eps, for what is rounded there; and 
 
 
 class Moved(NamedTuple):
-    """Sums over splats, for stretches of rays: (tasks, stretches, rays).
+    """Sums over splats, for intervals of rays: (tasks, intervals, rays).
 
     Attributes:
         placed: thickness of pieces where splats have it.
         ended: thickness of pieces whose span ends there.
         past: thickness that may be on the other side of something there once it is moved.
-        past_mean: the mean of it over the stretch, and over where in it a piece may be.
+        past_mean: the mean of it over the interval, and over where in it a piece may be.
         past_own: `past_mean` of a splat times its thickness that stays there.
-        spanning: opacities of pieces whose span includes the stretch.
+        spanning: opacities of pieces whose span includes the interval.
         begun: opacities of pieces whose span begins there.
         same: half the squares of those, and the products of those with that of the other piece of the same splat.
         extra: thickness that only chords or only splats have there, and what rounding may have misplaced.
@@ -50,11 +50,11 @@ class Moved(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where stretches of a slab lie relative to that of a splat: in front of it, it, behind it; in none if that is none."""
+    """Where intervals of a slab lie relative to that of a splat: in front of it, it, behind it; in none if that is none."""
 
-    before: Bool[Array, "tasks points stretches rays"]
-    here: Bool[Array, "tasks points stretches rays"]
-    behind: Bool[Array, "tasks points stretches rays"]
+    before: Bool[Array, "tasks points intervals rays"]
+    here: Bool[Array, "tasks points intervals rays"]
+    behind: Bool[Array, "tasks points intervals rays"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,18 +64,18 @@ class Splats:
     Attributes:
         square: squared distance between ray and centre.
         strength: thickness of a length of 1; 0 of what is no splat.
-        border: where stretches of the slab begin and end.
+        border: where intervals of the slab begin and end.
         near, far: where the ray does.
-        front, back: where the stretch of the splat begins and ends.
+        front, back: where the interval of the splat begins and ends.
         seen: whether there is one, between near and far.
-        places: where stretches of the slab lie relative to it.
+        places: where intervals of the slab lie relative to it.
         rounding: how far off all of this may be.
         profile: a `closed` one.
     """
 
     square: Float[Array, "tasks points 1 rays"]
     strength: Float[Array, "tasks points 1 rays"]
-    border: Float[Array, "tasks points stretches_and_one rays"]
+    border: Float[Array, "tasks points intervals_and_one rays"]
     near: Float[Array, "tasks points 1 rays"]
     far: Float[Array, "tasks points 1 rays"]
     front: Float[Array, "tasks points 1 rays"]
@@ -136,14 +136,14 @@ class Splats:
         return spans, begins + jnp.where(here, of_aft, 0), same
 
     def ends_in(self, last: Array) -> Array:
-        """Stretches that surely hold the end of the chord; none where that is within rounding of a border."""
+        """Intervals that surely hold the end of the chord; none where that is within rounding of a border."""
         begin, end = self.border[:, :, :-1], self.border[:, :, 1:]
         return self.places.behind & (begin < last - self.rounding) & (last + self.rounding <= end)
 
     def misplaced(self) -> Array:
-        """What rounding may have moved in or out of stretches, of chords and splats together.
+        """What rounding may have moved in or out of intervals, of chords and splats together.
 
-        If a centre is off by p in any direction, the distance b is, and so are the ends of stretches; the half chord h by
+        If a centre is off by p in any direction, the distance b is, and so are the ends of intervals; the half chord h by
         $min(\\sqrt{3p}, 3p/h)$, as its square is by less than 3p. A profile of at most 1 and of a slope of at most 2 has an
         integral then that is off by four times p for the distance, and by as much as both ends are.
         """

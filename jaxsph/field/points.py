@@ -59,7 +59,7 @@ class Row(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths between stretches."""
+    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths between intervals."""
 
     rank: Int[Array, " pairs"]
     number: Int[Array, " spheres"]

@@ -9,6 +9,8 @@ as if it were, as a compiler may contract a square and what it is added to into 
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -19,12 +21,22 @@ from jaxsph.field.fetch import Block, fetch, quantities_of
 from jaxsph.field.gather import BLOCK
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
+from jaxsph.field.uneven import turns_of
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
 
 def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, 1, rays) at every sample of slabs, from all particles of their windows."""
+    sums = sums_of([jnp.zeros(task.shape, task.depth.dtype)] * (1 + len(quantities_of(ordered))))
+    for turns in turns_of(task, BLOCK):
+        add = functools.partial(_add, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
+    return jax.tree.map(lambda value: value[:, :, None], sums)
+
+
+def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
+    """With a block of particles more."""
     entry, s = task.entry, task.depth[..., None]
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
@@ -34,17 +46,12 @@ def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTas
     def fetched(index: Array) -> Block:
         return fetch(ordered, rank, windows, index, reference)[1]
 
-    def add_block(nth: Array, sums: Sums) -> Sums:
-        block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-        channels = list(sums.all)
-        for k in range(BLOCK):
-            one = jax.tree.map(lambda column, k=k: column[:, k, None, None], block)
-            across = jnp.minimum(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
-            along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
-            w = smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp)
-            channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], one.quantities, strict=True))]
-        return sums_of(channels)
-
-    blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-    sums = lax.fori_loop(0, blocks, add_block, sums_of([jnp.zeros_like(su)] * (1 + len(quantities_of(ordered)))))
-    return jax.tree.map(lambda value: value[:, :, None], sums)
+    block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+    channels = list(sums.all)
+    for k in range(BLOCK):
+        one = jax.tree.map(lambda column, k=k: column[:, k, None, None], block)
+        across = jnp.minimum(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
+        along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
+        w = smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp)
+        channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], one.quantities, strict=True))]
+    return sums_of(channels)

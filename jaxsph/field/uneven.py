@@ -1,6 +1,6 @@
 """Slabs of uneven fullness, marched together without waiting for the fullest.
 
-Flow: task -> [uneven] -> points.
+Flow: task -> [uneven] -> gather, scattered, points.
 
 The slabs of a task come in order of how many spheres their windows hold. Where those are clustered the first of them may hold a
 thousand times as many as the last, and a loop over blocks of all would mostly add nothing. So all slabs are looped over until

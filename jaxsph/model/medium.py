@@ -103,7 +103,7 @@ class Medium(abc.ABC):
         return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
 
     def moved(self, task: Any) -> Any:
-        """What is laid elsewhere along rays than it is, summed for stretches (`field.moved.Moved`); by default nothing."""
+        """What is laid elsewhere along rays than it is, summed for intervals (`field.moved.Moved`); by default nothing."""
         return None
 
     def no_cotangents(self) -> Any:
