@@ -2,6 +2,7 @@
 
 from jaxsph import io, reference, scenes
 from jaxsph.access.morton import prepare
+from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
@@ -26,7 +27,9 @@ __all__ = [
     "TransferFunction",
     "Volume",
     "__version__",
+    "in_octree",
     "io",
+    "octree_plans",
     "plan",
     "prepare",
     "progressive",
