@@ -86,7 +86,7 @@ class Medium(abc.ABC):
         """
 
     def gather(self, task: Any) -> Any:
-        """What is found in loops, once for all that follows; by default nothing."""
+        """What is found in loops, once for all that follows: arrays whose first axis is tasks; by default nothing."""
         return ()
 
     @abc.abstractmethod
