@@ -79,7 +79,7 @@ def test_intervals_are_in_order_and_cover_the_ray_inside_the_box(seed, style, dt
         some = walked(tree, origin, direction, *ends, False)
     entry, exit, number = (np.asarray(value) for value in (full.entry, full.exit, full.number))
     there = np.arange(LEAVES)[:, None] < number
-    assert (exit > entry)[there].all()
+    assert (exit >= entry)[there].all()  # rounding may leave nothing of one
     assert (entry[1:] == exit[:-1])[there[1:]].all()
     lower, side = np.asarray(tree.lower, np.float64)[:, None], float(tree.side)
     start, way = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
