@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.access.lists import ListPlan
 from jaxsph.access.octree_build import OctreePlan
+from jaxsph.cast.batches import CastPlan
 from jaxsph.field.octree_particles import OctreeParticles
 from jaxsph.field.octree_points import OctreePoints
+
+pytestmark = pytest.mark.usefixtures("quick_programs")
 
 STEPS = js.Settings(samples=32, integrator="step_doubling", step_tolerance=1e-3)
 COUNT = 40
@@ -22,10 +26,10 @@ POSITION, COLOR = RNG.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32), RNG.uni
 
 
 def parts():
-    """Particles and points, whose edges are soft."""
+    """Particles and points, in octrees of one shape."""
     look = js.TransferFunction.from_points([0, 0.4, 1], [[1, 0, 0], [0, 1, 0.2], [0.1, 0, 1]], [0.2, 2.0, 1.0])
-    found = js.Particles.from_arrays(POSITION, 0.55, RNG.uniform(0, 1, COUNT).astype(np.float32), capacity=COUNT)
-    points = js.Points.from_arrays(POSITION[::-1], 0.3, COLOR, 2.0, capacity=COUNT)
+    found = js.Particles.from_arrays(POSITION, 0.5, RNG.uniform(0, 1, COUNT).astype(np.float32), capacity=COUNT)
+    points = js.Points.from_arrays(POSITION, 0.5, COLOR, 0.6, capacity=COUNT)
     return {"particles": found, "transfer": look}, {"points": points}
 
 
@@ -41,6 +45,17 @@ def off(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance, float) - np.asarray(truth.transmittance, float)))
 
 
+def test_particles_and_points_by_step_doubling_are_the_reference_of_many_samples():
+    """Without a word about octrees."""
+    scene = js.Scene(**PARTICLES, **POINTS)
+    image = js.render(scene, camera(), STEPS)
+    fine = js.reference.render(scene, camera(), js.Settings(samples=512))
+    assert 0.3 < float(image.alpha.max()) < 1
+    error = off(image, fine)
+    assert (error <= 4 * STEPS.step_tolerance).mean() > 0.98 and error.max() < 0.05
+
+
+@pytest.mark.slow
 def test_points_by_step_doubling_are_nearly_their_exact_chords():
     image = js.render(js.Scene(**POINTS), camera(), STEPS)
     chords = js.reference.render(js.Scene(**POINTS), camera(), js.Settings(samples=512))
@@ -49,6 +64,7 @@ def test_points_by_step_doubling_are_nearly_their_exact_chords():
     assert (error <= 3 * STEPS.step_tolerance).mean() > 0.98 and error.max() < 0.02  # a profile ends at exp(-4.5), not at 0
 
 
+@pytest.mark.slow
 def test_particles_by_step_doubling_are_the_reference_of_many_samples():
     image = js.render(js.Scene(**PARTICLES), camera(), STEPS)
     fine = js.reference.render(js.Scene(**PARTICLES), camera(), js.Settings(samples=1024))
@@ -56,12 +72,12 @@ def test_particles_by_step_doubling_are_the_reference_of_many_samples():
     assert (off(image, fine) <= 3 * STEPS.step_tolerance).mean() > 0.98
 
 
-def test_parts_become_media_and_the_rest_stays(frames):
+def test_parts_become_media_and_the_rest_stays():
     scene = js.Scene(**PARTICLES, points=(POINTS["points"],), mix="opacity")
-    found = js.in_octree(scene, PLANS)
+    found = jax.eval_shape(lambda scene: js.in_octree(scene, PLANS), scene)
     assert [type(medium) for medium in found.media] == [OctreeParticles, OctreePoints]
     assert found.particles is found.points is found.transfer is None and found.mix == "opacity"
-    assert js.in_octree(found) == found  # nothing is left to do
+    assert js.in_octree(found).media == found.media  # nothing is left to do
 
 
 @pytest.mark.slow
@@ -72,17 +88,18 @@ def test_the_same_samples_show_the_same():
 
 
 def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
-    plan = js.plan(js.Scene(**PARTICLES), camera(), STEPS)
+    lists, cast = ListPlan(2, 2, 64, 64), CastPlan(64, 4, 128)
+    plan = js.Plan(20, 16, 32, 64, 1, 1, lists, cast, 0, integrator="step_doubling", step_tolerance=STEPS.step_tolerance)
 
-    def color(view, scene=None):
+    def color(view, scene):
         return js.render(scene, view, STEPS, plan=plan).color
 
     for parts, name in ((PARTICLES, "particles"), (POINTS, "points")):
         shown = js.Scene(**parts)
         with pytest.raises(ValueError, match=rf"`Scene\({name}=...\)` cannot answer; .*`jaxsph.in_octree`"):
             jax.eval_shape(lambda view, shown=shown: color(view, shown), camera())
-    inside = js.in_octree(js.Scene(**PARTICLES), PLANS[:1])
-    assert jax.eval_shape(lambda view: color(view, inside), camera()).shape == (16, 20, 3)
+    inside = jax.eval_shape(lambda scene: color(camera(), js.in_octree(scene, PLANS[:1])), js.Scene(**PARTICLES))
+    assert inside.shape == (16, 20, 3)
 
 
 def test_under_a_trace_plans_are_needed_one_for_each_set():

@@ -61,6 +61,11 @@ def asked(given, view, task):
     return medium.faults(), task.positions(), medium.optics(medium.gather(task), task)
 
 
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def in_view(given, view):
+    return OctreePoints.from_points(given, PLAN).seen_by(view)
+
+
 def fall_off(name, offset, brightness):
     """Of offsets in radii, float64, along the axes of the world."""
     square = (offset**2).sum(-1)
@@ -74,7 +79,7 @@ def fall_off(name, offset, brightness):
     ("name", "projection"),
     [
         ("shaped", "perspective"),
-        ("gaussian", "orthographic"),
+        pytest.param("gaussian", "orthographic", marks=pytest.mark.slow),
         pytest.param("ball", "perspective", marks=pytest.mark.slow),
         pytest.param("table", "orthographic", marks=pytest.mark.slow),
     ],
@@ -100,9 +105,8 @@ def test_extinctions_add_up_and_colours_weigh_by_them(name, projection):
 
 def test_cotangents_are_the_transpose_of_tangents(x64):
     """By all numbers of the points, of a profile, of the camera and of where samples are: <c, J t> = <J^T c, t>."""
-    medium = OctreePoints.from_points(points(shaped, np.float64), PLAN)
-    task, view = slabs("perspective", np.float64), jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera())
-    seen, rng = medium.seen_by(view), np.random.default_rng(5)
+    view, rng = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera()), np.random.default_rng(5)
+    seen, task = in_view(points(shaped, np.float64), view), slabs("perspective", np.float64)
     weights = [jnp.asarray(rng.normal(size=task.shape)) for _ in range(4)]
     move = [jnp.asarray(rng.normal(size=np.shape(part))) for part in (seen.seen.table, seen.seen.common[1], task.depth, 1.0)]
 
@@ -132,13 +136,13 @@ def test_what_has_no_extinction_at_a_point_is_refused_by_name(given, name):
 
 
 def test_points_that_mean_nothing_are_a_fault():
-    broken = points()
+    broken = points(shaped)
     broken = dataclasses.replace(broken, radius=broken.radius.at[3].set(jnp.nan))
     word, _, optics = asked(broken, camera(), slabs("perspective"))
     assert int(word) == faults.BAD_POINTS and bool(jnp.isfinite(jnp.stack(optics)).all())
 
 
 def test_where_there_are_none_there_is_no_extinction():
-    nobody = dataclasses.replace(points(), valid=jnp.zeros(COUNT, bool))
+    nobody = dataclasses.replace(points(shaped), valid=jnp.zeros(COUNT, bool))
     word, _, optics = asked(nobody, camera(), slabs("perspective"))
     assert int(word) == 0 and not np.asarray(optics[3]).any()
