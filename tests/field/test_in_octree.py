@@ -19,7 +19,7 @@ from jaxsph.field.octree_points import OctreePoints
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 STEPS = js.Settings(samples=32, integrator="step_doubling", step_tolerance=1e-3)
-COUNT = 40
+COUNT, WIDTH, HEIGHT = 16, 14, 12
 PLANS = (OctreePlan(2, 2048, 2048, (), 2048),) * 2
 RNG = np.random.default_rng(1)
 POSITION, COLOR = RNG.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32), RNG.uniform(0, 1, (COUNT, 3))
@@ -28,8 +28,8 @@ POSITION, COLOR = RNG.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32), RNG.uni
 def parts():
     """Particles and points, in octrees of one shape."""
     look = js.TransferFunction.from_points([0, 0.4, 1], [[1, 0, 0], [0, 1, 0.2], [0.1, 0, 1]], [0.2, 2.0, 1.0])
-    found = js.Particles.from_arrays(POSITION, 0.5, RNG.uniform(0, 1, COUNT).astype(np.float32), capacity=COUNT)
-    points = js.Points.from_arrays(POSITION, 0.5, COLOR, 0.6, capacity=COUNT)
+    found = js.Particles.from_arrays(POSITION, 0.56, RNG.uniform(0, 1, COUNT).astype(np.float32), capacity=COUNT)
+    points = js.Points.from_arrays(POSITION, 0.56, COLOR, 1.0, capacity=COUNT)
     return {"particles": found, "transfer": look}, {"points": points}
 
 
@@ -37,7 +37,7 @@ PARTICLES, POINTS = parts()
 
 
 def camera():
-    return js.Camera.look_at((0.6, 0.5, -3.0), (0.0, 0.0, 0.0), fov_degrees=42.0, width=20, height=16, near=1.5, far=5.0)
+    return js.Camera.look_at((0.6, 0.5, -3.0), (0.0, 0.0, 0.0), fov_degrees=42.0, width=WIDTH, height=HEIGHT, near=1.5, far=5.0)
 
 
 def off(image, truth):
@@ -89,7 +89,7 @@ def test_the_same_samples_show_the_same():
 
 def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
     lists, cast = ListPlan(2, 2, 64, 64), CastPlan(64, 4, 128)
-    plan = js.Plan(20, 16, 32, 64, 1, 1, lists, cast, 0, integrator="step_doubling", step_tolerance=STEPS.step_tolerance)
+    plan = js.Plan(WIDTH, HEIGHT, 32, 64, 1, 1, lists, cast, 0, integrator="step_doubling", step_tolerance=STEPS.step_tolerance)
 
     def color(view, scene):
         return js.render(scene, view, STEPS, plan=plan).color
@@ -99,7 +99,7 @@ def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
         with pytest.raises(ValueError, match=rf"`Scene\({name}=...\)` cannot answer; .*`jaxsph.in_octree`"):
             jax.eval_shape(lambda view, shown=shown: color(view, shown), camera())
     inside = jax.eval_shape(lambda scene: color(camera(), js.in_octree(scene, PLANS[:1])), js.Scene(**PARTICLES))
-    assert inside.shape == (16, 20, 3)
+    assert inside.shape == (HEIGHT, WIDTH, 3)
 
 
 def test_under_a_trace_plans_are_needed_one_for_each_set():
