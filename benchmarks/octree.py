@@ -13,7 +13,11 @@ the same with points of a hundredth of a support, and maybe particles of a file.
 Building, with a kept plan, is timed in turns with a frame of `jaxsph.render`. The rule by which nodes are split is measured by
 its `ratio`, if asked for, on a tenth of the particles. Writes `results/octree.json`; ends in an assert.
 
+And which access wins: whole frames of the same scenes, 256 x 256 pixels and 128 point samples, by the perspective grid and by
+octrees (`jaxsph.in_octree`, made once), in turns. `--only-frames` measures this alone, and leaves all else in the file as it is.
+
     python benchmarks/octree.py [--repeats 3] [--particles 1000000] [--every 16] [--ratios] [--data FILE] [--check]
+                                [--only-frames]
 """
 
 from __future__ import annotations
@@ -42,6 +46,8 @@ RATIOS = 1.0, 2.0, 4.0
 SMALL = 0.01  # of a support: radius of points that overlap nowhere
 AT_ONCE = 1 << 22  # (segment, entry) pairs that are tested together
 MAX_SHARE = 0.05  # evaluations of small points with all skipping, of those without
+FRAME, FRAME_SAMPLES, FRAME_PARTICLES = 256, 128, 100_000
+POINT, OPACITY = 0.3, 0.2  # of a support: radius of points, of which about one is in the reach of each; and what each hides
 RESULTS = pathlib.Path(__file__).with_name("results") / "octree.json"
 
 
@@ -196,6 +202,52 @@ def measured(particles: js.Particles, share: float, repeats: int, every: int, ra
     return {"particles": count, "seconds": times, "sizes": sizes(tree, plan, count)} | rows
 
 
+def frame_scenes(count: int) -> dict[str, tuple[js.Scene, js.Camera]]:
+    """Particles and points, everywhere alike and clustered."""
+    cube, (position, support) = workloads.cube(round(count ** (1 / 3))), halo(count)
+    quantity = np.log(np.linalg.norm(position, axis=1)).astype(np.float32)
+    sets = {
+        "uniform": js.prepare(js.Particles.from_arrays(cube.position, cube.support, cube.quantity)),
+        "clustered": js.prepare(js.Particles.from_arrays(position, support, quantity)),
+    }
+    found = {}
+    for name, particles in sets.items():
+        camera, valid = js.Camera.framing(particles, width=FRAME, height=FRAME), np.asarray(particles.valid)
+        place, radius = (np.asarray(value)[valid] for value in (particles.position, POINT * particles.support))
+        if name == "uniform":  # a lattice would have points in rows
+            place = np.random.default_rng(8).uniform(place.min(0), place.max(0), place.shape).astype(np.float32)
+        points = js.Points.from_arrays(place, radius, (1.0, 0.8, 0.5), opacity=OPACITY)
+        found |= {f"{name} particles": (scene_of(particles), camera), f"{name} points": (js.Scene(points=points), camera)}
+    return found
+
+
+def by_access(scene: js.Scene, camera: js.Camera, repeats: int) -> dict[str, Any]:
+    """Seconds of a frame by the grid and by octrees, in turns; and how far their images are apart."""
+    settings, started = js.Settings(samples=FRAME_SAMPLES), time.perf_counter()
+    shown = {"grid": scene, "octree": jax.block_until_ready(js.in_octree(scene))}
+    made = time.perf_counter() - started
+    first = {name: np.asarray(js.render(one, camera, settings).color) for name, one in shown.items()}  # compiles
+    times: dict[str, list[float]] = {name: [] for name in shown}
+    for _ in range(repeats):
+        for name, one in shown.items():
+            times[name].append(seconds_of(lambda one=one: js.render(one, camera, settings).color))
+    seconds = {name: statistics.median(turns) for name, turns in times.items()}
+    apart = float(np.abs(first["grid"] - first["octree"]).mean())
+    return {"seconds": seconds, "octree over grid": seconds["octree"] / seconds["grid"], "made": made, "mean difference": apart}
+
+
+def measure_frames(repeats: int) -> None:
+    """Add to the results which access wins."""
+    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    rows = {}
+    for name, (scene, camera) in frame_scenes(FRAME_PARTICLES).items():
+        rows[name] = by_access(scene, camera, repeats)
+        print(name, json.dumps(rows[name]), flush=True)
+    shape = {"size": FRAME, "samples": FRAME_SAMPLES, "particles": FRAME_PARTICLES, "repeats": repeats}
+    kept["frames"] = {"run": of_this_run(), **shape, "found": rows}
+    RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3)
@@ -204,13 +256,22 @@ def main() -> None:
     parser.add_argument("--ratios", action="store_true", help="measure the rule by which nodes are split as well")
     parser.add_argument("--data", help="a file of particles")
     parser.add_argument("--check", action="store_true", help="fail where small points take too many evaluations")
+    parser.add_argument("--only-frames", action="store_true", help="measure frames by both kinds of access, and nothing else")
     arguments = parser.parse_args()
+    if not arguments.only_frames:
+        measure_trees(arguments)
+    measure_frames(arguments.repeats)
+
+
+def measure_trees(arguments: argparse.Namespace) -> None:
+    """Evaluations along rays, and sizes of trees."""
     found: dict[str, Any] = {}
+    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name, (particles, share) in contenders(arguments.particles, arguments.data).items():
         found[name] = measured(particles, share, arguments.repeats, arguments.every, arguments.ratios)
         print(name, json.dumps(found[name]), flush=True)
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"run": of_this_run(), "every": arguments.every, "found": found}, indent=1) + "\n")
+        RESULTS.write_text(json.dumps(kept | {"run": of_this_run(), "every": arguments.every, "found": found}, indent=1) + "\n")
     if arguments.check:
         shares = {name: row["counts"]["segments"] / row["counts"]["flat"] for name, row in found.items() if "points" in name}
         assert max(shares.values()) <= MAX_SHARE, shares

@@ -3,6 +3,7 @@
 from jaxsph import io, reference, scenes
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
+from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
@@ -31,7 +32,9 @@ __all__ = [
     "__version__",
     "coarse_bound",
     "coarsened",
+    "in_octree",
     "io",
+    "octree_plans",
     "plan",
     "prepare",
     "progressive",

@@ -378,12 +378,12 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
 
 
 def _require_points(scene: Scene, integrator: str) -> None:
-    """Raise where a medium cannot tell its optics at any point."""
-    refused = [type(medium).__name__ for medium in scene.media if not medium.at_points]
+    """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
     given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-    refused = [*(what for what, there in given.items() if there), *refused]
-    if refused:
+    refused = [(what, "put it into an octree by `jaxsph.in_octree`") for what, there in given.items() if there]
+    refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
+    for what, remedy in refused:
         raise ValueError(
-            f"`integrator={integrator!r}` asks media for points of its own choosing, which `{refused[0]}` cannot answer; "
-            "give `integrator='samples'`, leave that out, or make a volume of particles by `jaxsph.resample`"
+            f"`integrator={integrator!r}` asks media for points of its own choosing, which `{what}` cannot answer; "
+            f"{remedy}, or give `integrator='samples'`"
         )

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from jaxsph.access.host_sorting import depth_order
+from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures, measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
@@ -63,6 +64,7 @@ def plan(
     settings = settings or Settings()
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    scene = reachable(scene, settings)
     settings = along_rays(scene, settings)
     shape = dataclasses.replace(shape_of(spheres_of(scene), camera, settings), headroom=1.0)
     if tuning is not None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Frame
 from jaxsph.layers import assemble
 from jaxsph.model.camera import Camera
@@ -176,7 +177,7 @@ def _with_quadtree(settings: Settings) -> Settings:
 
 
 def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) -> _State:
-    clock = Clock()
+    clock, scene = Clock(), reachable(scene, settings)
     plan, seen = PLANS.for_frame(scene, camera, settings, clock)
     shards = shards_at_hand(plan.cast.tuning)
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
+from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Band, Frame
 from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
@@ -96,6 +97,7 @@ def render(
 
 def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, progress: Progress | None) -> Image:
     clock, planned = Clock(), plan is None
+    scene = reachable(scene, settings)
     if plan is None:
         plan, seen = PLANS.for_frame(scene, camera, settings, clock)
     else:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY as UNOPTIMIZED
 
 import jaxsph as js
 from jaxsph.access.lists import ListPlan
@@ -21,12 +22,13 @@ from jaxsph.access.view import view_particles
 from jaxsph.cast.batches import CastPlan
 from jaxsph.control.errors import fits
 from jaxsph.field.schedule import reference_quantities
-from jaxsph.numerics import memory_maps
+from jaxsph.numerics import memory_maps, programs
 from jaxsph.stages import make_grid
 from jaxsph.viewing import half_steps
 
 pytest_plugins = ["share"]
 
+QUICKLY = UNOPTIMIZED | {"xla_cpu_parallel_codegen_split_count": 1}
 hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
 hypothesis.settings.load_profile("jaxsph")
 
@@ -147,6 +149,21 @@ def few_programs() -> Iterator[None]:
     yield
     if (memory_maps.in_use() or 0) > MAX_MAPS:
         jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def own_programs() -> Iterator[None]:
+    """No program from another test file, and none for the next."""
+    programs.PROGRAMS.clear()
+    yield
+    programs.PROGRAMS.clear()
+
+
+@pytest.fixture
+def quick_programs(own_programs: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs of eager images compiled in half the time, and slower: those of slow tests are as everyone has them."""
+    if request.node.get_closest_marker("slow") is None:
+        monkeypatch.setattr(programs, "_compile", lambda lowered, _: lowered.compile(compiler_options=QUICKLY))
 
 
 @pytest.fixture

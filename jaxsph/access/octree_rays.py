@@ -35,7 +35,8 @@ class LeavesAlong:
     """Leaves along rays in their order.
 
     Attributes:
-        entry, exit: of each leaf, as parameters of the ray: a position is origin + parameter * direction.
+        entry, exit: of each leaf, as parameters of the ray: a position is origin + parameter * direction. Both are the same where
+            less of the ray is in the leaf than rounding leaves of it.
         begin, length: its entries in `Octree.entry`; of length 0 past the last.
         level: its own.
         number: leaves of each ray.

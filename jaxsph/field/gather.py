@@ -23,7 +23,6 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.field.fetch import fetch, quantities_of
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
-from jaxsph.field.uneven import turns_of
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -34,7 +33,7 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
     """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows."""
     zero = jnp.zeros((*task.depth.shape, task.v.shape[1], task.u.shape[1]), task.depth.dtype)
     sums = sums_of([zero] * (1 + len(quantities_of(ordered))))
-    for turns in turns_of(task, BLOCK):
+    for turns in task.turns(BLOCK):
         add = functools.partial(_add, ordered, rank, turns.task, kernel)
         sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
     return sums

@@ -26,7 +26,6 @@ from jaxsph.field.fetch import particle_at
 from jaxsph.field.moved import LEAST_ROUNDING, ROUNDINGS, Moved, Places, Splats
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
-from jaxsph.field.uneven import turns_of
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.points import Points
@@ -128,13 +127,13 @@ class PointsMedium(Medium):
         """Nothing of its own: spheres are in the grid, by which slabs are filled."""
         return jnp.zeros_like(slabs.z_lower, bool)
 
-    def gather(self, task: SlabTask) -> Float[Array, "4 tasks intervals rays"]:
+    def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], ...]:
         """Thickness of all intervals, and thickness times red, green and blue."""
         sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
-        for turns in turns_of(task, BLOCK):
+        for turns in task.turns(BLOCK):
             add = functools.partial(self._add, turns.task)
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
-        return jnp.stack(sums.all)
+        return tuple(sums.all)
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
         """With a block of points more."""
@@ -152,12 +151,14 @@ class PointsMedium(Medium):
             channels = [channels[0] + here, *(old + new for old, new in zip(channels[1:], weighed, strict=True))]
         return sums_of(channels)
 
-    def extinction(self, gathered: Array, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Array]:
+    def extinction(
+        self, gathered: tuple[Array, ...], task: SlabTask
+    ) -> tuple[Float[Array, "tasks intervals rays"], tuple[Array, ...]]:
         """Mean extinction of intervals."""
         path = task.path()
         return jnp.where(path > 0, gathered[0] / jnp.where(path > 0, path, 1), 0), gathered
 
-    def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """Weighed by thickness."""
         thickness, *weighed = samples
         inverse = jnp.where(thickness > 0, 1 / jnp.where(thickness > 0, thickness, 1), 0)
@@ -184,7 +185,7 @@ class PointsMedium(Medium):
 
             return jax.tree.map(jnp.add, sums, fusion_barrier(nth >= 0, found, nth))
 
-        for turns in turns_of(task, BLOCK):
+        for turns in task.turns(BLOCK):
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, functools.partial(add, task=turns.task), turns.of(sums)), sums)
         return sums
 
@@ -224,15 +225,16 @@ class PointsMedium(Medium):
         return jax.tree.map(jnp.zeros_like, dataclasses.replace(self, lists=None))
 
     def pull(  # type: ignore[override]
-        self, total: PointsMedium, gathered: Array, task: SlabTask, cotangents: list[Array]
+        self, total: PointsMedium, gathered: tuple[Array, ...], task: SlabTask, cotangents: list[Array]
     ) -> tuple[PointsMedium, OfPlaces]:
         """See `Medium.pull`: sums have the same cotangents for each point, which is met again."""
 
-        def optics(sums: Array, places: OfPlaces) -> list[Array]:
+        def optics(sums: tuple[Array, ...], places: OfPlaces) -> list[Array]:
             return self.optics(sums, _moved(task, places))
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        of_sums, places = jax.vjp(optics, gathered, there)[1](cotangents)
+        of_gathered, places = jax.vjp(optics, gathered, there)[1](cotangents)
+        of_sums = jnp.stack(of_gathered)
 
         def add(nth: Array, carry: tuple[Any, ...], number: int, part: SlabTask) -> tuple[Any, ...]:
             table, attributes, axes, profile, places = carry
@@ -255,7 +257,7 @@ class PointsMedium(Medium):
             return table, attributes, axes, profile, places
 
         carry = total.table, total.attributes, total.axes, total.profile, places
-        for turns in turns_of(task, BLOCK):
+        for turns in task.turns(BLOCK):
             some = functools.partial(add, number=turns.number, part=turns.task)
             carry = lax.fori_loop(turns.begin, turns.end, some, carry)
         table, attributes, axes, profile, places = carry

@@ -6,12 +6,19 @@ Flow: screen -> [tasks: RayPackets] -> cast -> [tasks: SlabTask] -> media, integ
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.field.schedule import SlabSchedule
+
+Sums = TypeVar("Sums")
+PARTS = 4, 16  # of the slabs of a task, the first quarter and the first sixteenth have loops of their own
+FEWEST = 16  # slabs that are worth a loop: each is compiled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +131,22 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
+    def turns(self, block: int) -> Iterator[Turns]:
+        """All blocks of `block` spheres of all slabs, in order for each slab.
+
+        The slabs come in order of how many spheres their windows hold. Where those are clustered the first may hold a thousand
+        times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
+        only a quarter of them have anything left, then that quarter alone, and so on. Out of order it takes longer.
+        """
+        blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
+        tasks = blocks.shape[0]
+        numbers = [tasks, *(tasks // part for part in PARTS if tasks // part >= FEWEST), 0]
+        begin = jnp.int32(0)
+        for number, fewer in itertools.pairwise(numbers):
+            end = jnp.maximum(blocks[fewer:number].max(), begin)
+            yield Turns(number, self.first(number), begin, end)
+            begin = end
+
     def first(self, number: int) -> SlabTask:
         """The first so many slabs."""
         entry = jax.tree.map(lambda leaf: leaf[..., :number], self.entry)
@@ -142,6 +165,23 @@ class SlabTask:
             jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
         )
         return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, scattered=True)
+
+
+class Turns(NamedTuple):
+    """Blocks of spheres from `begin` up to `end` of the first `number` slabs of a task, which are `task`."""
+
+    number: int
+    task: SlabTask
+    begin: Int[Array, ""]
+    end: Int[Array, ""]
+
+    def of(self, sums: Sums) -> Sums:
+        """Those of these slabs."""
+        return jax.tree.map(lambda value: value[: self.number], sums)  # type: ignore[no-any-return]
+
+    def put(self, some: Sums, sums: Sums) -> Sums:
+        """All sums, with some of these slabs."""
+        return jax.tree.map(lambda new, old: jnp.concatenate([new, old[self.number :]]), some, sums)  # type: ignore[no-any-return]
 
 
 jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])

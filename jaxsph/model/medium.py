@@ -52,6 +52,11 @@ class Medium(abc.ABC):
     at_points: ClassVar[bool] = True
     between_samples: ClassVar[bool] = False
 
+    @property
+    def dtype(self) -> Any:
+        """What samples are to be computed in at least, float32 or float64; by default float32."""
+        return jnp.dtype(jnp.float32)
+
     def seen_by(self, camera: Camera) -> Medium:
         """The medium in view space; by default as it is."""
         return self
@@ -81,7 +86,7 @@ class Medium(abc.ABC):
         """
 
     def gather(self, task: Any) -> Any:
-        """What is found in loops, once for all that follows; by default nothing."""
+        """What is found in loops, once for all that follows: arrays whose first axis is tasks; by default nothing."""
         return ()
 
     @abc.abstractmethod

@@ -79,8 +79,8 @@ class Scene:
 
     @property
     def dtype(self) -> Any:
-        """float32, or float64 if particles, a volume or points are."""
-        given = [part.dtype for part in (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets)]
+        """float32, or float64 if any part is."""
+        given = [part.dtype for part in (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets, *self.media)]
         return jnp.result_type(*given) if given else jnp.dtype(jnp.float32)
 
     @property

@@ -211,16 +211,11 @@ def test_forward_derivatives_of_an_image_are_its_differences(looked_at):
     np.testing.assert_allclose(found, (both(at + 0.05 * way) - both(at - 0.05 * way)) / 0.1, rtol=2e-2)
 
 
-@pytest.mark.parametrize("what", ["particles", "iso-surface"])
-def test_media_without_values_at_points_are_refused_by_name(what):
-    shown = scene()
-    if what == "particles":
-        parts = {"particles": js.Particles.from_arrays([[0.0, 0, 0]], 0.5, 0.5), "transfer": shown.volume_transfer}
-        name = r"Scene\(particles=...\)"
-    else:
-        parts, name = {"media": (js.IsoSurface.from_volume(shown.volume, 0.5),)}, "IsoSurface"
+def test_media_without_values_at_points_are_refused_by_name():
+    """Particles and points too, under a trace: see `tests/field/test_in_octree.py`."""
+    parts = {"media": (js.IsoSurface.from_volume(scene().volume, 0.5),)}
     with pytest.raises(
-        ValueError, match=f"`integrator='step_doubling'` asks media for points.*{name}.*give `integrator='samples'`"
+        ValueError, match=r"`integrator='step_doubling'` asks media for points.*IsoSurface.*give `integrator='samples'`"
     ):
         js.render(scene(**parts), camera(), SETTINGS)
 

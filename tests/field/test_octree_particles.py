@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
-from jaxsph.access.octree_build import OctreePlan
+from jaxsph.access.octree_build import LevelSizes, OctreePlan
 from jaxsph.field.octree_particles import OctreeParticles
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=32)
+PLAN = OctreePlan(1, 400, 400, (LevelSizes(8, 2048),), 2048)
 
 
 def particles(kernel="poly6", count=60, decades=0.7, seed=1):
@@ -36,7 +41,12 @@ def camera(projection="perspective", width=20, height=16):
 
 
 def in_octree(found):
-    return js.Scene(media=(OctreeParticles.from_particles(found, transfer()),))
+    return js.Scene(media=(built(found, transfer(), PLAN),))
+
+
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
+def built(found, look, plan):
+    return OctreeParticles.from_particles(found, look, plan)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +86,7 @@ def test_a_constant_is_rendered_as_that_constant():
 def test_derivatives_are_those_of_particles_that_are_marched_by_lists():
     found, view, weights = particles(count=30, decades=0.3), camera(width=9, height=8), jnp.arange(1.0, 4)
     look = transfer()
-    medium = OctreeParticles.from_particles(found, look)
+    medium = built(found, look, PLAN)
 
     def scene(position, quantity, support, extinction, in_tree):
         moved = dataclasses.replace(found, position=position, quantity=quantity, support=support)
@@ -115,7 +125,8 @@ def test_octree_particles_share_rays_with_other_media():
 
 def test_an_octree_that_was_too_small_is_refused_with_what_to_do():
     found = particles()
-    medium = OctreeParticles.from_particles(found, transfer(), OctreePlan(1, 512, 512, (), 16))
-    assert int(medium.faults()) == faults.OCTREE_OVERFLOW
+    wide = dataclasses.replace(found, support=8 * found.support)
+    assert int(built(found, transfer(), PLAN).faults()) == 0
+    assert int(built(wide, transfer(), PLAN).faults()) == faults.OCTREE_OVERFLOW
     with pytest.raises(ValueError, match="plan_octree"):
-        js.render(js.Scene(media=(medium,)), camera(), SETTINGS)
+        js.render(in_octree(wide), camera(), SETTINGS)
