@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="assert the claim")
     options = parser.parse_args()
     found = measured()
-    RESULTS.write_text(json.dumps({**of_this_run(), "samples": SAMPLES, **found}, indent=1) + "\n")
+    RESULTS.write_text(json.dumps({"run": of_this_run(), "samples": SAMPLES, **found}, indent=1) + "\n")
     figure(found, RESULTS.with_suffix(".png"))
     for what, by in found.items():
         for mix, values in by.items():

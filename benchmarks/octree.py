@@ -113,7 +113,7 @@ def counted(tree: Octree, ball: tuple[Any, Any, Any], camera: js.Camera, every: 
 
     depths = np.asarray(camera.depth(jnp.arange(SAMPLES) + 0.5, SAMPLES))
     found, first = dict.fromkeys(("rays", "leaves", "asks flat", "asks skipping", "asks segments", "flat"), 0.0), ends[0]
-    found |= dict.fromkeys(("tests", "segments", "needed"), 0.0)
+    found |= dict.fromkeys(("tests", "segments", "needed", "projected"), 0.0)
     while True:
         along = walk(first)
         entry, exit, begin, length = (np.asarray(value) for value in (along.entry, along.exit, along.begin, along.length))
@@ -137,7 +137,7 @@ def met(tree: Octree, ball: Any, eye: np.ndarray, way: np.ndarray, depths: np.nd
     leaf, ray = np.nonzero((samples > 0) & (length > 0))
     of = tuple(value[leaf, ray] for value in (entry, exit, begin, length, samples))
     centre, radius, listed = np.asarray(ball[0]), np.asarray(ball[1]), np.asarray(tree.entry)
-    found = dict.fromkeys(("tests", "segments", "asks segments", "needed"), 0.0)
+    found = dict.fromkeys(("tests", "segments", "asks segments", "needed", "projected"), 0.0)
     up_to = np.cumsum(of[3], dtype=np.int64)
     borders = np.searchsorted(up_to, np.arange(0, up_to[-1] if len(up_to) else 0, AT_ONCE), "right")
     for low, high in zip(borders, [*borders[1:], len(leaf)], strict=True):
@@ -153,6 +153,8 @@ def met(tree: Octree, ball: Any, eye: np.ndarray, way: np.ndarray, depths: np.nd
         meets = (half > 0) & (front < back)
         found["tests"] += len(segment)
         found["segments"] += float((meets * taken[segment]).sum())
+        in_front, behind = of[0][low:high][segment], of[1][low:high][segment]
+        found["projected"] += float((meets & (nearest >= in_front) & (nearest < behind)).sum())
         found["asks segments"] += float(taken[np.bincount(segment[meets], minlength=high - low) > 0].sum())
         within = np.searchsorted(depths, back[meets]) - np.searchsorted(depths, front[meets])
         found["needed"] += float(within.sum())

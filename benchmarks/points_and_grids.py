@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="assert that ours loses less than theirs")
     options = parser.parse_args()
     results = [measured(name, options.rounds) for name in THEIRS]
-    RESULTS.write_text(json.dumps({**of_this_run(), "scenes": results}, indent=1) + "\n")
+    RESULTS.write_text(json.dumps({"run": of_this_run(), "scenes": results}, indent=1) + "\n")
     figure(results, RESULTS.with_suffix(".png"))
     for found in results:
         for row in found["rows"]:

@@ -10,13 +10,13 @@ $$|I_A - I_B| \le \sum_i G_i [1 - e^{-e_i} + \min(1, P_i + M_i)].$$
 *Argument.* Light is the expected colour of what a photon, sent out from the eye, meets first, if what it may meet along a ray is
 a Poisson process of the media's thickness: in an interval of constant extinctions that is the light of the mixture. Give both
 images the same process: what they have in common stays where it is, and each event of a piece (`field.moved`) is moved from its
-place in B to its place in A. Let there be no extra thickness. Light differs only if the first event p of B, at b in B and at a
-in A, and the first event p' of A, at b' and a', are two of different colour. Then b < b' and a' < a: they have passed each
-other, so one at least is moved, and the spans of both have an interval in common if what stays has its place as span. Let i be
-the first such, which is where one of the spans begins. One of b and a' is not in front of i: for b in front of the span of p', a' is
-in it and a behind that, so a' is at or behind the beginnings of both spans. Thus nothing that stays in front of i has had an
-event, as p was the first in B, p' in A; nor had pieces whose span ends in front of i. That has the probability $G_i = e^{-g}$, g
-being the thickness of all those, and is independent of what has a span that includes i.
+place in B to its place in A. Let there be no extra thickness. Light differs only if the first event p of B, at b in B and at a in
+A, and the first event p' of A, at b' and a', are two of different colour. Then b < b' and a' < a: they have passed each other, so
+one at least is moved, and the spans of both have an interval in common if what stays has its place as span. Let i be the first
+such, which is where one of the spans begins. One of b and a' is not in front of i: if b is in front of the span of p', a' is in
+it and a behind that, so a' is at or behind the beginnings of both spans. Thus nothing that stays in front of i has had an event,
+as p was the first in B, p' in A; nor had pieces whose span ends in front of i. That has the probability $G_i = e^{-g}$, g being
+the thickness of all those, and is independent of what has a span that includes i.
 
 - Both moved: with probability at most $P_i$, the sum over pairs of pieces of different points, with spans that include i and of
   which one begins there, of the products of their opacities.
@@ -29,7 +29,7 @@ Where totals differ, let U be A with what B has more of, in the splats' interval
 and what of U it should have, differ only if the first event of U is an extra one: in interval i, of thickness $e_i$, with
 probability at most $G_i (1 - e^{-e_i})$. $\square$
 
-So a point alone on a ray is not wrong, nor is one within an interval: only overlaps are, to second order in thickness. In an image
+So a point alone on a ray is not wrong, nor is one within an interval: only overlaps are, to second order in thickness. In images
 of 2000 points of opacity 0.2 that overlap some others (`tests/test_splats.py`, float64), the true difference was 0.37 of the
 bound in the median of pixels, and 0.98 at most. The bound has no use where many thick points overlap: there it is 1.
 
