@@ -79,7 +79,9 @@ def sphere_depths(camera: Camera, dtype: Any, samples: int, between_samples: boo
     """Depths of the fine samples, by which spheres are ordered; out to the borders of the first and the last where they count."""
     steps = half_steps(camera, dtype, samples)
     depths = steps[1::2]
-    return depths.at[0].set(steps[0]).at[-1].set(steps[-1]) if between_samples and samples > 1 else depths
+    if not between_samples:
+        return depths
+    return depths.at[0].set(steps[0]).at[-1].set(steps[-1]) if samples > 1 else steps[::2]
 
 
 def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:

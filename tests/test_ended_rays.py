@@ -51,6 +51,7 @@ def test_what_rays_leave_out_is_bounded_and_spares_evaluations(opaque):
     assert ended.certified and np.asarray(truth.error_bound).max() == 0
 
 
+@pytest.mark.slow
 def test_a_tolerance_is_kept_together_with_what_is_left_out(opaque):
     scene, view = opaque
     given = settings(0.005, tolerance=0.02)

@@ -34,6 +34,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 4  # points whose chords are held at once
+PARTS = 4, 16  # of the slabs of a task that have loops of their own: points are clustered
 NUM_COLUMNS = 8  # of a row of the table: read, and added to, as one
 
 
@@ -130,7 +131,7 @@ class PointsMedium(Medium):
     def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], ...]:
         """Thickness of all intervals, and thickness times red, green and blue."""
         sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
-        for turns in task.turns(BLOCK):
+        for turns in task.turns(BLOCK, PARTS):
             add = functools.partial(self._add, turns.task)
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
         return tuple(sums.all)
@@ -185,7 +186,7 @@ class PointsMedium(Medium):
 
             return jax.tree.map(jnp.add, sums, fusion_barrier(nth >= 0, found, nth))
 
-        for turns in task.turns(BLOCK):
+        for turns in task.turns(BLOCK, PARTS):
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, functools.partial(add, task=turns.task), turns.of(sums)), sums)
         return sums
 
@@ -257,7 +258,7 @@ class PointsMedium(Medium):
             return table, attributes, axes, profile, places
 
         carry = total.table, total.attributes, total.axes, total.profile, places
-        for turns in task.turns(BLOCK):
+        for turns in task.turns(BLOCK, PARTS):
             some = functools.partial(add, number=turns.number, part=turns.task)
             carry = lax.fori_loop(turns.begin, turns.end, some, carry)
         table, attributes, axes, profile, places = carry

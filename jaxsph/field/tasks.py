@@ -17,8 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.field.schedule import SlabSchedule
 
 Sums = TypeVar("Sums")
-PARTS = 4, 16  # of the slabs of a task, the first quarter and the first sixteenth have loops of their own
-FEWEST = 16  # slabs that are worth a loop: each is compiled
+FEWEST = 256  # slabs of a task that are worth more than one loop: each is compiled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,16 +130,16 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
-    def turns(self, block: int) -> Iterator[Turns]:
-        """All blocks of `block` spheres of all slabs, in order for each slab.
+    def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[Turns]:
+        """All blocks of `block` spheres of all slabs, in order for each slab; of `parts` 4 is the first quarter of the slabs.
 
         The slabs come in order of how many spheres their windows hold. Where those are clustered the first may hold a thousand
         times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
-        only a quarter of them have anything left, then that quarter alone, and so on. Out of order it takes longer.
+        only a part of them has anything left, then that part alone, and so on. Out of order it takes longer.
         """
         blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
         tasks = blocks.shape[0]
-        numbers = [tasks, *(tasks // part for part in PARTS if tasks // part >= FEWEST), 0]
+        numbers = [tasks, *(tasks // part for part in parts if tasks >= FEWEST), 0]
         begin = jnp.int32(0)
         for number, fewer in itertools.pairwise(numbers):
             end = jnp.maximum(blocks[fewer:number].max(), begin)

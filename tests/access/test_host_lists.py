@@ -50,9 +50,9 @@ def lists_of(grid):
 
 def both(scene, camera, lists, first_row=0, samples=24):
     """The grid as XLA and as the host makes it."""
-    order = {"samples": samples, "slab_samples": 4}
-    grid = {"lists": lists, "samples": samples, "halo": 0}
-    seen = view_scene(scene, camera, samples=samples, num_classes=3)
+    order = {"samples": samples, "slab_samples": 4, "between_samples": False}
+    grid = {"lists": lists, "samples": samples, "beside": False}
+    seen = view_scene(scene, camera, samples=samples, capacity=scene.particles.capacity, num_classes=3)
     found = []
     for tuning in (dataclasses.replace(CPU, sorts_on_host=False), CPU):
         run = Clock()

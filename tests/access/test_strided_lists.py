@@ -43,7 +43,10 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
     rng = np.random.default_rng(seed)
     shape = dataclasses.replace(frames, **SIZE)
     scene, camera = shape.scene(rng, decades=decades), shape.camera(rng, projection, distance)
-    seen, strided = view_scene(scene, camera, samples=SAMPLES, num_classes=3), camera.strided(STRIDE)
+    seen, strided = (
+        view_scene(scene, camera, samples=SAMPLES, capacity=scene.particles.capacity, num_classes=3),
+        camera.strided(STRIDE),
+    )
     lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Clock(), []
     for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
         size = {"samples": SAMPLES, "tuning": tuning}

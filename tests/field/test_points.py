@@ -129,6 +129,12 @@ def test_points_that_touch_only_the_ends_of_rays_are_met():
     assert float(alpha[9, 10]) > 0.3 and float(alpha[5, 4]) > 0.3
 
 
+@pytest.mark.slow
+def test_a_single_sample_stands_for_all_of_a_ray():
+    scene, view, one = js.Scene(points=points()), camera(), js.Settings(samples=1)
+    assert (off(js.render(scene, view, one), js.reference.render(scene, view, one)) <= 1e-4).mean() >= 0.999
+
+
 MIXES = "extinction", pytest.param("opacity", marks=pytest.mark.slow)
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from jaxsph.field.schedule import SlabSchedule
 from jaxsph.field.tasks import SlabTask
 
-TASKS = 64
-lengths = st.lists(st.integers(0, 40) | st.integers(0, 3), min_size=TASKS, max_size=TASKS)
+TASKS = 256
 
 
 def task_of(length):
@@ -23,11 +22,15 @@ def task_of(length):
 
 
 @settings(max_examples=20)
-@given(lengths, st.booleans())
-def test_each_block_of_each_slab_is_met_once_and_in_order(length, sorted_first):
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_each_block_of_each_slab_is_met_once_and_in_order(seed, sorted_first):
+    rng = np.random.default_rng(seed)
+    length = [
+        int(n) for n in np.where(rng.uniform(size=TASKS) < rng.uniform(), rng.integers(0, 40, TASKS), rng.integers(0, 3, TASKS))
+    ]
     length = sorted(length, reverse=True) if sorted_first else length
     met = [[] for _ in range(TASKS)]
-    for turns in task_of(length).turns(4):
+    for turns in task_of(length).turns(4, (4,)):
         assert turns.task.depth.shape[0] == turns.number
         for block in range(int(turns.begin), int(turns.end)):
             for slab in range(turns.number):
@@ -40,7 +43,7 @@ def test_each_block_of_each_slab_is_met_once_and_in_order(length, sorted_first):
 
 def test_one_full_slab_does_not_keep_the_others_waiting():
     length = [1000] + [1] * (TASKS - 1)
-    looped = sum(turns.number * int(turns.end - turns.begin) for turns in task_of(length).turns(4))
+    looped = sum(turns.number * int(turns.end - turns.begin) for turns in task_of(length).turns(4, (4,)))
     assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
     assert jax.tree.leaves(task_of(length).first(3))[0].shape == (3,)
     np.testing.assert_array_equal(task_of(length).first(2).entry.count, [1000, 1])
