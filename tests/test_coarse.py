@@ -125,6 +125,7 @@ def test_float64_positions_far_from_the_origin_keep_their_centroid():
     np.testing.assert_allclose(coarse.exact_position()[0], [1e6 + 0.015, 0, 0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_thickness_of_the_image_is_kept_where_points_are_smaller_than_pixels():
     """Between the means over an image of 16 rays a pixel, of points before and after."""
     points = cluster(2000, radius=0.05)

@@ -261,6 +261,7 @@ def test_nodes_are_as_far_apart_as_supports_allow():
         assert 0 < rows < size / 8 and 0 < columns <= size / 8, "around the fluid only"
 
 
+@pytest.mark.slow
 def test_float64_orthographic_wendland(x64):
     rng = np.random.default_rng(2)
     position = rng.uniform(-1, 1, (3000, 3))

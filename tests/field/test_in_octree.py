@@ -45,6 +45,7 @@ def off(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance, float) - np.asarray(truth.transmittance, float)))
 
 
+@pytest.mark.slow
 def test_particles_and_points_by_step_doubling_are_the_reference_of_many_samples():
     """Without a word about octrees."""
     scene = js.Scene(**PARTICLES, **POINTS)
