@@ -5,7 +5,6 @@ Flow: media -> [integrator] -> composite.
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 from typing import Any, ClassVar
 
@@ -34,7 +33,7 @@ class Segment:
     thickness: Float[Array, "slabs samples rays"]
 
 
-class Integrator(abc.ABC):
+class Integrator:
     """How samples become light.
 
     What a slab does to light must not depend on what lies in front of it: slabs are marched in any order.
@@ -48,14 +47,17 @@ class Integrator(abc.ABC):
     halo: ClassVar[int] = 0
     forward_only: ClassVar[str | None] = None
 
-    @abc.abstractmethod
     def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
         """Colour of slabs, and the optical thickness of their intervals; differentiable.
 
         Args:
             optics: at the samples, of all media together; no colour counts where extinction is 0.
             path: path length of each interval.
+
+        Raises:
+            NotImplementedError: of integrators that are `forward_only`, which have a `__call__` of their own.
         """
+        raise NotImplementedError(self.forward_only or f"`{type(self).__name__}` has no `segment`: define it")
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""

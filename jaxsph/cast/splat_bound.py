@@ -44,7 +44,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsph.cast.integrator import Integrator, Optics, Segment
+from jaxsph.cast.integrator import Integrator, Segment
 from jaxsph.field.moved import Moved
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
@@ -57,14 +57,6 @@ class SplatBound(Integrator):
     """In place of each colour, how wrong light of a slab can be; in place of transmittance, G above."""
 
     forward_only = "`integrator='splat_bound'` gives bounds, which have no derivatives; differentiate `integrator='samples'`"
-
-    def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
-        """What only reverse mode asks for.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(self.forward_only)
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`."""

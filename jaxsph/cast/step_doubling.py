@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.cast.integrator import Integrator, Optics, Segment
+from jaxsph.cast.integrator import Integrator, Segment
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.fusion import fusion_barrier
@@ -76,14 +76,6 @@ class StepDoubling(Integrator):
     )
     tolerance: float = 1e-3
     samples: int = 256
-
-    def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
-        """What only reverse mode asks for: the light of samples whose number is known.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(self.forward_only)
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`. What is gathered at samples is not read.
