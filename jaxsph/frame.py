@@ -86,7 +86,7 @@ class Frame:
     ) -> Frame:
         """With the particles ranked, which is done once for all bands."""
         static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
-        static["between_samples"] = _between_samples(seen.media)
+        static["between_samples"] = _between_samples(seen.media, plan)
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
         allowed = None if limits is None else limits.tolerance
@@ -138,7 +138,7 @@ class Frame:
 
     @property
     def _beside(self) -> bool:
-        return bool(self._halo) or _between_samples(self.media)
+        return bool(self._halo) or _between_samples(self.media, self.plan)
 
     @property
     def _cast(self) -> dict[str, Any]:
@@ -186,6 +186,6 @@ class Frame:
         return run.each("adapt", decide_by_bounds, inputs, **static)
 
 
-def _between_samples(media: tuple[Medium, ...]) -> bool:
+def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:
     """Whether any medium meets spheres between samples."""
-    return any(medium.between_samples for medium in media)
+    return registry.between_samples(plan.integrator) or any(medium.between_samples for medium in media)

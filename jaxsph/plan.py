@@ -201,6 +201,7 @@ class FrameShape:
     number: int
     tuning: Tuning = CPU
     memory: int = MEMORY
+    integrator: str = "samples"
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:

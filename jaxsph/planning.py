@@ -22,6 +22,7 @@ import numpy as np
 from jaxsph.access.host_sorting import depth_order
 from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures, measure
+from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
@@ -73,18 +74,21 @@ def plan(
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, Clock())
+    seen = see(scene, camera, shape, Clock())
     measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     return made if like is None else like.grown(made)
 
 
-def see(scene: Scene, camera: Camera, samples: int, capacity: int, num_classes: int, run: Executor) -> Seen:
-    """Have the scene viewed, with its particles padded to a capacity."""
+def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -> Seen:
+    """Have the scene viewed, with its particles padded to the capacity of a frame."""
+    capacity = sizes.num_particles
     if not scene.point_sets and scene.particle_set.capacity < capacity:
         scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particle_set,), capacity=capacity))
-    seen: Seen = run.one("grid", view_scene, (scene, camera), samples=samples, capacity=capacity, num_classes=num_classes)
+    between = bool(scene.point_sets) or registry.between_samples(sizes.integrator)
+    static = {"samples": sizes.samples, "num_classes": sizes.num_classes, "between_samples": between}
+    seen: Seen = run.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
     return seen.with_data(scene)
 
 
@@ -117,7 +121,7 @@ class Plans:
         settings = along_rays(scene, settings)
         shape = self._similar(shape_of(spheres_of(scene), camera, settings))
         run.mark("plan")
-        seen = see(scene, camera, shape.samples, shape.num_particles, shape.num_classes, run)
+        seen = see(scene, camera, shape, run)
         seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
         choices = choose(measures, settings)
         needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
@@ -180,7 +184,8 @@ def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameS
     number = np.dtype(particles.dtype).itemsize
     size = camera.width, camera.height, settings.samples
     classes = _num_classes(np.asarray(particles.support)[valid])
-    return FrameShape(*size, capacity, classes, headroom, number, tuning_for(particles.support), memory_for(particles.support))
+    machine = tuning_for(particles.support), memory_for(particles.support)
+    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)
 
 
 def _num_classes(support: Any) -> int:

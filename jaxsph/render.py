@@ -103,7 +103,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     else:
         plan.check(scene, camera, settings)
         clock.mark("plan")
-        seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, clock)
+        seen = see(scene, camera, plan, clock)
     draw = functools.partial(_draw, seen, camera, settings, plan, scene.formulas)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
@@ -150,7 +150,7 @@ def _draw(
 
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
     run = Traced()
-    seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
+    seen = see(scene, camera, plan, run)
     frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
     if plan.quadtree is not None:
         return _refined_traced(frame, seen, settings, run)

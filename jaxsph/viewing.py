@@ -46,15 +46,15 @@ class Seen(NamedTuple):
 
 
 @compiled_quickly
-@functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes"))
-def view_scene(scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int) -> Seen:
+@functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes", "between_samples"))
+def view_scene(scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
     dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     if transfer is not None:
         quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
         particles = dataclasses.replace(particles, quantity=quantity)
-    depths = sphere_depths(camera, dtype, samples, bool(scene.point_sets))
+    depths = sphere_depths(camera, dtype, samples, between_samples)
     viewed = view_particles(particles, camera, depths, num_classes)
     media = _media(scene, camera)
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))

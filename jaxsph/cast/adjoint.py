@@ -37,6 +37,7 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.mixture import Mixture
 from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer_means import MeanTables
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
 
@@ -137,7 +138,9 @@ def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted:
     media = tuple(medium.in_band(grid) for medium in inputs.media)
     if inputs.transfer is None:
         return media
-    return ParticleMedium(grid, inputs.transfer.segments(), fixed.lattice, method.kernel, wanted), *media
+    segments = inputs.transfer.segments()
+    tables = MeanTables.of(segments) if method.integrator.between else None
+    return ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), *media
 
 
 def _moved(
@@ -223,8 +226,8 @@ def _pull(
     plan = method.plan.of_shard(2)  # as twice as much is held of each slab
     grid, camera = _seen(inputs, fixed)
     packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
-    on_borders = bool(method.integrator.halo)
-    how = camera.is_perspective, on_borders, fixed.min_transmittance
+    integrator = method.integrator
+    how = camera.is_perspective, bool(integrator.halo), fixed.min_transmittance, integrator.between
     batches = batches_of(grid, fixed.schedule, packets, plan, *how)
     dtype = grid.half_steps.dtype
     medium = Mixture.of(media, method.mix)
@@ -309,7 +312,7 @@ class _Backward:
 
     def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
         """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
-        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.optics(gathered, task), task.path())
+        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.met(gathered, task), task.path())
         of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
         return of_optics, of_path
 

@@ -90,6 +90,7 @@ class Batches:
         order: the items of `compacted`, and dummies up to a whole batch.
         on_borders: whether samples lie on the borders between what they stand for, one more than else.
         min_transmittance: rays end below it; None where they go on to their ends.
+        between: whether media are asked for means between samples.
     """
 
     schedule: SlabSchedule
@@ -101,6 +102,7 @@ class Batches:
     perspective: bool
     on_borders: bool
     min_transmittance: Float[Array, ""] | None = None
+    between: bool = False
 
     @property
     def num_packets(self) -> int:
@@ -170,7 +172,7 @@ class Batches:
         depth, border = self._depths(entry, slab, self.half_steps)
         u, v = self.packets.u[:, packet].T, self.packets.v[:, packet].T
         bundle = packet if self.packets.list_id is None else self.packets.list_id[packet]
-        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective, self.packets.scattered)
+        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective, self.packets.scattered, self.between)
 
     def borders(self, items: Int[Array, " some"]) -> Float[Array, "some samples_and_one"]:
         """Depths of the borders of items' samples."""
@@ -214,6 +216,7 @@ def batches_of(
     perspective: bool,
     on_borders: bool = False,
     min_transmittance: Float[Array, ""] | None = None,
+    between: bool = False,
 ) -> Batches:
     """The batches that a `schedule` of bundles is marched in, by packets that read the bundles' lists."""
     schedule = packets.schedule_of(schedule)
@@ -221,7 +224,7 @@ def batches_of(
     compacted = compact(schedule.filled)
     order = jnp.pad(compacted.item, (0, plan.batch_slabs), constant_values=slabs * num_packets)
     half_steps = with_room(grid.half_steps, grid.samples, slabs, plan)
-    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, on_borders, min_transmittance)
+    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, on_borders, min_transmittance, between)
 
 
 def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Array:

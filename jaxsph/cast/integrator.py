@@ -41,17 +41,20 @@ class Integrator:
     Attributes:
         halo: 0 where samples are the middles of what they stand for; 1 where they lie on the borders, both ends included, so that
             neighbouring slabs share one.
+        between: whether it is given means over the intervals between samples (`Medium.means`), which lie on borders; else optics
+            at samples.
         forward_only: what is said where reverse mode is asked for; None where there is that.
     """
 
     halo: ClassVar[int] = 0
+    between: ClassVar[bool] = False
     forward_only: ClassVar[str | None] = None
 
     def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
         """Colour of slabs, and the optical thickness of their intervals; differentiable.
 
         Args:
-            optics: at the samples, of all media together; no colour counts where extinction is 0.
+            optics: of all media together, see `Medium.met`; no colour counts where extinction is 0.
             path: path length of each interval.
 
         Raises:
@@ -61,7 +64,7 @@ class Integrator:
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
-        color, thickness = self.segment(medium.optics(gathered, task), task.path())
+        color, thickness = self.segment(medium.met(gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
 
 

@@ -53,7 +53,7 @@ def march(
         schedule: the slabs of samples to march, by bundle.
         min_transmittance: packets all of whose rays let less through end, between batches; None for none.
     """
-    batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance)
+    batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
     together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples, integrator.halo) if ending else None
 

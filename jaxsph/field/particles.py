@@ -18,17 +18,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.access.grid import Grid
+from jaxsph.field.between import SumsBetween, intervals_between, pull_cover, pull_means
+from jaxsph.field.cover import cover_of
+from jaxsph.field.intervals import Intervals, means_of
 from jaxsph.field.lattice import Lattice
 from jaxsph.field.methods import methods_of
-from jaxsph.field.sums import Sums
+from jaxsph.field.sums import Sums, by_rays, least_weight
 from jaxsph.field.tasks import SlabTask
 from jaxsph.field.transposed import COLUMNS, WIDTH, pull_gather
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
+from jaxsph.model.transfer_means import MeanTables
 from jaxsph.numerics.fusion import fusion_barrier
 
 EXTINCTION = slice(3, 4)
-MIN_WEIGHT = 2.0**20  # times the least normal number: below it a sample has no cotangents, as one over it could overflow
 
 
 class Wanted(NamedTuple):
@@ -60,6 +63,7 @@ class ParticleMedium(Medium):
     Attributes:
         grid: where they are.
         segments: of the transfer function.
+        tables: of the same for means between samples; None where none are asked for.
         lattice: where the sums of interpolated slabs come from, if any do.
         kernel: name of the smoothing kernel.
         wanted: cotangents that `pull` is to find.
@@ -68,6 +72,7 @@ class ParticleMedium(Medium):
     at_points = False  # lists are of slabs
     grid: Grid
     segments: Segments
+    tables: MeanTables | None
     lattice: Lattice | None
     kernel: str
     wanted: Wanted
@@ -76,8 +81,17 @@ class ParticleMedium(Medium):
         """Slabs that have any particle."""
         return self.grid.windows.count > 0
 
-    def gather(self, task: SlabTask) -> Sums:
-        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule."""
+    def gather(self, task: SlabTask) -> Any:
+        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule.
+
+        Of a task between samples, moreover what supports cover of its rays.
+        """
+        if not task.between:
+            return self._sums(task)
+        sums = self._sums(task)
+        return SumsBetween(sums, cover_of(self.grid.ordered, self.grid.lists.rank, task, by_rays(sums)[0] > 0))
+
+    def _sums(self, task: SlabTask) -> Sums:
         methods = methods_of(self.grid, self.kernel, self.lattice, task.scattered)
         if len(methods) == 1 or task.entry.method is None:
             return methods[0](task)
@@ -87,7 +101,7 @@ class ParticleMedium(Medium):
 
     def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
         """Extinction, and places in the transfer function."""
-        weight, weighted = _by_rays(gathered)
+        weight, weighted = by_rays(gathered)
         inside = weight > 0
         ratio = jnp.where(inside, weighted / jnp.where(inside, weight, 1), 0)
         place = find(self.segments, task.entry.reference_quantity[:, None, None] + ratio)
@@ -99,6 +113,16 @@ class ParticleMedium(Medium):
     def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function; of super-pixels, what they are painted with."""
         return self._optics(samples, task, channels)
+
+    def intervals(self, gathered: SumsBetween, task: SlabTask) -> Intervals:
+        """Ends of the intervals between samples, in units of the quantity."""
+        return fusion_barrier(task.slab[0] >= 0, intervals_between, gathered, task)  # type: ignore[no-any-return]
+
+    def means(self, intervals: Intervals, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """See `Medium.means`: of the transfer function, over the range of the quantity in each interval."""
+        if self.tables is None:
+            raise ValueError("means between samples need `tables`, made with `MeanTables.of`")
+        return means_of(self.tables, intervals, channels)
 
     def _optics(self, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
         optics, entry = read(self.segments, place, channels), task.entry
@@ -114,9 +138,11 @@ class ParticleMedium(Medium):
         return ParticleCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), jnp.zeros((5, control_points), x.dtype))
 
     def pull(  # type: ignore[override]
-        self, total: ParticleCotangents, gathered: Sums, task: SlabTask, cotangents: list[Array]
+        self, total: ParticleCotangents, gathered: Any, task: SlabTask, cotangents: list[Array]
     ) -> tuple[ParticleCotangents, OfPlaces]:
         """See `Medium.pull`. What is interpolated or painted has none."""
+        if task.between:
+            return self._pull_between(total, gathered, task, cotangents)
         samples = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
         if self.wanted.transfer:
             total = total._replace(transfer=total.transfer + pull_control_points(samples, self.segments))
@@ -129,6 +155,23 @@ class ParticleMedium(Medium):
             of_depth = of_depth + found.lateral / task.depth.T
         places = OfPlaces(of_depth.T, jnp.zeros_like(task.border), found.lateral.sum())
         return total._replace(table=found.table), places
+
+    def _pull_between(
+        self, total: ParticleCotangents, gathered: SumsBetween, task: SlabTask, cotangents: list[Array]
+    ) -> tuple[ParticleCotangents, OfPlaces]:
+        """Through the means of intervals, then through sums and borders."""
+        ordered, rank = self.grid.ordered, self.grid.lists.rank
+        found = fusion_barrier(task.slab[0] >= 0, pull_means, gathered, self.segments, task, cotangents)
+        if self.wanted.transfer:
+            transfer = jnp.concatenate([found.transfer.colors.T, found.transfer.extinction[None], found.transfer.values[None]])
+            total = total._replace(transfer=total.transfer + transfer)
+        if not self.wanted.field:
+            return total, OfPlaces.none(task)
+        of_sums = pull_gather(total.table, ordered, rank, task, (found.weight, found.weighted), self.kernel)
+        of_depth = of_sums.along + (of_sums.lateral / task.depth.T if task.perspective else 0)
+        table, factor = pull_cover(of_sums.table, ordered, rank, task, gathered, found.cover)
+        places = OfPlaces(of_depth.T + found.depth, jnp.zeros_like(task.border), of_sums.lateral.sum() + factor)
+        return total._replace(table=table), places
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +193,7 @@ class SampleCotangents:
 
 def pull_look_up(sums: Sums, segments: Segments, task: SlabTask, cotangents: list[Array]) -> SampleCotangents:
     """From cotangents of optics to those of the sums that they were looked up by."""
-    weight, weighted = _by_rays(sums)
+    weight, weighted = by_rays(sums)
     inside = weight > 0
     inverse = 1 / jnp.where(inside, weight, 1)
     ratio = jnp.where(inside, weighted * inverse, 0)
@@ -158,7 +201,7 @@ def pull_look_up(sums: Sums, segments: Segments, task: SlabTask, cotangents: lis
     slopes = jax.jvp(lambda q: look_up(segments, q), (quantity,), (jnp.ones_like(quantity),))[1]
     of_optics = [jnp.where(inside, value, 0) for value in cotangents]
     of_quantity = sum(value * slope for value, slope in zip(of_optics, slopes, strict=True))
-    solid = weight > MIN_WEIGHT * jnp.finfo(weight.dtype).tiny
+    solid = weight > least_weight(weight.dtype)
     of_weighted = jnp.where(solid, of_quantity * inverse, 0)
     return SampleCotangents(-ratio * of_weighted, of_weighted, of_optics, of_quantity, quantity)
 
@@ -182,13 +225,9 @@ def pull_control_points(samples: SampleCotangents, segments: Segments) -> Float[
     return added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
 
 
-def _by_rays(sums: Sums) -> list[Float[Array, "tasks samples rays"]]:
-    """The sum of weights and that of the one quantity, rays in a row: short rows do not vectorise."""
-    rows = tuple(value.reshape(*value.shape[:2], -1) for value in sums.packed)
-    return list(dataclasses.replace(sums, packed=rows).all)
-
-
-jax.tree_util.register_dataclass(ParticleMedium, data_fields=["grid", "segments", "lattice"], meta_fields=["kernel", "wanted"])
+jax.tree_util.register_dataclass(
+    ParticleMedium, data_fields=["grid", "segments", "tables", "lattice"], meta_fields=["kernel", "wanted"]
+)
 jax.tree_util.register_dataclass(
     SampleCotangents, data_fields=[field.name for field in dataclasses.fields(SampleCotangents)], meta_fields=[]
 )

@@ -130,7 +130,7 @@ class PointsMedium(Medium):
 
     def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], ...]:
         """Thickness of all intervals, and thickness times red, green and blue."""
-        sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
+        sums = sums_of([jnp.zeros(task.between_shape, self.table.dtype)] * 4)
         for turns in task.turns(BLOCK, PARTS):
             add = functools.partial(self._add, turns.task)
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
@@ -165,6 +165,17 @@ class PointsMedium(Medium):
         inverse = jnp.where(thickness > 0, 1 / jnp.where(thickness > 0, thickness, 1), 0)
         return [value * inverse for value in weighed[channels]]
 
+    def intervals(self, gathered: tuple[Array, ...], task: SlabTask) -> tuple[Array, ...]:
+        """What was gathered is of intervals."""
+        return gathered
+
+    def means(self, intervals: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """See `Medium.means`: exact, as what is laid into an interval is."""
+        thickness, *weighed = intervals
+        path = task.path()
+        inverse = jnp.where(path > 0, 1 / jnp.where(path > 0, path, 1), 0)
+        return [value * inverse for value in [*weighed, thickness][channels]]
+
     def moved(self, task: SlabTask) -> Moved | None:
         """Of those points whose thickness is not laid along chords.
 
@@ -178,7 +189,7 @@ class PointsMedium(Medium):
             raise ValueError(
                 f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums"
             )
-        sums = Moved(*(jnp.zeros(task.shape, self.table.dtype) for _ in Moved._fields))
+        sums = Moved(*(jnp.zeros(task.between_shape, self.table.dtype) for _ in Moved._fields))
 
         def add(nth: Array, sums: Moved, task: SlabTask) -> Moved:
             def found(nth: Array) -> Moved:

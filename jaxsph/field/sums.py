@@ -9,6 +9,7 @@ complex number there, and are taken apart where they are read; elsewhere each is
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.fusion import barriers_kept
+
+MIN_WEIGHT = 2.0**20  # times the least normal number
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +57,27 @@ def sums_of(channels: list[Float[Array, "..."]]) -> Sums:
         return Sums(tuple(channels), number)
     seconds = [*channels[1::2], jnp.zeros_like(channels[0])]
     return Sums(tuple(lax.complex(*pair) for pair in zip(channels[::2], seconds, strict=False)), number)
+
+
+def together_of(first: Array, second: Array) -> Any:
+    """Two arrays as one where that makes one kernel of them: as a complex number, see the head of this file."""
+    return lax.complex(first, second) if barriers_kept() else (first, second)
+
+
+def apart_of(pair: Any) -> tuple[Array, Array]:
+    """The two arrays again."""
+    return (pair.real, pair.imag) if barriers_kept() else pair
+
+
+def by_rays(sums: Sums) -> list[Float[Array, "tasks samples rays"]]:
+    """The sum of weights and that of the one quantity, rays in a row: short rows do not vectorise."""
+    rows = tuple(value.reshape(*value.shape[:2], -1) for value in sums.packed)
+    return list(dataclasses.replace(sums, packed=rows).all)
+
+
+def least_weight(dtype: Any) -> float:
+    """The sum of weights below which a sample has no cotangents, as one over it could overflow."""
+    return float(MIN_WEIGHT * jnp.finfo(dtype).tiny)
 
 
 jax.tree_util.register_dataclass(Sums, data_fields=["packed"], meta_fields=["num_quantities"])

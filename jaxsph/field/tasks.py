@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +84,7 @@ class SlabTask:
         border: view depths of the borders of what samples stand for.
         perspective: whether rays spread with depth.
         scattered: whether u and v are of rays, see `RayPackets`.
+        between: whether what is asked for are means of the intervals between samples, which then lie on borders.
     """
 
     entry: SlabSchedule
@@ -95,12 +96,19 @@ class SlabTask:
     border: Float[Array, "tasks samples_and_one"]
     perspective: bool
     scattered: bool = False
+    between: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Tasks, samples of each, and rays."""
         rows = 1 if self.scattered else self.v.shape[1]
         return self.depth.shape[0], self.depth.shape[1], rows * self.u.shape[1]
+
+    @property
+    def between_shape(self) -> tuple[int, int, int]:
+        """Tasks, intervals between borders, and rays."""
+        tasks, _, rays = self.shape
+        return tasks, self.border.shape[1] - 1, rays
 
     def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """View coordinates x, y, z of all samples."""
@@ -148,9 +156,16 @@ class SlabTask:
 
     def first(self, number: int) -> SlabTask:
         """The first so many slabs."""
-        entry = jax.tree.map(lambda leaf: leaf[..., :number], self.entry)
+        return self._some(slice(number))
+
+    def at(self, items: Int[Array, " some"]) -> SlabTask:
+        """Those slabs of it."""
+        return self._some(items)
+
+    def _some(self, chosen: Any) -> SlabTask:
+        entry = jax.tree.map(lambda leaf: leaf[..., chosen], self.entry)
         names = "slab", "bundle", "u", "v", "depth", "border"
-        return dataclasses.replace(self, entry=entry, **{name: getattr(self, name)[:number] for name in names})
+        return dataclasses.replace(self, entry=entry, **{name: getattr(self, name)[chosen] for name in names})
 
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
@@ -187,5 +202,5 @@ jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "
 jax.tree_util.register_dataclass(
     SlabTask,
     data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border"],
-    meta_fields=["perspective", "scattered"],
+    meta_fields=["perspective", "scattered", "between"],
 )

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.model.camera import Camera
 from jaxsph.numerics import faults
 
-COLORS = slice(0, 3)
+COLORS, LIGHT = slice(0, 3), slice(0, 4)
 Total = TypeVar("Total")
 
 
@@ -107,6 +107,25 @@ class Medium(abc.ABC):
         extinction, samples = self.extinction(gathered, task)
         return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
 
+    def intervals(self, gathered: Any, task: Any) -> Any:
+        """What `means` reads, found once; by default red, green, blue and extinction at the samples, which lie on borders."""
+        return self.optics(gathered, task)
+
+    def means(self, intervals: Any, task: Any, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """Means over the intervals between samples, of emission in red, green and blue and of extinction, a unit length.
+
+        Emission is colour times extinction. By default both are linear from sample to sample.
+        """
+        *colors, extinction = intervals
+        light = [*(jnp.where(extinction > 0, color * extinction, 0) for color in colors), extinction]
+        return [0.5 * (value[:, :-1] + value[:, 1:]) for value in light[channels]]
+
+    def met(self, gathered: Any, task: Any) -> list[Array]:
+        """What an integrator makes light of: `optics` at samples or, of a task that is `between` them, all `means`."""
+        if task.between:
+            return self.means(self.intervals(gathered, task), task, LIGHT)
+        return self.optics(gathered, task)
+
     def moved(self, task: Any) -> Any:
         """What is laid elsewhere along rays than it is, summed for intervals (`field.moved.Moved`); by default nothing."""
         return None
@@ -116,7 +135,7 @@ class Medium(abc.ABC):
         return jax.tree.map(jnp.zeros_like, self)
 
     def pull(self, total: Total, gathered: Any, task: Any, cotangents: list[Array]) -> tuple[Total, OfPlaces]:
-        """Cotangents of red, green, blue and extinction at samples, pulled back.
+        """Cotangents of what is `met`, pulled back: of red, green, blue and extinction at samples, or of means.
 
         By default by differentiating `gather`, `extinction` and `colors`.
 
@@ -131,7 +150,7 @@ class Medium(abc.ABC):
             moved = dataclasses.replace(
                 task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor
             )
-            return medium.optics(medium.gather(moved), moved)
+            return medium.met(medium.gather(moved), moved)
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
         of_medium, of_places = jax.vjp(optics, self, there)[1](cotangents)

@@ -63,6 +63,15 @@ class Mixture(Medium):
         extinctions = [extinction for extinction, _ in samples]
         return mixed_colors(colors, extinctions, None if self.mix == "extinction" else task.path())
 
+    def intervals(self, gathered: tuple[Any, ...], task: Any) -> tuple[Any, ...]:
+        """Of each."""
+        return tuple(medium.intervals(one, task) for medium, one in zip(self.media, gathered, strict=True))
+
+    def means(self, intervals: tuple[Any, ...], task: Any, channels: slice) -> Optics:
+        """Sums, of emission as of extinction: the limit of either mix for short intervals."""
+        found = [medium.means(one, task, channels) for medium, one in zip(self.media, intervals, strict=True)]
+        return [mixed_extinction(list(of_channel)) for of_channel in zip(*found, strict=True)]
+
     def moved(self, task: Any) -> Any:
         """Of all that move anything."""
         moving = [moved for medium in self.media if (moved := medium.moved(task)) is not None]
@@ -78,6 +87,8 @@ class Mixture(Medium):
         """See `Medium.pull`: through the mixing by `jax.vjp`, then through each medium as it does."""
 
         def mixed(optics: list[Optics], path: Array) -> Optics:
+            if task.between:
+                return [mixed_extinction(list(of_channel)) for of_channel in zip(*optics, strict=True)]
             extinctions = [of_one[3] for of_one in optics]
             colors = mixed_colors([of_one[:3] for of_one in optics], extinctions, None if self.mix == "extinction" else path)
             return [*colors, mixed_extinction(extinctions)]
@@ -85,7 +96,7 @@ class Mixture(Medium):
         def path(border: Array, factor: Array) -> Array:
             return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()  # type: ignore[no-any-return]
 
-        optics = [medium.optics(one, task) for medium, one in zip(self.media, gathered, strict=True)]
+        optics = [medium.met(one, task) for medium, one in zip(self.media, gathered, strict=True)]
         of_optics, of_path = jax.vjp(mixed, optics, task.path())[1](cotangents)
         places = OfPlaces.none(task)
         if self.mix != "extinction":

@@ -13,6 +13,7 @@ from typing import Any
 
 INTEGRATORS = {
     "samples": "jaxsph.cast.samples:PointSamples",
+    "segments": "jaxsph.cast.segments:Segments",
     "step_doubling": "jaxsph.cast.step_doubling:StepDoubling",
     "splat_bound": "jaxsph.cast.splat_bound:SplatBound",
 }
@@ -26,6 +27,12 @@ SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel", "quadtree": "jaxsph.scre
 def integrator(name: str, *arguments: Any) -> Any:
     """The integrator of that name, made with arguments if it takes any: one object a process, so that it may be static."""
     return _made(INTEGRATORS[name], *arguments)
+
+
+def between_samples(name: str) -> bool:
+    """Whether the integrator of that name has media tell of what lies between samples, too."""
+    module, _, kind = INTEGRATORS[name].partition(":")
+    return bool(getattr(importlib.import_module(module), kind).between)
 
 
 def screen(name: str) -> Any:

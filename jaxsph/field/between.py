@@ -1,0 +1,134 @@
+"""Particles between samples: from their sums at samples, and borders of supports, to the ends of intervals; and back.
+
+Flow: gather, cover -> [between] -> intervals -> media; cotangents of means -> [between] -> transposed.
+
+What is made of the ends of intervals has cotangents by the sums at samples, and by the borders: those depend on the one particle
+that makes each of them, which is found again by its place in the windows of its slab.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsph.access.ordering import Ordered
+from jaxsph.field.cover import Cover, Ends, ends_of, over_groups
+from jaxsph.field.fetch import particle_at
+from jaxsph.field.intervals import Intervals, intervals_of, means_of
+from jaxsph.field.sums import Sums, by_rays, least_weight
+from jaxsph.field.tasks import SlabTask
+from jaxsph.field.transposed import COLUMNS, WIDTH
+from jaxsph.model.transfer import Segments, TransferFunction
+from jaxsph.model.transfer_means import MeanTables
+
+GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives
+
+
+class SumsBetween(NamedTuple):
+    """Sums at samples, and what supports cover of rays."""
+
+    sums: Sums
+    cover: Cover
+
+
+class MeanCotangents(NamedTuple):
+    """Of sums and depths of samples, of borders, and of the transfer function."""
+
+    weight: Float[Array, "tasks samples rays"]
+    weighted: Float[Array, "tasks samples rays"]
+    cover: Cover
+    depth: Float[Array, "tasks samples"]
+    transfer: TransferFunction
+
+
+def intervals_between(gathered: SumsBetween, task: SlabTask) -> Intervals:
+    """Ends of the intervals between samples, in units of the quantity."""
+    weight, weighted = by_rays(gathered.sums)
+    return _intervals(weight, weighted, gathered.cover, task.depth, task)
+
+
+def _intervals(weight: Array, weighted: Array, cover: Cover, depth: Array, task: SlabTask) -> Intervals:
+    inside, solid = weight > 0, weight > least_weight(weight.dtype)
+    still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
+    ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
+    near, far, share = intervals_of(ratio, inside, cover, depth)
+    reference = task.entry.reference_quantity[:, None, None]
+    return Intervals(reference + near, reference + far, share)
+
+
+def pull_means(gathered: SumsBetween, segments: Segments, task: SlabTask, cotangents: list[Array]) -> MeanCotangents:
+    """From cotangents of means of emission and extinction to those of what they were made of."""
+
+    def means(weight: Array, weighted: Array, cover: Cover, depth: Array, transfer: TransferFunction) -> list[Array]:
+        return means_of(MeanTables.of(transfer.segments()), _intervals(weight, weighted, cover, depth, task), slice(0, 4))
+
+    transfer = TransferFunction(segments.start, segments.base[:3].T, segments.base[3])
+    given = *by_rays(gathered.sums), gathered.cover, task.depth, transfer
+    return MeanCotangents(*jax.vjp(means, *given)[1](cotangents))
+
+
+def pull_cover(
+    table: Float[Array, "particles 8"],
+    ordered: Ordered,
+    rank: Int[Array, " pairs"],
+    task: SlabTask,
+    gathered: SumsBetween,
+    of_cover: Cover,
+) -> tuple[Float[Array, "particles 8"], Float[Array, ""]]:
+    """Add to `table` the cotangents of particles by the borders that they make; and that of a common factor of u and v."""
+    inside = by_rays(gathered.sums)[0] > 0
+
+    def pull_some(items: Array, some: SlabTask, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        table, factor = carry
+        here = jnp.minimum(items, inside.shape[0] - 1)
+        places = ends_of(ordered, rank, some, gathered.cover.pivot[here], "place")
+        for piece in range(2):
+            mine = Ends(*(value[piece] for value in places))
+            cotangent = Ends(*(value[piece, here] for value in of_cover[:4]))
+            for sign, end, place, of_end, of_quantity in (
+                (-1, mine.front, mine.of_front, cotangent.front, cotangent.of_front),
+                (1, mine.back, mine.of_back, cotangent.back, cotangent.of_back),
+            ):
+                found = (jnp.abs(end) < jnp.finfo(end.dtype).max) & (items < inside.shape[0])[:, None]
+                given = jnp.where(found, of_end, 0), jnp.where(found, of_quantity, 0)
+                table, more = _pull_end(table, ordered, rank, some, place.astype(jnp.int32), sign, given)
+                factor = factor + more
+        return table, factor
+
+    return over_groups(pull_some, (table, jnp.zeros((), table.dtype)), task, inside)
+
+
+def _pull_end(
+    table: Array, ordered: Ordered, rank: Array, task: SlabTask, place: Array, sign: int, cotangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The same of one end of a piece of each ray, made by the particle at a `place` in the windows."""
+    entry = task.entry
+    particle, _ = particle_at(rank, entry.begin[..., None], entry.length[..., None], place)
+    columns = tuple(getattr(ordered, name)[particle] for name in COLUMNS[:5])
+
+    def end(columns: tuple[Array, ...], factor: Array) -> Array:
+        return chord_end(columns, dataclasses.replace(task, u=task.u * factor, v=task.v * factor), sign)
+
+    of_end, of_quantity = cotangents
+    of_columns, factor = jax.vjp(end, columns, jnp.ones((), table.dtype))[1](of_end)
+    row = jnp.stack([*of_columns, of_quantity, *[jnp.zeros_like(of_quantity)] * (WIDTH - len(COLUMNS))], -1)
+    return table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds"), factor
+
+
+def chord_end(columns: tuple[Array, ...], task: SlabTask, sign: int) -> Float[Array, "tasks rays"]:
+    """Depth at which each ray enters (`sign` -1) or leaves (1) a support of its own: x, y, z, scale and size (tasks, rays)."""
+    (x, y, z, scale, size), (u, v) = columns, task.ray_coordinates()
+    middle = jax.lax.stop_gradient(0.5 * (task.border[:, :1] + task.border[:, -1:]))
+    slopes, lateral = ((u, v), middle) if task.perspective else ((jnp.zeros_like(u), jnp.zeros_like(v)), 1.0)
+    x, y, z = x - u * lateral, y - v * lateral, z - middle
+    inverse = 1 / (1 + slopes[0] ** 2 + slopes[1] ** 2)
+    along = x * slopes[0] + y * slopes[1] + z
+    square = (size / jnp.where(scale > 0, scale, 1)) ** 2
+    inner = square - (x * x + y * y + z * z) + along * along * inverse
+    solid = inner > GRAZING * jnp.finfo(square.dtype).eps * square
+    half = jnp.where(solid, jnp.sqrt(jnp.where(solid, inner, 1) * inverse), 0)
+    return middle + along * inverse + sign * half

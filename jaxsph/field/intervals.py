@@ -1,0 +1,72 @@
+r"""The field of particles between samples: linear from one to the next, and from a border to the sample that it is next to.
+
+Flow: sums at samples, cover -> [intervals] -> media.
+
+An interval whose two ends are inside of supports is taken to be so all along. Where one end is inside, it is so as far as the
+cover's piece goes that this end is of, and the field is linear between that end and what it is at the border, the quantity of the
+particle that makes it. Where neither is, a whole piece may lie between them. What pieces that are not connected leave open counts
+as half of an interval: an estimate, as rare as two borders more in a few samples of one ray.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.field.cover import Cover
+from jaxsph.model.transfer_means import MeanTables, mean_emission, mean_extinction
+
+LIGHT, EXTINCTION = range(4), 3  # channels: red, green, blue, extinction
+BESIDE = 1e-3  # of an interval that rounding may move a border out of it
+
+
+class Intervals(NamedTuple):
+    """Of each interval, the field where it begins and ends, and what share of it is inside of supports.
+
+    Where all is, `near` and `far` are those of samples; else those of where the inner part begins and ends.
+    """
+
+    near: Float[Array, "tasks intervals rays"]
+    far: Float[Array, "tasks intervals rays"]
+    share: Float[Array, "tasks intervals rays"]
+
+
+def intervals_of(
+    quantity: Float[Array, "tasks samples rays"],
+    inside: Bool[Array, "tasks samples rays"],
+    cover: Cover,
+    depth: Float[Array, "tasks samples"],
+) -> Intervals:
+    """Intervals between samples of slabs.
+
+    Args:
+        quantity: at samples, relative to what that of the cover is.
+    """
+    begin, end = depth[:, :-1, None], depth[:, 1:, None]
+    length = end - begin
+    behind = begin >= cover.pivot[:, None]
+    front, back, of_front, of_back = (jnp.where(behind, both[1][:, None], both[0][:, None]) for both in cover[:4])
+    first, second = inside[:, :-1], inside[:, 1:]
+    slack = BESIDE * length
+    begins = (front >= begin - slack) & (front <= end + slack)
+    ends = (back >= begin - slack) & (back <= end + slack)
+    inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 0)
+    ahead = jnp.where(begins, jnp.clip((front - begin) * inverse, 0, 1), jnp.where(first, 0, 0.5))
+    past = jnp.where(ends, jnp.clip((end - back) * inverse, 0, 1), jnp.where(second, 0, 0.5))
+    ahead, past = jnp.where(first, 0, ahead), jnp.where(second, 0, past)
+    hidden = ~first & ~second & ~(begins & ends)
+    share = jnp.where(hidden, 0, jnp.maximum(1 - ahead - past, 0))
+    at_front = jnp.where(begins, of_front, jnp.where(second, quantity[:, 1:], 0))
+    at_back = jnp.where(ends, of_back, jnp.where(first, quantity[:, :-1], 0))
+    return Intervals(jnp.where(first, quantity[:, :-1], at_front), jnp.where(second, quantity[:, 1:], at_back), share)
+
+
+def means_of(tables: MeanTables, intervals: Intervals, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+    """Means of emission in red, green and blue and of extinction, a unit length, of those that `channels` selects."""
+    near, far, share = intervals
+    begin, end, _ = channels.indices(len(LIGHT))
+    found = mean_emission(tables, near, far, slice(begin, min(end, EXTINCTION))) if begin < EXTINCTION else []
+    found += [mean_extinction(tables, near, far)] if end > EXTINCTION else []
+    return [jnp.where(share > 0, share * mean, 0) for mean in found]
