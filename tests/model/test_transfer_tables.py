@@ -1,0 +1,18 @@
+"""Promises of the tables that means are read from."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model.transfer_tables import MeanTables, integral_between
+
+
+@pytest.mark.parametrize("count", [40, 200])
+def test_a_huge_integral_before_does_not_spoil_those_behind(count):
+    extinction = np.full(count, 0.1)
+    extinction[3] = 1e9
+    values = np.sort(np.random.default_rng(1).uniform(0.5, 0.99, count))
+    transfer = js.TransferFunction.from_points(values, np.zeros((count, 3)), extinction)
+    got = integral_between(MeanTables.of(transfer.segments()), 3, np.arange(10, 20), np.arange(12, 22))
+    values = np.asarray(transfer.values, np.float64)
+    np.testing.assert_allclose(got, 0.1 * (values[12:22] - values[11:21]), rtol=1e-5)
