@@ -70,8 +70,11 @@ def of_band(band: OfShards, *, plan: Plan) -> Layers:
         return lists.as_image(jnp.broadcast_to(value[:, None, None], (lists.num_bundles, BUNDLE, BUNDLE)))
 
     levels = None if verdict.levels is None else lists.as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
-    color, transmittance, depth = pixels
-    return Layers(color, transmittance, depth, over_pixels(spent), over_pixels(verdict.bound), over_pixels(verdict.full), levels)
+    bound = over_pixels(verdict.bound)
+    if band.cast[0].rays.error is not None:
+        error = unshard(tuple(shard.rays.error for shard in band.cast), 0)
+        bound = registry.screen(plan.screen).resolve(RayResult(color, error, depth), lists)[1]
+    return Layers(*pixels, over_pixels(spent), bound, over_pixels(verdict.full), levels)
 
 
 def crop(bands: Layers, plan: Plan) -> Layers:

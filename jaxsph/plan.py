@@ -22,7 +22,7 @@ from jaxsph.measures import Measures
 from jaxsph.memory_estimate import frame_bytes, quadtree_bytes
 from jaxsph.model.camera import Camera, num_nodes
 from jaxsph.model.particles import capacity_class
-from jaxsph.model.registry import AT_POINTS
+from jaxsph.model.registry import AT_POINTS, ESTIMATING
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.spheres import num_spheres
@@ -35,6 +35,7 @@ MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
+FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -106,7 +107,7 @@ class Plan:
         given = {
             "camera.width": (camera.width, self.width),
             "camera.height": (camera.height, self.height),
-            "settings.samples": (settings.samples, self.samples),
+            "settings.samples": (first_samples(settings), self.samples),
             "settings.integrator": (settings.integrator, self.integrator),
             "settings.screen": (settings.screen, self.screen),
             "settings.step_tolerance": (_step_tolerance(settings), self.step_tolerance),
@@ -117,6 +118,9 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
+        if is_refined(settings) != bool(self.cast.doublings):
+            kind = "a tolerance" if self.cast.doublings else "no tolerance (`tolerance=None`)"
+            raise ValueError(f"`plan` was made for {kind}, but settings ask for the other; make a new one with `jaxsph.plan`")
         wanted = _kind(settings)
         if wanted != _kind_of(self.control):
             raise ValueError(
@@ -243,6 +247,7 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
     lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
+    cast = dataclasses.replace(cast, doublings=DOUBLINGS if is_refined(settings) else 0)
     room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
@@ -288,7 +293,7 @@ def _control_plan(settings: Settings, choices: Choices, room: tuple[int, int]) -
 
 def _kind(settings: Settings) -> ControlPlan | type[PilotPlan] | None:
     """The kind of error control that settings ask for, whatever the frame."""
-    if settings.tolerance is None:
+    if settings.tolerance is None or is_refined(settings):
         return None
     if settings.estimator == "pilot":
         return PilotPlan
@@ -350,6 +355,16 @@ def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) ->
     return CastPlan(chunk, slab_samples, min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk), tuning)
 
 
+def is_refined(settings: Settings) -> bool:
+    """Whether samples are doubled where a tolerance needs it."""
+    return settings.tolerance is not None and settings.integrator in ESTIMATING
+
+
+def first_samples(settings: Settings) -> int:
+    """Samples that rays are cut by before any are doubled."""
+    return -(-settings.samples // FIRST) if is_refined(settings) else settings.samples
+
+
 def along_rays(scene: Scene, settings: Settings) -> Settings:
     """Settings of error control along rays: without a tolerance where only the screen can keep it.
 
@@ -363,7 +378,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     if settings.tolerance is None:
         return settings
     beyond = {
-        f"`integrator={settings.integrator!r}`": settings.integrator != "samples",
+        f"`integrator={settings.integrator!r}`": settings.integrator not in ("samples", *ESTIMATING),
         f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
@@ -371,7 +386,10 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     }
     if settings.screen == "quadtree":
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
+        pays = pays and settings.integrator == "samples"
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
+    if is_refined(settings) and settings.screen == "pixels":
+        return settings
     for what, asked in beyond.items():
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")

@@ -32,7 +32,7 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.plan import FrameShape, Plan, along_rays, choose, fitted, next_class
+from jaxsph.plan import FrameShape, Plan, along_rays, choose, first_samples, fitted, next_class
 from jaxsph.viewing import Seen, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -182,7 +182,7 @@ def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameS
     headroom = capacity / max(int(valid.sum()), 1)
     headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
     number = np.dtype(particles.dtype).itemsize
-    size = camera.width, camera.height, settings.samples
+    size = camera.width, camera.height, first_samples(settings)
     classes = _num_classes(np.asarray(particles.support)[valid])
     machine = tuning_for(particles.support), memory_for(particles.support)
     return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)

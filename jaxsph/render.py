@@ -196,7 +196,7 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
 
 def _certifies(plan: Plan) -> bool:
     """Whether the error can be bounded at all."""
-    return not isinstance(plan.control, PilotPlan) and plan.quadtree is None
+    return not isinstance(plan.control, PilotPlan) and plan.quadtree is None and not plan.cast.doublings
 
 
 def raise_for(word: int, planned: bool) -> None:

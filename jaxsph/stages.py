@@ -311,6 +311,7 @@ def cast_shard(
     schedule: SlabSchedule,
     lattice: Lattice | None,
     min_transmittance: Float[Array, ""] | None,
+    tolerance: Float[Array, ""] | None,
     nth: Int[Array, ""],
     *,
     shards: int,
@@ -328,9 +329,11 @@ def cast_shard(
     made = registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, min_transmittance=min_transmittance)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance)
     spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
+    if rays.refined is not None:
+        spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)
     if rays.left_out is not None:
         spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
     return Cast(rays, spent if of_nodes is None else spent + of_nodes)

@@ -82,6 +82,7 @@ class NonDiffInputs:
     lattice: Lattice | None
     chosen: Any
     min_transmittance: Float[Array, ""] | None
+    tolerance: Float[Array, ""] | None
 
 
 def cast(
@@ -94,6 +95,7 @@ def cast(
     lattice: Lattice | None = None,
     chosen: Any = None,
     min_transmittance: Float[Array, ""] | None = None,
+    tolerance: Float[Array, ""] | None = None,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
@@ -108,7 +110,7 @@ def cast(
     """
     columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
-    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance))
+    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance))
     return _cast(method, inputs, fixed)
 
 
@@ -122,7 +124,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
         medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
-        how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance
+        how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance, fixed.tolerance
         return march(grid, fixed.schedule, packets, *how)
 
 

@@ -36,6 +36,7 @@ class CastPlan:
         chunk: slabs marched together.
         slab_samples: samples that share a window of particles.
         batch_slabs: slabs whose light is held before it is composited; a multiple of `chunk`.
+        doublings: how often the samples of a slab can be doubled, for a tolerance.
         tuning: for the kind of machine that marches.
     """
 
@@ -43,9 +44,10 @@ class CastPlan:
     slab_samples: int
     batch_slabs: int
     tuning: Tuning = CPU
+    doublings: int = 0
 
     def __post_init__(self) -> None:
-        require_sizes(self)
+        require_sizes(self, zero=("doublings",))
         if self.batch_slabs % self.chunk:
             raise ValueError(f"`batch_slabs` must be a multiple of `chunk`, got {self.batch_slabs} and {self.chunk}")
 
@@ -128,7 +130,7 @@ class Batches:
         method = None if self.schedule.method is None else self.schedule.method.ravel()[inside]
         number = real.sum(dtype=jnp.int32)
         wanted = real if ended is None else real & ~ended[inside % self.num_packets]
-        order = _by_fullness(self.schedule.count.ravel()[inside], method, wanted)
+        order = by_fullness(self.schedule.count.ravel()[inside], method, wanted)
         place, end = self._slots(method, wanted, wanted.sum(dtype=jnp.int32))
         slot = jnp.zeros(self.plan.batch_slabs, jnp.int32).at[order].set(place)
         marched = jnp.full(self.num_slots, dummy, jnp.int32).at[place].set(jnp.where(wanted, items, dummy)[order])
@@ -232,7 +234,7 @@ def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Ar
     return jnp.pad(half_steps, (0, 2 * ((slabs + 1) * plan.slab_samples - samples)), mode="edge")
 
 
-def _by_fullness(
+def by_fullness(
     count: Int[Array, " batch"], method: Int[Array, " batch"] | None, real: Bool[Array, " batch"]
 ) -> Int[Array, " batch"]:
     """Slabs in order of method if any, then of how many blocks of particles they have; those that are not `real` last.

@@ -54,24 +54,27 @@ class RayState:
         color: red, green and blue met so far, premultiplied.
         transmittance: of all that was met so far.
         depth: where that fell to one half, infinite where it has not.
+        square: sum of the squared errors that slabs are estimated to have, as they are seen; None where none are.
     """
 
     color: tuple[Float[Array, "packets rays"], ...]
     transmittance: Float[Array, "packets rays"]
     depth: Float[Array, "packets rays"]
+    square: Float[Array, "packets rays"] | None = None
 
 
-def empty_segments(slots: int, samples: int, rays: int, dtype: Any) -> Segment:
-    """Slabs with nothing in them."""
-    red, green, blue = (jnp.zeros((slots, rays), dtype) for _ in range(3))
-    return Segment((red, green, blue), jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype))
+def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False) -> Segment:
+    """Slabs with nothing in them; `estimated`: and with no error."""
+    red, green, blue, error = (jnp.zeros((slots, rays), dtype) for _ in range(4))
+    through, thickness = jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype)
+    return Segment((red, green, blue), through, thickness, error if estimated else None)
 
 
-def fresh_rays(packets: int, rays: int, dtype: Any, together: Together) -> RayState:
+def fresh_rays(packets: int, rays: int, dtype: Any, together: Together, estimated: bool = False) -> RayState:
     """Rays that have met nothing."""
     room = packets + together.packets, rays
-    red, green, blue, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 1, jnp.inf))
-    return RayState((red, green, blue), transmittance, depth)
+    red, green, blue, square, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 0, 1, jnp.inf))
+    return RayState((red, green, blue), transmittance, depth, square if estimated else None)
 
 
 def over_layers(
@@ -147,7 +150,10 @@ def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_dep
     crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
     depth = _with_half_depth(rays, crossed, light.thickness, slot, border, half_depths)
     color = tuple(color + rays.transmittance * added for color, added in zip(rays.color, emitted, strict=True))
-    return RayState(color, behind, depth)
+    square = rays.square
+    if square is not None and light.error is not None:
+        square = square + (rays.transmittance * light.error[slot]) ** 2
+    return RayState(color, behind, depth, square)
 
 
 def _with_half_depth(
@@ -189,4 +195,4 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: A
     return depth
 
 
-jax.tree_util.register_dataclass(RayState, data_fields=["color", "transmittance", "depth"], meta_fields=[])
+jax.tree_util.register_dataclass(RayState, data_fields=["color", "transmittance", "depth", "square"], meta_fields=[])

@@ -26,11 +26,13 @@ class Segment:
         color: red, green and blue that a slab emits.
         transmittance: what it lets through, the exponential of minus the sum of `thickness`.
         thickness: optical thickness between borders.
+        error: how wrong colours and transmittance are estimated to be, whatever shines behind; None where that is not asked for.
     """
 
     color: tuple[Float[Array, "slabs rays"], Float[Array, "slabs rays"], Float[Array, "slabs rays"]]
     transmittance: Float[Array, "slabs rays"]
     thickness: Float[Array, "slabs samples rays"]
+    error: Float[Array, "slabs rays"] | None = None
 
 
 class Integrator:
@@ -62,10 +64,14 @@ class Integrator:
         """
         raise NotImplementedError(self.forward_only or f"`{type(self).__name__}` has no `segment`: define it")
 
+    def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
+        """Light of slabs with an estimate of its error, for integrators that a tolerance can be kept with."""
+        raise NotImplementedError(f"`{type(self).__name__}` estimates no errors: define `compared`, or give `tolerance=None`")
+
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
         color, thickness = self.segment(medium.met(gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
 
 
-jax.tree_util.register_dataclass(Segment, data_fields=["color", "transmittance", "thickness"], meta_fields=[])
+jax.tree_util.register_dataclass(Segment, data_fields=["color", "transmittance", "thickness", "error"], meta_fields=[])

@@ -9,6 +9,7 @@ chunk by chunk; what they emit and absorb is held, and then put into the rays' s
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.cast.batches import Batches, CastPlan, batches_of
 from jaxsph.cast.composite import RayState, Together, composite, empty_segments, fresh_rays
 from jaxsph.cast.integrator import Integrator, Segment
+from jaxsph.cast.refine import CAUTION, errors_seen, refine, shares_of
 from jaxsph.field.schedule import SlabSchedule, evaluations_of_slabs
 from jaxsph.field.tasks import RayPackets
 from jaxsph.model.medium import Medium
@@ -28,13 +30,32 @@ from jaxsph.model.medium import Medium
 class RayResult:
     """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance.
 
-    `left_out` is what rays that ended would have taken, kernel evaluations a ray of each packet; None where none can end.
+    `error` is what colours and transmittance are estimated to be wrong by, None where nothing is estimated; `refined` what was spent
+    on that, and `left_out` is what rays that ended would have taken, kernel evaluations a ray of each packet; None where none can end.
     """
 
     color: Float[Array, "3 packets rows columns"]
     transmittance: Float[Array, "packets rows columns"]
     depth: Float[Array, "packets rows columns"]
     left_out: Float[Array, " packets"] | None = None
+    error: Float[Array, "packets rows columns"] | None = None
+    refined: Float[Array, " packets"] | None = None
+
+
+class Marched(NamedTuple):
+    """What is known between batches.
+
+    Attributes:
+        rays: what they have met.
+        light: of the slabs of the last batch, by slot.
+        left_out: what rays that ended would have taken; None where none can end.
+        refined: what marching slabs again took; None where none are.
+    """
+
+    rays: RayState
+    light: Segment
+    left_out: Array | None
+    refined: Array | None
 
 
 def march(
@@ -46,53 +67,78 @@ def march(
     plan: CastPlan,
     perspective: bool,
     min_transmittance: Float[Array, ""] | None = None,
+    tolerance: Float[Array, ""] | None = None,
 ) -> RayResult:
     """March all packets of a band.
 
     Args:
         schedule: the slabs of samples to march, by bundle.
         min_transmittance: packets all of whose rays let less through end, between batches; None for none.
+        tolerance: what slabs are refined for, where the plan has room for that; None where they are not.
     """
     batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
-    together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
+    together, ending, refining = (
+        Together.of(batches.num_packets, plan.tuning),
+        min_transmittance is not None,
+        tolerance is not None,
+    )
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples, integrator.halo) if ending else None
+    starts = batches.compacted.start
 
-    def march_batch(nth: Array, state: tuple[RayState, Segment, Array | None]) -> tuple[RayState, Segment, Array | None]:
-        rays, light, left_out = state
+    def light_of(items: Array, parts: int = 1) -> Segment:
+        return segments_of(batches, items, medium, integrator, parts, refining)
+
+    def march_batch(nth: Array, state: Marched) -> Marched:
+        rays, light, left_out, refined = state
         batch = batches.batch(nth, batches.ended(rays.transmittance))
         if spent is not None and left_out is not None:
             left_out = left_out + batches.left_out(batch, spent)
 
         def march_chunk(chunk: Array, light: Segment) -> Segment:
             items, begin = batches.chunk(batch, chunk)
-            found = segments_of(batches, items, medium, integrator)
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, light_of(items))
 
         def borders(place: Array) -> Array:
             return batches.borders(batch.items[place])
 
+        def seen(light: Segment) -> Array:
+            return errors_seen(batch, light, rays.transmittance, starts, together)
+
         light = lax.fori_loop(0, batch.chunks, march_chunk, light)
-        return composite(rays, light, batch, borders, batches.compacted.start, together), light, left_out
+        if tolerance is not None and refined is not None:
+            light, refined = refine(batches, batch, light, refined, seen, shares_of(batches, tolerance), light_of)
+        return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
 
-    dtype = grid.half_steps.dtype
-    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together)
-    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype)
-    nothing = jnp.zeros(batches.num_packets, jnp.float32) if ending else None
-    rays, _, left_out = lax.fori_loop(0, batches.number, march_batch, (rays, light, nothing))
-    return dataclasses.replace(result_of(rays, batches), left_out=left_out)
+    dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
+    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining)
+    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining)
+    start = Marched(rays, light, nothing if ending else None, nothing if refining else None)
+    found = lax.fori_loop(0, batches.number, march_batch, start)
+    return dataclasses.replace(result_of(found.rays, batches), left_out=found.left_out, refined=found.refined)
 
 
-def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Integrator) -> Segment:
-    """What slabs emit and let through."""
+def segments_of(
+    batches: Batches, items: Array, medium: Medium, integrator: Integrator, parts: int = 1, compared: bool = False
+) -> Segment:
+    """What slabs emit and let through, with so many times as many samples; `compared`: and how wrong that may be."""
     task = batches.task(items)
-    return integrator(medium, medium.gather(task), task)
+    task = task if parts == 1 else task.refined(parts)
+    gathered = medium.gather(task)
+    if not compared:
+        return integrator(medium, gathered, task)
+    light = integrator.compared(medium, gathered, task)
+    tasks, samples, rays = light.thickness.shape
+    return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))
 
 
 def result_of(rays: RayState, batches: Batches) -> RayResult:
     """Rays in the order of packets, as rows and columns."""
     rank, shape = batches.compacted.bundle_rank, batches.packets.shape
     *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
-    return RayResult(jnp.stack(color), transmittance, depth)
+    error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
+    return RayResult(jnp.stack(color), transmittance, depth, error=error)
 
 
-jax.tree_util.register_dataclass(RayResult, data_fields=["color", "transmittance", "depth", "left_out"], meta_fields=[])
+jax.tree_util.register_dataclass(
+    RayResult, data_fields=["color", "transmittance", "depth", "left_out", "error", "refined"], meta_fields=[]
+)

@@ -176,6 +176,10 @@ class PointsMedium(Medium):
         inverse = jnp.where(path > 0, 1 / jnp.where(path > 0, path, 1), 0)
         return [value * inverse for value in [*weighed, thickness][channels]]
 
+    def every_other(self, gathered: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Sums of two intervals each."""
+        return tuple(value[:, ::2] + value[:, 1::2] for value in gathered)
+
     def moved(self, task: SlabTask) -> Moved | None:
         """Of those points whose thickness is not laid along chords.
 

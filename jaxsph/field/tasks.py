@@ -167,6 +167,18 @@ class SlabTask:
         names = "slab", "bundle", "u", "v", "depth", "border"
         return dataclasses.replace(self, entry=entry, **{name: getattr(self, name)[chosen] for name in names})
 
+    def refined(self, parts: int) -> SlabTask:
+        """Slabs of so many times as many samples, on borders, evenly spaced in each of the intervals."""
+        begin, end = self.border[:, :-1, None], self.border[:, 1:, None]
+        share = jnp.arange(parts, dtype=begin.dtype) / parts
+        inner = (begin + share * (end - begin)).reshape(begin.shape[0], -1)
+        border = jnp.concatenate([inner, self.border[:, -1:]], 1)
+        return dataclasses.replace(self, depth=border, border=border)
+
+    def every_other(self) -> SlabTask:
+        """Slabs of intervals twice as long."""
+        return dataclasses.replace(self, depth=self.depth[:, ::2], border=self.border[:, ::2])
+
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
         rays, u, v = self.shape[2], self.u, self.v

@@ -72,6 +72,10 @@ class Mixture(Medium):
         found = [medium.means(one, task, channels) for medium, one in zip(self.media, intervals, strict=True)]
         return [mixed_extinction(list(of_channel)) for of_channel in zip(*found, strict=True)]
 
+    def every_other(self, gathered: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Of each."""
+        return tuple(medium.every_other(one) for medium, one in zip(self.media, gathered, strict=True))
+
     def moved(self, task: Any) -> Any:
         """Of all that move anything."""
         moving = [moved for medium in self.media if (moved := medium.moved(task)) is not None]

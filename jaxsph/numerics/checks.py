@@ -18,12 +18,12 @@ def is_traced(*values: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
 
 
-def require_sizes(plan: Any) -> None:
-    """Raise `ValueError` unless all integers of a dataclass of sizes are at least 1."""
+def require_sizes(plan: Any, zero: tuple[str, ...] = ()) -> None:
+    """Raise `ValueError` unless all integers of a dataclass of sizes are at least 1, or not negative where `zero` is of use."""
     for field in dataclasses.fields(plan):
         size = getattr(plan, field.name)
-        if isinstance(size, int) and not isinstance(size, bool) and size < 1:
-            raise ValueError(f"`{field.name}` must be at least 1, got {size}")
+        if isinstance(size, int) and not isinstance(size, bool) and size < (least := int(field.name not in zero)):
+            raise ValueError(f"`{field.name}` must be at least {least}, got {size}")
 
 
 def require_shape(name: str, value: Any, shape: tuple[int | None, ...], remedy: str) -> None:
