@@ -1,0 +1,112 @@
+"""Rays cut into pieces: nothing begins or ends inside of a piece, and a list says which chords lie over it.
+
+Flow: rays, chords -> [reference_pieces] -> reference_media -> reference_integral.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsph.reference_chords import Chords, Rays, ranges
+
+LONGEST = 0.5  # of a support: see `borders`
+
+
+class Pieces(NamedTuple):
+    """Parts of rays, in order of rays and, within a ray, of depth.
+
+    Attributes:
+        ray: number of its ray.
+        start, end: depths.
+        root: number of the piece of the first cut that it is a part of: lists are of those.
+    """
+
+    ray: Int[np.ndarray, " pieces"]
+    start: Float[np.ndarray, " pieces"]
+    end: Float[np.ndarray, " pieces"]
+    root: Int[np.ndarray, " pieces"]
+
+    def some(self, which: np.ndarray) -> Pieces:
+        """Those of the given numbers, or a mask."""
+        return Pieces(*(column[which] for column in self))
+
+
+class Lists(NamedTuple):
+    """Numbers of chords that lie over roots: `chord[first[i] : first[i] + count[i]]` over root i."""
+
+    first: Int[np.ndarray, " roots"]
+    count: Int[np.ndarray, " roots"]
+    chord: Int[np.ndarray, " pairs"]
+
+    def over(self, root: Int[np.ndarray, " pieces"]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a piece (a place in `root`) and a chord, piece by piece."""
+        which, place = ranges(self.first[root], self.count[root])
+        return which, self.chord[place]
+
+    def some(self, which: np.ndarray) -> Lists:
+        """Of some of the roots."""
+        return self._replace(first=self.first[which], count=self.count[which])
+
+
+Cuts = tuple[np.ndarray, np.ndarray]
+"""Numbers of rays, and depths on them."""
+
+
+def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
+    """Entries and exits that rays are cut at from the start.
+
+    Those where the union of all chords of a ray begins or ends, as the medium does there: all of them. Of the others, where
+    only a higher derivative jumps and which are cut at where the error demands it, the first in each of the bins that are
+    `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single piece, so that
+    none is overlooked between nodes.
+    """
+    ray, depth = np.tile(chords.ray, 2), np.concatenate([chords.entry, chords.exit])
+    step = np.repeat([1, -1], len(chords.ray))
+    order = np.lexsort((-step, depth, ray))
+    ray, depth, step = ray[order], depth[order], step[order]
+    covering = np.cumsum(step)
+    octave = np.frexp(np.tile(radius, 2)[order])[1]
+    place = np.floor(depth / np.ldexp(LONGEST, octave - 1))
+    first = np.zeros(len(ray), bool)
+    within = np.lexsort((depth, octave, ray))
+    keys = ray[within], octave[within], place[within]
+    first[within[1:]] = np.logical_or.reduce([key[1:] != key[:-1] for key in keys])
+    first[within[:1]] = True
+    kept = first | (covering == 0) | (covering == step)
+    return ray[kept], depth[kept]
+
+
+def cut(rays: Rays, cuts: list[Cuts]) -> Pieces:
+    """What lies between neighbouring cuts of a ray, between near and far."""
+    count = len(rays.u)
+    ends = np.repeat([rays.near, rays.far], count)
+    ray = np.concatenate([np.tile(np.arange(count), 2), *(ray for ray, _ in cuts)])
+    depth = np.clip(np.concatenate([ends, *(depth for _, depth in cuts)]), rays.near, rays.far)
+    order = np.lexsort((depth, ray))
+    ray, depth = ray[order], depth[order]
+    held = (ray[1:] == ray[:-1]) & (depth[1:] > depth[:-1])
+    start, end = depth[:-1][held], depth[1:][held]
+    return Pieces(ray[:-1][held], start, end, np.arange(len(start)))
+
+
+def lists(rays: Rays, pieces: Pieces, chords: Chords) -> Lists:
+    """Which chords lie over which pieces."""
+    width = 2 * (rays.far - rays.near)
+
+    def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
+
+    last = len(pieces.ray) - 1
+    first = np.searchsorted(key(pieces.ray, pieces.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
+    beyond = np.searchsorted(key(pieces.ray, pieces.start), key(chords.ray, chords.exit)) + 1
+    first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
+    chord, piece = ranges(first, np.maximum(beyond - first, 0))
+    over = (pieces.ray[piece] == chords.ray[chord]) & (chords.entry[chord] < pieces.end[piece])
+    over &= chords.exit[chord] > pieces.start[piece]
+    chord, piece = chord[over], piece[over]
+    count = np.bincount(piece, minlength=len(pieces.ray))
+    small = piece.astype(np.uint16) if len(count) <= 1 << 16 else piece  # which sorts faster
+    return Lists(np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")])
