@@ -86,6 +86,9 @@ class Chords(NamedTuple):
     exit: Float[np.ndarray, " chords"]
 
 
+NO_CHORDS = Chords(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
+
+
 class Spheres:
     """Spheres in view space, with their shadows on the screen, by which rays find them.
 
@@ -100,10 +103,7 @@ class Spheres:
     def chords(self, rays: Rays) -> Chords:
         """All chords of `rays` between near and far; cut off there they are not."""
         found = [_chords(rays, self.center, self.radius, *pairs) for pairs in self._candidates(rays)]
-        if not found:
-            nothing, nowhere = np.zeros(0, int), np.zeros(0)
-            return Chords(nothing, nothing, nowhere, nowhere)
-        return Chords(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        return Chords(*(np.concatenate(parts) for parts in zip(NO_CHORDS, *found, strict=True)))
 
     def _candidates(self, rays: Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Numbers of rays and of spheres whose shadows they may be in, some at a time."""

@@ -40,8 +40,8 @@ def integral(
 ) -> Image:
     r"""The light integral along rays between `camera.near` and `camera.far`, by quadrature of a known error.
 
-    Extinctions of all parts add up, and so do their emissions, colour times extinction. (With `mix="opacity"` samples show the sum
-    of colours times opacities; in the limit of short intervals opacities are thicknesses, so that it has the same integral.)
+    Extinctions of all parts add up, and so do their emissions, colour times extinction. (With `mix="opacity"` samples show the
+    sum of colours times opacities; in the limit of short intervals opacities are thicknesses: it has the same integral.)
     Particles: $Q = \sum q V W / \sum V W$ wherever a support is, nothing elsewhere. Points are taken by their true density,
     spread "chords"; "feet" and "centres" lay it elsewhere, as ways of rendering it.
 
@@ -60,8 +60,8 @@ def integral(
 
     Returns:
         Image of float64 NumPy arrays. `error_bound` is the own error: the sum over pieces of what all nodes and every second
-        node differ by, times the transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are
-        what is shown. Not `certified`. `stats` counts `rays`, `chords`, `pieces` and `evaluations`.
+        node differ by, times the transmittance in front. It is an estimate, and a cautious one, as the polynomials of all
+        nodes are what is shown. Not `certified`. `stats` counts `rays`, `chords`, `pieces` and `evaluations`.
 
     Raises:
         ValueError: pixels out of the image, a tolerance below 1e-12, a scene of nothing, or of media unknown here.
@@ -85,9 +85,9 @@ def integral(
         counts, done = counts + more, done + len(some)
         if progress is not None:
             progress(done, rows.size)
-    color, rest = found[:, :3].reshape(*rows.shape, 3), found[:, 3:].T.reshape(4, *rows.shape)
+    color: Any = found[:, :3].reshape(*rows.shape, 3)
+    transmittance, depth, error, evaluations = found[:, 3:].T.reshape(4, *rows.shape)
     stats = _stats(found, counts) | {"seconds": {"cast": time.perf_counter() - started}}
-    transmittance, depth, error, evaluations = rest
     return Image(color, transmittance, depth, error, evaluations, False, 0, stats)
 
 
@@ -124,7 +124,7 @@ def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarra
     """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and pieces they have."""
     parts = [whole.seen_by(rays) for whole in wholes]
     roots = cut(rays, [part.cuts() for part in parts])
-    held = np.logical_or.reduce([part.lies_over(roots) for part in parts])
+    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
     for part in parts:
         part.keep(held)
     pieces = roots.some(held)._replace(root=np.arange(held.sum()))

@@ -123,7 +123,8 @@ class Look:
         inwards[-1] += NUDGE * (quantity[-2] - quantity[-1])
         segment = np.searchsorted(self._values, inwards, "right")
         part = np.clip((quantity - self._start[segment]) * self._inverse[segment], 0, 1)
-        red, green, blue, extinction = (base[segment] + part * change[segment] for base, change in zip(self._base, self._change))
+        pairs = zip(self._base, self._change, strict=True)
+        red, green, blue, extinction = (base[segment] + part * change[segment] for base, change in pairs)
         seen.extinction[:, which] += extinction
         seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
         half = (pieces.end[which] - pieces.start[which]) / 2

@@ -16,17 +16,22 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference_chords import Rays, Spheres
+from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference_pieces import Cuts, Lists, Pieces, borders, lists
 from jaxsph.reference_points import at_offset, kinks
 
-PAIRS = 1 << 12  # of a piece and a chord, whose nodes are looked at at once: what a cache holds
 INWARDS = 1e-9  # of a piece: how far inside its ends particles are looked at, where those that begin there weigh something
 
 
 class Part(abc.ABC):
-    """One part of a scene, as some rays meet it; made by `seen_by`."""
+    """One part of a scene, as some rays meet it; made by `seen_by`.
+
+    Attributes:
+        chords: what rays have inside its spheres; none of a part that is not made of spheres.
+    """
+
+    chords: Chords = NO_CHORDS
 
     @abc.abstractmethod
     def cuts(self) -> Cuts:
@@ -104,7 +109,7 @@ class ParticlesMet(Part):
     def lies_over(self, roots: Pieces) -> np.ndarray:
         """See `Part`."""
         self._lists = lists(self._rays, roots, self.chords)
-        return self._lists.count > 0
+        return self._lists.length > 0
 
     def keep(self, which: np.ndarray) -> None:
         """See `Part`."""
@@ -112,15 +117,12 @@ class ParticlesMet(Part):
 
     def add(self, seen: AtNodes, pieces: Pieces) -> None:
         """See `Part`."""
-        count = self._lists.count[pieces.root]
+        count = self._lists.length[pieces.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
-        ends = np.cumsum(count[which])
         quantity = np.empty((NODES, len(which)))
-        parts = np.arange(1, int(ends[-1]) // PAIRS + 1) * PAIRS if len(ends) else []
-        for some in np.split(np.arange(len(which)), np.searchsorted(ends, parts)):
-            if len(some):
-                quantity[:, some] = self._mean(pieces.some(which[some]))
+        for some in self._lists.batches(pieces.root[which]):
+            quantity[:, some] = self._mean(pieces.some(which[some]))
         self._whole.look.add(seen, which, _filled(quantity), pieces, self._rays.slant)
 
     def _mean(self, pieces: Pieces) -> np.ndarray:
@@ -187,19 +189,17 @@ class VolumeMet(Part):
     def __init__(self, whole: AllOfVolume, rays: Rays, start: np.ndarray, direction: np.ndarray):
         self._whole, self._rays, self._start, self._direction = whole, rays, start, direction
         self._last = np.array(whole.values.shape) - 1
-        self._over = np.zeros(0, bool)
+        self._over: np.ndarray = np.zeros(0, bool)
 
     def cuts(self) -> Cuts:
         """Planes of lattice points, inside the box alone."""
+        start, direction = self._start, self._direction
         with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.sort(np.stack([-self._start, self._last - self._start]) / self._direction, 0)
-            outside = (self._direction == 0) & ((self._start < 0) | (self._start > self._last))
-            ends[0], ends[1] = np.nan_to_num(ends[0], nan=-np.inf), np.nan_to_num(ends[1], nan=np.inf)
-            enter, leave = ends[0].max(1), np.where(outside.any(1), -np.inf, ends[1].min(1))
-            planes = [
-                (np.arange(last + 1) - self._start[:, [axis]]) / self._direction[:, [axis]]
-                for axis, last in enumerate(self._last)
-            ]
+            planes = [(np.arange(last + 1) - start[:, [i]]) / direction[:, [i]] for i, last in enumerate(self._last)]
+            enter, leave = np.sort(np.stack([-start, self._last - start]) / direction, 0)
+        beside = (direction == 0) & ((start < 0) | (start > self._last))
+        enter = np.where(direction == 0, -np.inf, enter).max(1)
+        leave = np.where(beside, -np.inf, np.where(direction == 0, np.inf, leave)).min(1)
         depth = np.concatenate([enter[:, None], leave[:, None], *planes], 1)
         enter, leave = np.maximum(enter, self._rays.near), np.minimum(leave, self._rays.far)
         ray, place = np.nonzero((depth >= enter[:, None]) & (depth <= leave[:, None]))
@@ -208,7 +208,7 @@ class VolumeMet(Part):
     def lies_over(self, roots: Pieces) -> np.ndarray:
         """See `Part`."""
         at = self._at(roots.ray, (roots.start + roots.end) / 2)
-        self._over = ((at >= 0) & (at <= self._last)).all(-1)
+        self._over = np.all((at >= 0) & (at <= self._last), axis=-1)
         return self._over
 
     def keep(self, which: np.ndarray) -> None:
@@ -272,7 +272,7 @@ class PointsMet(Part):
     def lies_over(self, roots: Pieces) -> np.ndarray:
         """See `Part`."""
         self._lists: Lists = lists(self._rays, roots, self.chords)
-        return self._lists.count > 0
+        return self._lists.length > 0
 
     def keep(self, which: np.ndarray) -> None:
         """See `Part`."""
@@ -280,9 +280,7 @@ class PointsMet(Part):
 
     def add(self, seen: AtNodes, pieces: Pieces) -> None:
         """See `Part`."""
-        ends = np.cumsum(self._lists.count[pieces.root])
-        parts = np.arange(1, int(ends[-1]) // PAIRS + 1) * PAIRS if len(ends) else []
-        for some in np.split(np.arange(len(ends)), np.searchsorted(ends, parts)):
+        for some in self._lists.batches(pieces.root):
             self._add(seen, some, pieces.some(some))
 
     def _add(self, seen: AtNodes, some: np.ndarray, pieces: Pieces) -> None:

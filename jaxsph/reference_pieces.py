@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jaxsph.reference_chords import Chords, Rays, ranges
 
 LONGEST = 0.5  # of a support: see `borders`
+PAIRS = 1 << 12  # of a piece and a chord, whose nodes are looked at at once: what a cache holds
 
 
 class Pieces(NamedTuple):
@@ -35,20 +36,27 @@ class Pieces(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Numbers of chords that lie over roots: `chord[first[i] : first[i] + count[i]]` over root i."""
+    """Numbers of chords that lie over roots: `chord[first[i] : first[i] + length[i]]` over root i."""
 
     first: Int[np.ndarray, " roots"]
-    count: Int[np.ndarray, " roots"]
+    length: Int[np.ndarray, " roots"]
     chord: Int[np.ndarray, " pairs"]
+
+    def batches(self, root: Int[np.ndarray, " pieces"]) -> list[np.ndarray]:
+        """Numbers of pieces, as many at a time as have about `PAIRS` chords over them together."""
+        ends = np.cumsum(self.length[root])
+        pairs = int(ends[-1]) if len(ends) else 0
+        some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(PAIRS, pairs, PAIRS)))
+        return [part for part in some if len(part)]
 
     def over(self, root: Int[np.ndarray, " pieces"]) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of a piece (a place in `root`) and a chord, piece by piece."""
-        which, place = ranges(self.first[root], self.count[root])
+        which, place = ranges(self.first[root], self.length[root])
         return which, self.chord[place]
 
     def some(self, which: np.ndarray) -> Lists:
         """Of some of the roots."""
-        return self._replace(first=self.first[which], count=self.count[which])
+        return self._replace(first=self.first[which], length=self.length[which])
 
 
 Cuts = tuple[np.ndarray, np.ndarray]
