@@ -26,6 +26,7 @@ BLOCK = 128  # rays that share arrays
 ROUNDS = 120  # of splitting: a wall of an optical thickness of 1e6 takes about 20
 MOST_PIECES = 1 << 16  # of a ray; beyond, its error is told as it is
 LEAST_TOLERANCE = 1e-12
+ROUNDING = 64 * np.finfo(float).eps  # of a ray's sums
 SHORTEST = 4 * np.finfo(float).eps  # of the depth
 
 
@@ -59,9 +60,10 @@ def integral(
         progress: called as `progress(done, total)` in rays.
 
     Returns:
-        Image of float64 NumPy arrays. `error_bound` is the own error: the sum over pieces of what all nodes and every second
-        node differ by, times the transmittance in front. It is an estimate, and a cautious one, as the polynomials of all
-        nodes are what is shown. Not `certified`. `stats` counts `rays`, `chords`, `pieces` and `evaluations`.
+        Image of float64 NumPy arrays. `error_bound` is the own error: four times the sum over pieces of what all nodes and
+        every second node differ by, and of what kinks and jumps of transfer functions can hide between nodes, times the
+        transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are what is shown. Not
+        `certified`. `stats` counts `rays`, `chords`, `pieces` and `evaluations`.
 
     Raises:
         ValueError: pixels out of the image, a tolerance below 1e-12, a scene of nothing, or of media unknown here.
@@ -204,4 +206,5 @@ def _composite(rays: Rays, pieces: Pieces, light: Light) -> np.ndarray:
     share = where_thickness(light.thickness[crossed], half - before[crossed])
     depth[there.ray] = there.start + share * (there.end - there.start)
     transmittance = np.exp(-np.bincount(pieces.ray, own, count))
-    return np.stack([*color, transmittance, depth, np.bincount(pieces.ray, front * light.error, count)], 1)
+    error = np.bincount(pieces.ray, front * light.error, count)
+    return np.stack([*color, transmittance, depth, np.where(error > 0, error + ROUNDING, 0)], 1)

@@ -20,6 +20,8 @@ from jaxsph.reference_pieces import Pieces
 NODES = 9
 PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 1
 NUDGE = 1e-7  # of the way from an end to the next node: how far inwards the side of a control value is looked at
+KINK = 1 / 8  # error of a gap's integral for a kink within, over the change of slope times the gap squared
+CAUTION = 4  # times what is seen of an error: a quantity that turns between nodes may just touch a control value, unseen
 BISECTIONS = 20  # of a gap between two nodes, before a secant
 
 
@@ -72,7 +74,8 @@ class Light:
     Attributes:
         color: emitted light, attenuated up to the piece's front.
         thickness: optical thickness up to each node.
-        error: difference between all nodes and every second, of the largest channel and transmittance together, and doubt.
+        error: `CAUTION` times the difference between all nodes and every second, of the largest channel and transmittance
+            together, and doubt.
         crossing: see `AtNodes`.
     """
 
@@ -87,6 +90,7 @@ def light_of(seen: AtNodes, half_path: Float[np.ndarray, " pieces"]) -> Light:
     color, thickness = _integrated(seen.extinction, seen.emission, half_path, INTEGRATION)
     coarse, thinner = _integrated(seen.extinction[::2], seen.emission[:, ::2], half_path, EVERY_SECOND)
     error = np.abs(color - coarse).max(0) + np.abs(np.exp(-thickness[-1]) - np.exp(-thinner[-1])) + seen.doubt
+    error *= CAUTION
     return Light(color.T, thickness.T, error, seen.crossing)
 
 
@@ -112,7 +116,7 @@ class Look:
         self._base, self._change = np.append(table[:, :1], table, 1), np.append(np.zeros((4, 1)), change, 1)
         self._rank = np.append(0, np.cumsum(np.append(True, width[:-1] > 0)))  # distinct control values up to each
         light = np.concatenate([table[3:], table[:3] * table[3]])
-        self._bend = _bends(light, width)
+        self._jump, self._turn, self._bend = _bends(light, width)
 
     def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, pieces: Pieces, slant: np.ndarray) -> None:
         """Add what pieces number `which` show for their `quantity` (nodes, which); nothing where that is NaN."""
@@ -128,9 +132,11 @@ class Look:
         seen.extinction[:, which] += extinction
         seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
         half = (pieces.end[which] - pieces.start[which]) / 2
+        upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[pieces.ray[which]]
+        bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
         skips = np.abs(np.diff(self._rank[segment], axis=0)) > 1
-        unseen = (np.diff(PLACE) @ skips) * half * slant[pieces.ray[which]] * self._most
-        seen.doubt[which] += np.minimum(unseen, 1)
+        unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
+        seen.doubt[which] += np.minimum(unseen.sum(0), 1)
         self._cross(seen, which, quantity, segment, pieces)
 
     def _cross(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, segment: np.ndarray, pieces: Pieces) -> None:
@@ -148,8 +154,8 @@ class Look:
         seen.weight[of] = best[some]
 
 
-def _bends(light: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """How much light (4, points) jumps or changes its slope at control points, a slope over the lesser of the widths beside it.
+def _bends(light: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How much light (4, points) jumps at control points, how much its slope changes, and both by the lesser width beside.
 
     Entry k is of point k - 1, as segments are numbered; a jump's is with its later point.
     """
@@ -158,9 +164,10 @@ def _bends(light: np.ndarray, width: np.ndarray) -> np.ndarray:
     slope = np.divide(rise, width[:-1], out=np.zeros_like(rise), where=width[:-1] > 0)
     before, after = np.append(0, width[:-1]), width
     least = np.where((before > 0) & (after > 0), np.minimum(before, after), np.maximum(before, after))
-    jump = np.where(before > 0, 0, np.abs(np.concatenate([none, rise], 1)))
-    bend = jump + np.abs(np.concatenate([slope, none], 1) - np.concatenate([none, slope], 1)) * least
-    return np.append(0, bend.max(0)) + np.finfo(float).tiny
+    jump = np.where(before > 0, 0, np.abs(np.concatenate([none, rise], 1)).max(0))
+    turn = np.abs(np.concatenate([slope, none], 1) - np.concatenate([none, slope], 1)).max(0)
+    jump[:1] = 0
+    return tuple(np.append(0, part) for part in (jump, turn, jump + turn * least + np.finfo(float).tiny))
 
 
 def _crossing(coefficients: np.ndarray, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxsph.reference_chords import Chords, Rays, ranges
 
-LONGEST = 0.5  # of a support: see `borders`
+LONGEST = 0.25  # of a support: see `borders`
 PAIRS = 1 << 12  # of a piece and a chord, whose nodes are looked at at once: what a cache holds
 
 
