@@ -37,6 +37,7 @@ def _integration(place: np.ndarray) -> np.ndarray:
 
 
 COEFFICIENTS = _coefficients(PLACE)
+WITHIN = chebyshev.chebvander(PLACE[:-1, None] + np.diff(PLACE)[:, None] * [0.2, 0.4, 0.6, 0.8], NODES - 1) @ COEFFICIENTS
 INTEGRATION, EVERY_SECOND = _integration(PLACE), _integration(PLACE[::2])
 
 
@@ -134,10 +135,19 @@ class Look:
         half = (pieces.end[which] - pieces.start[which]) / 2
         upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[pieces.ray[which]]
         bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
-        skips = np.abs(np.diff(self._rank[segment], axis=0)) > 1
+        skips = (np.abs(np.diff(self._rank[segment], axis=0)) > 1) | self._hidden(quantity, segment)
         unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
         seen.doubt[which] += np.minimum(unseen.sum(0), 1)
         self._cross(seen, which, quantity, segment, pieces)
+
+    def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
+        """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
+        slack = 1e-9 * np.ptp(quantity, 0) + 8 * np.finfo(float).eps * np.abs(quantity).max(0)
+        within = quantity[0] + np.tensordot(WITHIN, quantity - quantity[0], 1)
+        lowest = np.searchsorted(self._values, within.min(1) + slack, "right")
+        highest = np.searchsorted(self._values, within.max(1) - slack, "right")
+        least, most = np.minimum(segment[1:], segment[:-1]), np.maximum(segment[1:], segment[:-1])
+        return (self._rank[lowest] < self._rank[least]) | (self._rank[highest] > self._rank[most])
 
     def _cross(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, segment: np.ndarray, pieces: Pieces) -> None:
         """Where the quantity crosses the control value that bends most, those amid a piece before those at its ends."""
