@@ -22,6 +22,7 @@ PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 
 NUDGE = 1e-7  # of the way from an end to the next node: how far inwards the side of a control value is looked at
 KINK = 1 / 8  # error of a gap's integral for a kink within, over the change of slope times the gap squared
 CAUTION = 4  # times what is seen of an error: a quantity that turns between nodes may just touch a control value, unseen
+THICK = 4.0  # optical thickness of a piece beyond which its attenuation is too steep for what two polynomials say
 BISECTIONS = 20  # of a gap between two nodes, before a secant
 
 
@@ -76,7 +77,7 @@ class Light:
         color: emitted light, attenuated up to the piece's front.
         thickness: optical thickness up to each node.
         error: `CAUTION` times the difference between all nodes and every second, of the largest channel and transmittance
-            together, and doubt.
+            together, and doubt; of pieces thicker than `THICK` all light.
         crossing: see `AtNodes`.
     """
 
@@ -91,7 +92,7 @@ def light_of(seen: AtNodes, half_path: Float[np.ndarray, " pieces"]) -> Light:
     color, thickness = _integrated(seen.extinction, seen.emission, half_path, INTEGRATION)
     coarse, thinner = _integrated(seen.extinction[::2], seen.emission[:, ::2], half_path, EVERY_SECOND)
     error = np.abs(color - coarse).max(0) + np.abs(np.exp(-thickness[-1]) - np.exp(-thinner[-1])) + seen.doubt
-    error *= CAUTION
+    error = CAUTION * error + np.where(thickness[-1] > THICK, color.max(0), 0)
     return Light(color.T, thickness.T, error, seen.crossing)
 
 
@@ -177,7 +178,8 @@ def _bends(light: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray
     jump = np.where(before > 0, 0, np.abs(np.concatenate([none, rise], 1)).max(0))
     turn = np.abs(np.concatenate([slope, none], 1) - np.concatenate([none, slope], 1)).max(0)
     jump[:1] = 0
-    return tuple(np.append(0, part) for part in (jump, turn, jump + turn * least + np.finfo(float).tiny))
+    both = jump + turn * least + np.finfo(float).tiny
+    return np.append(0, jump), np.append(0, turn), np.append(0, both)
 
 
 def _crossing(coefficients: np.ndarray, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jaxsph.reference_chords import Chords, Rays, ranges
 
 LONGEST = 0.25  # of a support: see `borders`
+FEW = 4  # chords, see `borders`
 PAIRS = 1 << 12  # of a piece and a chord, whose nodes are looked at at once: what a cache holds
 
 
@@ -66,7 +67,8 @@ Cuts = tuple[np.ndarray, np.ndarray]
 def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
     """Entries and exits that rays are cut at from the start.
 
-    Those where the union of all chords of a ray begins or ends, as the medium does there: all of them. Of the others, where
+    Those where the union of all chords of a ray begins or ends, as the medium does there: all of them, and where less than
+    `FEW` chords are on one side, as a mean of few may change quickly. Of the others, where
     only a higher derivative jumps and which are cut at where the error demands it, the first in each of the bins that are
     `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single piece, so that
     none is overlooked between nodes.
@@ -83,7 +85,7 @@ def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
     keys = ray[within], octave[within], place[within]
     first[within[1:]] = np.logical_or.reduce([key[1:] != key[:-1] for key in keys])
     first[within[:1]] = True
-    kept = first | (covering == 0) | (covering == step)
+    kept = first | (np.minimum(covering, covering - step) < FEW)
     return ray[kept], depth[kept]
 
 
