@@ -71,7 +71,8 @@ def parts_of(scene: Scene, camera: Camera) -> list[Whole]:
     return parts + [AllPoints(points, camera) for points in scene.point_sets]
 
 
-def _to_view(position: np.ndarray, camera: Camera) -> np.ndarray:
+def to_view(position: np.ndarray, camera: Camera) -> np.ndarray:
+    """World to view coordinates of places (n, 3)."""
     return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
 
 
@@ -82,7 +83,7 @@ class AllParticles(Whole):
         there = np.asarray(particles.valid) & (np.asarray(particles.volume) > 0)
         columns = particles.support, particles.quantity, particles.volume
         self.support, self.quantity, volume = (np.asarray(column, np.float64)[there] for column in columns)
-        center = _to_view(particles.exact_position()[there], camera)
+        center = to_view(particles.exact_position()[there], camera)
         strength = volume / self.support**3
         self.strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
         self.spheres = Spheres(center, self.support, camera.is_perspective)
@@ -240,7 +241,7 @@ class AllPoints(Whole):
         self.points, self.axes = points, np.asarray(camera.axes, np.float64)
         self.radius, self.extinction, self.color = (self._column(name) for name in ("radius", "extinction", "color"))
         self.attributes = {name: np.asarray(value, np.float64)[self.there] for name, value in points.attributes.items()}
-        self.spheres = Spheres(_to_view(points.exact_position()[self.there], camera), self.radius, camera.is_perspective)
+        self.spheres = Spheres(to_view(points.exact_position()[self.there], camera), self.radius, camera.is_perspective)
 
     def _column(self, name: str) -> np.ndarray:
         return np.asarray(getattr(self.points, name), np.float64)[self.there]
