@@ -11,6 +11,7 @@ red, green, blue and alpha. Integrals are kept in `--cache`, so that another int
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import pathlib
 import sys
@@ -114,7 +115,7 @@ def check(records: list[Record]) -> list[str]:
             means = [
                 row["mean"] for row in sorted(record["rows"], key=lambda row: row["samples"]) if row["integrator"] == integrator
             ]
-            if any(after >= before for before, after in zip(means, means[1:], strict=False)):
+            if any(after >= before for before, after in itertools.pairwise(means)):
                 wrong.append(f"{record['scene']}: {integrator} does not come nearer: {means}")
     return wrong
 
