@@ -23,7 +23,7 @@ from jaxsph.reference_media import Part, Whole, parts_of
 from jaxsph.reference_pieces import Pieces, cut
 
 BLOCK = 128  # rays that share arrays
-ROUNDS = 120  # of splitting: a wall of an optical thickness of 1e6 takes about 20
+ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
 MOST_PIECES = 1 << 16  # of a ray; beyond, its error is told as it is
 LEAST_TOLERANCE = 1e-12
 ROUNDING = 64 * np.finfo(float).eps  # of a ray's sums
@@ -171,12 +171,12 @@ def _refined(rays: Rays, parts: list[Part], pieces: Pieces, tolerance: float) ->
 
 
 def _split(pieces: Pieces, crossing: np.ndarray, parts: list[Part], turn: int) -> np.ndarray:
-    """Depths to split at: crossings of control values and borders of supports have precedence in turns; else the middle."""
+    """Depths to split at: crossings of control values and borders of supports have precedence in turns, then the middle has its own."""
     border = np.full(len(crossing), np.nan)
     for part in parts:
         border = np.where(np.isnan(border), part.border_by(pieces), border)
     where = (pieces.start + pieces.end) / 2
-    for place in (border, crossing) if turn % 2 == 0 else (crossing, border):
+    for place in ((border, crossing), (crossing, border), ())[turn % 3]:
         where = np.where((place > pieces.start) & (place < pieces.end), place, where)
     return where
 

@@ -77,7 +77,7 @@ class Light:
         color: emitted light, attenuated up to the piece's front.
         thickness: optical thickness up to each node.
         error: `CAUTION` times the difference between all nodes and every second, of the largest channel and transmittance
-            together, and doubt; of pieces thicker than `THICK` all light.
+            together, and doubt; 1 for pieces that shine and are thicker than `THICK`.
         crossing: see `AtNodes`.
     """
 
@@ -92,7 +92,7 @@ def light_of(seen: AtNodes, half_path: Float[np.ndarray, " pieces"]) -> Light:
     color, thickness = _integrated(seen.extinction, seen.emission, half_path, INTEGRATION)
     coarse, thinner = _integrated(seen.extinction[::2], seen.emission[:, ::2], half_path, EVERY_SECOND)
     error = np.abs(color - coarse).max(0) + np.abs(np.exp(-thickness[-1]) - np.exp(-thinner[-1])) + seen.doubt
-    error = CAUTION * error + np.where(thickness[-1] > THICK, color.max(0), 0)
+    error = np.where((thickness[-1] > THICK) & seen.emission.any((0, 1)), 1, CAUTION * error)
     return Light(color.T, thickness.T, error, seen.crossing)
 
 
