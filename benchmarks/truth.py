@@ -67,7 +67,7 @@ def integral(name: str, scene: js.Scene, camera: js.Camera, options: argparse.Na
     image = js.reference.integral(scene, camera, pixels=pixels, tolerance=options.tolerance, progress=told)
     print(file=sys.stderr)
     numbers = {"error": image.error_bound.max(initial=0), "seconds": image.stats["seconds"]["cast"]}
-    numbers |= {"evaluations": image.stats["evaluations"], "pieces": image.stats["pieces"]}
+    numbers |= {"evaluations": image.stats["evaluations"], "portions": image.stats["portions"]}
     light = np.concatenate([image.color, image.alpha[:, None]], 1)
     kept = {"rows": pixels[0], "columns": pixels[1], "light": light} | {k: np.asarray(v) for k, v in numbers.items()}
     if file:
@@ -102,7 +102,7 @@ def measure(name: str, options: argparse.Namespace) -> Record:
             work = f"{row['evaluations']:20.0f} {row['seconds']:8.3f}"
             print(f"{pathlib.Path(name).name:24s} {integrator:12s} {samples:7d} {errors} {work}", flush=True)
             rows.append(row)
-    own = {key: float(truth[key]) for key in ("error", "seconds", "evaluations", "pieces")}
+    own = {key: float(truth[key]) for key in ("error", "seconds", "evaluations", "portions")}
     pixels = {"pixels": len(truth["rows"]), "particles": scene.particles.num_particles}
     return {"scene": pathlib.Path(name).name, **pixels, "integral": own, "rows": rows}
 

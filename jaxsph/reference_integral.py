@@ -1,6 +1,6 @@
 r"""The light integral itself, along the ray of each pixel, in float64 NumPy: what every way of sampling it is judged by.
 
-Flow: scene, camera, pixels -> rays -> pieces -> light of pieces, halved until it is known -> [reference_integral] -> image.
+Flow: scene, camera, pixels -> rays -> portions -> light of portions, halved until it is known -> [reference_integral] -> image.
 
 $I = \int T(l)\,c(l)\,\sigma(l)\,dl$ over the path length l, with $T(l) = \exp(-\int_0^l \sigma)$.
 """
@@ -20,14 +20,16 @@ from jaxsph.model.scene import Scene
 from jaxsph.reference_chords import Rays, blocks, rays_of
 from jaxsph.reference_looks import AtNodes, Light, light_of, where_thickness
 from jaxsph.reference_media import Part, Whole, parts_of
-from jaxsph.reference_pieces import Pieces, cut
+from jaxsph.reference_portions import Portions, cut
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
-MOST_PIECES = 1 << 16  # of a ray; beyond, its error is told as it is
+MOST_PORTIONS = 1 << 16  # of a ray; beyond, its error is told as it is
 LEAST_TOLERANCE = 1e-12
 ROUNDING = 64 * np.finfo(float).eps  # of a ray's sums
 SHORTEST = 4 * np.finfo(float).eps  # of the depth
+
+Progress = Callable[[int, int], None]
 
 
 def integral(
@@ -37,7 +39,7 @@ def integral(
     pixels: tuple[Any, Any] | None = None,
     every: int = 1,
     tolerance: float = 1e-7,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Image:
     r"""The light integral along rays between `camera.near` and `camera.far`, by quadrature of a known error.
 
@@ -46,10 +48,11 @@ def integral(
     Particles: $Q = \sum q V W / \sum V W$ wherever a support is, nothing elsewhere. Points are taken by their true density,
     spread "chords"; "feet" and "centres" lay it elsewhere, as ways of rendering it.
 
-    Rays are cut where supports, cells of volumes and points begin and end, into pieces on which what they hold is smooth.
-    On a piece extinction and emission are taken as polynomials of degree 8 through Chebyshev nodes, thickness as the integral of
-    the one, light as that of the other times transmittance. Pieces whose light or transmittance differs from what every second
-    node says are split: where a quantity crosses a control value of a transfer function, at the border of a support, or halved.
+    Rays are cut where supports, cells of volumes and points begin and end, into portions; of supports that many others overlap
+    only some ends are cut at from the start. On a portion extinction and emission are taken as polynomials of degree 8 through
+    Chebyshev nodes, thickness as the integral of the one, light as that of the other times transmittance. Portions whose light or
+    transmittance differs from what every second node says are split: where a quantity crosses a control value of a transfer
+    function, at the end of a support, or halved.
 
     Args:
         scene: particles, volumes and points; their (possibly float32) numbers are taken as exact, as is the camera.
@@ -60,10 +63,10 @@ def integral(
         progress: called as `progress(done, total)` in rays.
 
     Returns:
-        Image of float64 NumPy arrays. `error_bound` is the own error: four times the sum over pieces of what all nodes and
+        Image of float64 NumPy arrays. `error_bound` is the own error: four times the sum over portions of what all nodes and
         every second node differ by, and of what kinks and jumps of transfer functions can hide between nodes, times the
         transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are what is shown. Not
-        `certified`. `stats` counts `rays`, `chords`, `pieces` and `evaluations`.
+        `certified`. `stats` counts `rays`, `chords`, `portions` and `evaluations`.
 
     Raises:
         ValueError: pixels out of the image, a tolerance below 1e-12, a scene of nothing, or of media unknown here.
@@ -79,24 +82,27 @@ def integral(
         raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
     rows, columns = _pixels(camera, pixels, every)
     rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
-    found, counts, done = np.empty((rows.size, 7)), np.zeros(2, int), 0
-    waiting = blocks(rays, BLOCK)[::-1]
-    while waiting:
-        some = waiting.pop()
-        found[some], more = _block(rays.some(some), parts, tolerance)
-        counts, done = counts + more, done + len(some)
-        if progress is not None:
-            progress(done, rows.size)
+    found, counts = _all(rays, parts, tolerance, progress or (lambda done, total: None))
     color: Any = found[:, :3].reshape(*rows.shape, 3)
     transmittance, depth, error, evaluations = found[:, 3:].T.reshape(4, *rows.shape)
     stats = _stats(found, counts) | {"seconds": {"cast": time.perf_counter() - started}}
     return Image(color, transmittance, depth, error, evaluations, False, 0, stats)
 
 
+def _all(rays: Rays, parts: list[Whole], tolerance: float, told: Progress) -> tuple[np.ndarray, np.ndarray]:
+    """See `_block`."""
+    found, counts, done = np.empty((len(rays.u), 7)), np.zeros(2, int), 0
+    for some in blocks(rays, BLOCK):
+        found[some], more = _block(rays.some(some), parts, tolerance)
+        counts, done = counts + more, done + len(some)
+        told(done, len(rays.u))
+    return found, counts
+
+
 def _stats(found: np.ndarray, counts: np.ndarray) -> dict[str, Any]:
     total = int(found[:, 6].sum())
     of_image = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
-    return of_image | {"rays": len(found), "chords": int(counts[0]), "pieces": int(counts[1])}
+    return of_image | {"rays": len(found), "chords": int(counts[0]), "portions": int(counts[1])}
 
 
 def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple[Int[np.ndarray, "..."], Int[np.ndarray, "..."]]:
@@ -123,88 +129,88 @@ def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple
 
 
 def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and pieces they have."""
+    """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
     parts = [whole.seen_by(rays) for whole in wholes]
     roots = cut(rays, [part.cuts() for part in parts])
     held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
     for part in parts:
         part.keep(held)
-    pieces = roots.some(held)._replace(root=np.arange(held.sum()))
-    pieces, light, evaluations = _refined(rays, parts, pieces, tolerance)
+    portions = roots.some(held)._replace(root=np.arange(held.sum()))
+    portions, light, evaluations = _refined(rays, parts, portions, tolerance)
     chords = sum(len(part.chords.ray) for part in parts)
-    return np.concatenate([_composite(rays, pieces, light), evaluations[:, None]], 1), np.array([chords, len(pieces.ray)])
+    return np.concatenate([_composite(rays, portions, light), evaluations[:, None]], 1), np.array([chords, len(portions.ray)])
 
 
-def _refined(rays: Rays, parts: list[Part], pieces: Pieces, tolerance: float) -> tuple[Pieces, Light, np.ndarray]:
-    """Split pieces until the error of every ray is within tolerance, or no piece can be split."""
+def _refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float) -> tuple[Portions, Light, np.ndarray]:
+    """Split portions until the error of every ray is within tolerance, or no portion can be split."""
     count = len(rays.u)
     evaluations = np.zeros(count)
 
-    def look(some: Pieces) -> Light:
+    def look(some: Portions) -> Light:
         seen = AtNodes.nothing(len(some.ray))
         for part in parts:
             part.add(seen, some)
         evaluations[:] += np.bincount(some.ray, seen.evaluations, count)
         return light_of(seen, (some.end - some.start) / 2 * rays.slant[some.ray])
 
-    light = look(pieces)
+    light = look(portions)
     for turn in range(ROUNDS):
-        error = light.error * _in_front(pieces, light)
-        number = np.bincount(pieces.ray, minlength=count)
-        wanting = (np.bincount(pieces.ray, error, count) > tolerance) & (number < MOST_PIECES)
-        long = pieces.end - pieces.start > SHORTEST * np.abs(pieces.end)
-        split = wanting[pieces.ray] & long & (error > tolerance / (4 * np.maximum(number[pieces.ray], 1)))
+        error = light.error * _in_front(portions, light)
+        number = np.bincount(portions.ray, minlength=count)
+        wanting = (np.bincount(portions.ray, error, count) > tolerance) & (number < MOST_PORTIONS)
+        long = portions.end - portions.start > SHORTEST * np.abs(portions.end)
+        split = wanting[portions.ray] & long & (error > tolerance / (4 * np.maximum(number[portions.ray], 1)))
         if not split.any():
             break
-        where = _split(pieces.some(split), light.crossing[split], parts, turn)
+        where = _split(portions.some(split), light.crossing[split], parts, turn)
         times = 1 + split
         first = (np.cumsum(times) - times)[split]
-        pieces = Pieces(*(np.repeat(column, times) for column in pieces))
-        pieces.end[first], pieces.start[first + 1] = where, where
+        portions = Portions(*(np.repeat(column, times) for column in portions))
+        portions.end[first], portions.start[first + 1] = where, where
         new = np.stack([first, first + 1], 1).ravel()
-        fresh = look(pieces.some(new))
+        fresh = look(portions.some(new))
         for name, column in vars(light).items():
             column = np.repeat(column, times, axis=0)
             column[new] = getattr(fresh, name)
             setattr(light, name, column)
-    return pieces, light, evaluations
+    return portions, light, evaluations
 
 
-def _split(pieces: Pieces, crossing: np.ndarray, parts: list[Part], turn: int) -> np.ndarray:
-    """Depths to split at: crossings of control values and borders of supports have precedence in turns, then the middle has its own."""
+def _split(portions: Portions, crossing: np.ndarray, parts: list[Part], turn: int) -> np.ndarray:
+    """Depths to split at: by turns crossings of control values, borders of supports, and always the middle."""
     border = np.full(len(crossing), np.nan)
     for part in parts:
-        border = np.where(np.isnan(border), part.border_by(pieces), border)
-    where = (pieces.start + pieces.end) / 2
+        border = np.where(np.isnan(border), part.border_by(portions), border)
+    where = (portions.start + portions.end) / 2
     for place in ((border, crossing), (crossing, border), ())[turn % 3]:
-        where = np.where((place > pieces.start) & (place < pieces.end), place, where)
+        where = np.where((place > portions.start) & (place < portions.end), place, where)
     return where
 
 
-def _in_front(pieces: Pieces, light: Light) -> np.ndarray:
-    """Transmittance of all of a ray in front of each of its pieces."""
-    return np.exp(-_thickness_before(pieces, light))
+def _in_front(portions: Portions, light: Light) -> np.ndarray:
+    """Transmittance of all of a ray in front of each of its portions."""
+    return np.exp(-_thickness_before(portions, light))
 
 
-def _thickness_before(pieces: Pieces, light: Light) -> np.ndarray:
+def _thickness_before(portions: Portions, light: Light) -> np.ndarray:
     """Ray by ray: a sum over all would lose digits behind a wall."""
-    first = np.searchsorted(pieces.ray, pieces.ray)
-    place = np.arange(len(pieces.ray)) - first
-    table = np.zeros((pieces.ray.max(initial=-1) + 1, place.max(initial=-1) + 2))
-    table[pieces.ray, place + 1] = light.thickness[:, -1]
-    return np.cumsum(table, 1)[pieces.ray, place]
+    first = np.searchsorted(portions.ray, portions.ray)
+    place = np.arange(len(portions.ray)) - first
+    table = np.zeros((portions.ray.max(initial=-1) + 1, place.max(initial=-1) + 2))
+    table[portions.ray, place + 1] = light.thickness[:, -1]
+    return np.cumsum(table, 1)[portions.ray, place]
 
 
-def _composite(rays: Rays, pieces: Pieces, light: Light) -> np.ndarray:
+def _composite(rays: Rays, portions: Portions, light: Light) -> np.ndarray:
     """Front to back: colour, transmittance, depth of half transmittance and error, (rays, 6)."""
-    count, before = len(rays.u), _thickness_before(pieces, light)
+    count, before = len(rays.u), _thickness_before(portions, light)
     front, own = np.exp(-before), light.thickness[:, -1]
-    color = [np.bincount(pieces.ray, front * channel, count) for channel in light.color.T]
+    color = [np.bincount(portions.ray, front * channel, count) for channel in light.color.T]
     depth, half = np.full(count, np.inf), np.log(2)
     crossed = np.flatnonzero((before < half) & (before + own >= half))
-    there = pieces.some(crossed)
+    there = portions.some(crossed)
     share = where_thickness(light.thickness[crossed], half - before[crossed])
     depth[there.ray] = there.start + share * (there.end - there.start)
-    transmittance = np.exp(-np.bincount(pieces.ray, own, count))
-    error = np.bincount(pieces.ray, front * light.error, count)
+    transmittance = np.exp(-np.bincount(portions.ray, own, count))
+    error = np.bincount(portions.ray, front * light.error, count)
     return np.stack([*color, transmittance, depth, np.where(error > 0, error + ROUNDING, 0)], 1)

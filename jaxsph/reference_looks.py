@@ -1,8 +1,8 @@
-"""Light along pieces of rays from what a quantity is at Chebyshev nodes: transfer functions, their kinks and jumps, quadrature.
+"""Light along portions of rays from what a quantity is at Chebyshev nodes: transfer functions, their kinks and jumps, quadrature.
 
-Flow: quantity at nodes of pieces -> [reference_looks] -> extinction and emission at nodes -> light of pieces.
+Flow: quantity at nodes of portions -> [reference_looks] -> extinction and emission at nodes -> light of portions.
 
-On a piece whatever is smooth is taken as the polynomial through `NODES` nodes, ends included; the polynomial through every
+On a portion whatever is smooth is taken as the polynomial through `NODES` nodes, ends included; the polynomial through every
 second of them says how good that is.
 """
 
@@ -15,14 +15,14 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.reference_pieces import Pieces
+from jaxsph.reference_portions import Portions
 
 NODES = 9
 PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 1
 NUDGE = 1e-7  # of the way from an end to the next node: how far inwards the side of a control value is looked at
 KINK = 1 / 8  # error of a gap's integral for a kink within, over the change of slope times the gap squared
 CAUTION = 4  # times what is seen of an error: a quantity that turns between nodes may just touch a control value, unseen
-THICK = 4.0  # optical thickness of a piece beyond which its attenuation is too steep for what two polynomials say
+THICK = 4.0  # optical thickness of a portion beyond which its attenuation is too steep for what two polynomials say
 BISECTIONS = 20  # of a gap between two nodes, before a secant
 
 
@@ -44,7 +44,7 @@ INTEGRATION, EVERY_SECOND = _integration(PLACE), _integration(PLACE[::2])
 
 @dataclasses.dataclass
 class AtNodes:
-    """What is at nodes of pieces, summed over media; each medium adds its own.
+    """What is at nodes of portions, summed over media; each medium adds its own.
 
     Attributes:
         extinction: a unit of path length.
@@ -55,40 +55,42 @@ class AtNodes:
         evaluations: of kernels.
     """
 
-    extinction: Float[np.ndarray, "nodes pieces"]
-    emission: Float[np.ndarray, "3 nodes pieces"]
-    doubt: Float[np.ndarray, " pieces"]
-    crossing: Float[np.ndarray, " pieces"]
-    weight: Float[np.ndarray, " pieces"]
-    evaluations: Float[np.ndarray, " pieces"]
+    extinction: Float[np.ndarray, "nodes portions"]
+    emission: Float[np.ndarray, "3 nodes portions"]
+    doubt: Float[np.ndarray, " portions"]
+    crossing: Float[np.ndarray, " portions"]
+    weight: Float[np.ndarray, " portions"]
+    evaluations: Float[np.ndarray, " portions"]
 
     @classmethod
-    def nothing(cls, pieces: int) -> AtNodes:
+    def nothing(cls, portions: int) -> AtNodes:
         """Empty space."""
-        none = [np.zeros(pieces) for _ in range(3)]
-        return cls(np.zeros((NODES, pieces)), np.zeros((3, NODES, pieces)), none[0], np.full(pieces, np.nan), none[1], none[2])
+        none = [np.zeros(portions) for _ in range(3)]
+        return cls(
+            np.zeros((NODES, portions)), np.zeros((3, NODES, portions)), none[0], np.full(portions, np.nan), none[1], none[2]
+        )
 
 
 @dataclasses.dataclass
 class Light:
-    """What pieces show from right in front of them.
+    """What portions show from right in front of them.
 
     Attributes:
-        color: emitted light, attenuated up to the piece's front.
+        color: emitted light, attenuated up to the portion's front.
         thickness: optical thickness up to each node.
         error: `CAUTION` times the difference between all nodes and every second, of the largest channel and transmittance
-            together, and doubt; 1 for pieces that shine and are thicker than `THICK`.
+            together, and doubt; 1 for portions that shine and are thicker than `THICK`.
         crossing: see `AtNodes`.
     """
 
-    color: Float[np.ndarray, "pieces 3"]
-    thickness: Float[np.ndarray, "pieces nodes"]
-    error: Float[np.ndarray, " pieces"]
-    crossing: Float[np.ndarray, " pieces"]
+    color: Float[np.ndarray, "portions 3"]
+    thickness: Float[np.ndarray, "portions nodes"]
+    error: Float[np.ndarray, " portions"]
+    crossing: Float[np.ndarray, " portions"]
 
 
-def light_of(seen: AtNodes, half_path: Float[np.ndarray, " pieces"]) -> Light:
-    """Integrate extinction up to every node, and emission times transmittance over the piece: of high order in both."""
+def light_of(seen: AtNodes, half_path: Float[np.ndarray, " portions"]) -> Light:
+    """Integrate extinction up to every node, and emission times transmittance over the portion: of high order in both."""
     color, thickness = _integrated(seen.extinction, seen.emission, half_path, INTEGRATION)
     coarse, thinner = _integrated(seen.extinction[::2], seen.emission[:, ::2], half_path, EVERY_SECOND)
     error = np.abs(color - coarse).max(0) + np.abs(np.exp(-thickness[-1]) - np.exp(-thinner[-1])) + seen.doubt
@@ -104,7 +106,7 @@ def _integrated(extinction: np.ndarray, emission: np.ndarray, half_path: np.ndar
 class Look:
     """A transfer function in float64, as a medium's nodes are looked up in it.
 
-    At a jump the end of a piece is on the side that the piece is on, so that a piece that ends there is as smooth as any.
+    At a jump the end of a portion is on the side that the portion is on, so that a portion that ends there is as smooth as any.
     """
 
     def __init__(self, transfer: TransferFunction):
@@ -120,8 +122,8 @@ class Look:
         light = np.concatenate([table[3:], table[:3] * table[3]])
         self._jump, self._turn, self._bend = _bends(light, width)
 
-    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, pieces: Pieces, slant: np.ndarray) -> None:
-        """Add what pieces number `which` show for their `quantity` (nodes, which); nothing where that is NaN."""
+    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, slant: np.ndarray) -> None:
+        """Add what portions number `which` show for their `quantity` (nodes, which); nothing where that is NaN."""
         there = ~np.isnan(quantity[0])
         which, quantity = which[there], quantity[:, there]
         inwards = quantity.copy()
@@ -133,13 +135,13 @@ class Look:
         red, green, blue, extinction = (base[segment] + part * change[segment] for base, change in pairs)
         seen.extinction[:, which] += extinction
         seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
-        half = (pieces.end[which] - pieces.start[which]) / 2
-        upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[pieces.ray[which]]
+        half = (portions.end[which] - portions.start[which]) / 2
+        upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
         bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
         skips = (np.abs(np.diff(self._rank[segment], axis=0)) > 1) | self._hidden(quantity, segment)
         unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
         seen.doubt[which] += np.minimum(unseen.sum(0), 1)
-        self._cross(seen, which, quantity, segment, pieces)
+        self._cross(seen, which, quantity, segment, portions)
 
     def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
         """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
@@ -150,8 +152,8 @@ class Look:
         least, most = np.minimum(segment[1:], segment[:-1]), np.maximum(segment[1:], segment[:-1])
         return (self._rank[lowest] < self._rank[least]) | (self._rank[highest] > self._rank[most])
 
-    def _cross(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, segment: np.ndarray, pieces: Pieces) -> None:
-        """Where the quantity crosses the control value that bends most, those amid a piece before those at its ends."""
+    def _cross(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, segment: np.ndarray, portions: Portions) -> None:
+        """Where the quantity crosses the control value that bends most, those amid a portion before those at its ends."""
         upper = np.maximum(segment[1:], segment[:-1])
         amid = 1 - ((PLACE[1:] + PLACE[:-1]) / 2) ** 2
         weight = np.where(segment[1:] != segment[:-1], self._bend[upper] * amid[:, None], 0)
@@ -160,8 +162,8 @@ class Look:
         gap, of = gap[some], which[some]
         value = self._values[upper[gap, some] - 1]
         place = _crossing(COEFFICIENTS @ quantity[:, some], value, PLACE[gap], PLACE[gap + 1])
-        half = (pieces.end[of] - pieces.start[of]) / 2
-        seen.crossing[of] = pieces.start[of] + (place + 1) * half
+        half = (portions.end[of] - portions.start[of]) / 2
+        seen.crossing[of] = portions.start[of] + (place + 1) * half
         seen.weight[of] = best[some]
 
 
@@ -199,6 +201,6 @@ def _crossing(coefficients: np.ndarray, value: np.ndarray, low: np.ndarray, high
 
 
 def where_thickness(thickness: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Share of pieces before their thickness (pieces, nodes) reaches `target` (pieces,)."""
+    """Share of portions before their thickness (portions, nodes) reaches `target` (portions,)."""
     gap = np.clip((thickness < target[:, None]).sum(1) - 1, 0, NODES - 2)
     return (_crossing(COEFFICIENTS @ thickness.T, target, PLACE[gap], PLACE[gap + 1]) + 1) / 2

@@ -1,6 +1,6 @@
-"""What a scene has along rays, in float64: particles, volumes and points at the nodes of pieces.
+"""What a scene has along rays, in float64: particles, volumes and points at the nodes of portions.
 
-Flow: scene, rays -> [reference_media] -> cuts of rays; pieces -> [reference_media] -> extinction and emission at nodes.
+Flow: scene, rays -> [reference_media] -> cuts of rays; portions -> [reference_media] -> extinction and emission at nodes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
-from jaxsph.reference_pieces import Cuts, Lists, Pieces, borders, lists
 from jaxsph.reference_points import at_offset, kinks
+from jaxsph.reference_portions import Cuts, Lists, Portions, borders, lists
 
-INWARDS = 1e-9  # of a piece: how far inside its ends particles are looked at, where those that begin there weigh something
+INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 
 
 class Part(abc.ABC):
@@ -35,23 +35,23 @@ class Part(abc.ABC):
 
     @abc.abstractmethod
     def cuts(self) -> Cuts:
-        """Where it begins or ends, and what else pieces must not hold inside."""
+        """Where it begins or ends, and what else portions must not hold inside."""
 
     @abc.abstractmethod
-    def lies_over(self, roots: Pieces) -> np.ndarray:
-        """Mask of the pieces that it has something in."""
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """Mask of the portions that it has something in."""
 
     @abc.abstractmethod
     def keep(self, which: np.ndarray) -> None:
         """Number roots anew: only those of a mask are left."""
 
     @abc.abstractmethod
-    def add(self, seen: AtNodes, pieces: Pieces) -> None:
+    def add(self, seen: AtNodes, portions: Portions) -> None:
         """Add what it has at their nodes."""
 
-    def border_by(self, pieces: Pieces) -> np.ndarray:
-        """The border nearest to the middle of each piece, where only a derivative jumps, or NaN."""
-        return np.full(len(pieces.ray), np.nan)
+    def border_by(self, portions: Portions) -> np.ndarray:
+        """The border nearest to the middle of each portion, where only a derivative jumps, or NaN."""
+        return np.full(len(portions.ray), np.nan)
 
 
 class Whole(abc.ABC):
@@ -107,7 +107,7 @@ class ParticlesMet(Part):
         """See `Part`."""
         return borders(self.chords, 1 / self._scale)
 
-    def lies_over(self, roots: Pieces) -> np.ndarray:
+    def lies_over(self, roots: Portions) -> np.ndarray:
         """See `Part`."""
         self._lists = lists(self._rays, roots, self.chords)
         return self._lists.length > 0
@@ -116,24 +116,24 @@ class ParticlesMet(Part):
         """See `Part`."""
         self._lists = self._lists.some(which)
 
-    def add(self, seen: AtNodes, pieces: Pieces) -> None:
+    def add(self, seen: AtNodes, portions: Portions) -> None:
         """See `Part`."""
-        count = self._lists.length[pieces.root]
+        count = self._lists.length[portions.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
         quantity = np.empty((NODES, len(which)))
-        for some in self._lists.batches(pieces.root[which]):
-            quantity[:, some] = self._mean(pieces.some(which[some]))
-        self._whole.look.add(seen, which, _filled(quantity), pieces, self._rays.slant)
+        for some in self._lists.batches(portions.root[which]):
+            quantity[:, some] = self._mean(portions.some(which[some]))
+        self._whole.look.add(seen, which, _filled(quantity), portions, self._rays.slant)
 
-    def _mean(self, pieces: Pieces) -> np.ndarray:
-        """Q at nodes of pieces (nodes, pieces), relative to the first particle of each; NaN where nothing weighs.
+    def _mean(self, portions: Portions) -> np.ndarray:
+        """Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs.
 
         With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
         """
-        which, chord = self._lists.over(pieces.root)
-        first = np.searchsorted(which, np.arange(len(pieces.ray)))
-        middle, half = (pieces.start + pieces.end) / 2, (pieces.end - pieces.start) / 2
+        which, chord = self._lists.over(portions.root)
+        first = np.searchsorted(which, np.arange(len(portions.ray)))
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         scale, at = self._scale[chord], middle[which]
         place = PLACE.copy()
         place[[0, -1]] *= 1 - INWARDS
@@ -147,16 +147,16 @@ class ParticlesMet(Part):
         moved = np.add.reduceat(weight * rest, first, axis=1)
         return base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0)
 
-    def border_by(self, pieces: Pieces) -> np.ndarray:
+    def border_by(self, portions: Portions) -> np.ndarray:
         """See `Part`."""
-        which, chord = self._lists.over(pieces.root)
-        middle, half = (pieces.start + pieces.end) / 2, (pieces.end - pieces.start) / 2
+        which, chord = self._lists.over(portions.root)
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
         off = np.abs(border - middle[which])
         near = off < half[which] / 2
         which, border, off = which[near], border[near], off[near]
         order = np.lexsort((-off, which))
-        found = np.full(len(pieces.ray), np.nan)
+        found = np.full(len(portions.ray), np.nan)
         found[which[order]] = border[order]  # the last is the nearest
         return found
 
@@ -206,7 +206,7 @@ class VolumeMet(Part):
         ray, place = np.nonzero((depth >= enter[:, None]) & (depth <= leave[:, None]))
         return ray, depth[ray, place]
 
-    def lies_over(self, roots: Pieces) -> np.ndarray:
+    def lies_over(self, roots: Portions) -> np.ndarray:
         """See `Part`."""
         at = self._at(roots.ray, (roots.start + roots.end) / 2)
         self._over = np.all((at >= 0) & (at <= self._last), axis=-1)
@@ -216,10 +216,10 @@ class VolumeMet(Part):
         """See `Part`."""
         self._over = self._over[which]
 
-    def add(self, seen: AtNodes, pieces: Pieces) -> None:
-        """A piece is in one cell, whose cubic polynomial holds up to its ends."""
-        which = np.flatnonzero(self._over[pieces.root])
-        own = pieces.some(which)
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """A portion is in one cell, whose cubic polynomial holds up to its ends."""
+        which = np.flatnonzero(self._over[portions.root])
+        own = portions.some(which)
         middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
         cell = np.clip(self._at(own.ray, middle).astype(int), 0, self._last - 1)
         part = self._at(own.ray, middle + PLACE[:, None] * half) - cell
@@ -227,7 +227,7 @@ class VolumeMet(Part):
         for corner in np.ndindex(2, 2, 2):
             share = np.where(corner, part, 1 - part).prod(-1)
             quantity += share * self._whole.values[tuple((cell + corner).T)]
-        self._whole.look.add(seen, which, quantity, pieces, self._rays.slant)
+        self._whole.look.add(seen, which, quantity, portions, self._rays.slant)
 
     def _at(self, ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
         return self._start[ray] + depth[..., None] * self._direction[ray]
@@ -270,7 +270,7 @@ class PointsMet(Part):
         depths += [chords.entry, chords.exit]
         return np.tile(chords.ray, len(depths)), np.concatenate(depths)
 
-    def lies_over(self, roots: Pieces) -> np.ndarray:
+    def lies_over(self, roots: Portions) -> np.ndarray:
         """See `Part`."""
         self._lists: Lists = lists(self._rays, roots, self.chords)
         return self._lists.length > 0
@@ -279,17 +279,17 @@ class PointsMet(Part):
         """See `Part`."""
         self._lists = self._lists.some(which)
 
-    def add(self, seen: AtNodes, pieces: Pieces) -> None:
+    def add(self, seen: AtNodes, portions: Portions) -> None:
         """See `Part`."""
-        for some in self._lists.batches(pieces.root):
-            self._add(seen, some, pieces.some(some))
+        for some in self._lists.batches(portions.root):
+            self._add(seen, some, portions.some(some))
 
-    def _add(self, seen: AtNodes, some: np.ndarray, pieces: Pieces) -> None:
-        which, chord = self._lists.over(pieces.root)
+    def _add(self, seen: AtNodes, some: np.ndarray, portions: Portions) -> None:
+        which, chord = self._lists.over(portions.root)
         if not len(which):
             return
         whole, ray, point = self._whole, self.chords.ray[chord], self.chords.sphere[chord]
-        middle, half = (pieces.start + pieces.end) / 2, (pieces.end - pieces.start) / 2
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         depth = middle[which] + PLACE[:, None] * half[which]
         place = self._rays.start[ray] + depth[..., None] * self._rays.direction[ray]
         offset = (place - whole.spheres.center[point]) / whole.radius[point][:, None] @ whole.axes

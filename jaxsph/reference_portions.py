@@ -1,6 +1,6 @@
-"""Rays cut into pieces: nothing begins or ends inside of a piece, and a list says which chords lie over it.
+"""Rays cut into portions: nothing begins or ends inside of a portion, and a list says which chords lie over it.
 
-Flow: rays, chords -> [reference_pieces] -> reference_media -> reference_integral.
+Flow: rays, chords -> [reference_portions] -> reference_media -> reference_integral.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from jaxsph.reference_chords import Chords, Rays, ranges
 
 LONGEST = 0.25  # of a support: see `borders`
 FEW = 4  # chords, see `borders`
-PAIRS = 1 << 12  # of a piece and a chord, whose nodes are looked at at once: what a cache holds
+PAIRS = 1 << 12  # of a portion and a chord, whose nodes are looked at at once: what a cache holds
 
 
-class Pieces(NamedTuple):
+class Portions(NamedTuple):
     """Parts of rays, in order of rays and, within a ray, of depth.
 
     Attributes:
         ray: number of its ray.
         start, end: depths.
-        root: number of the piece of the first cut that it is a part of: lists are of those.
+        root: number of the portion of the first cut that it is a part of: lists are of those.
     """
 
-    ray: Int[np.ndarray, " pieces"]
-    start: Float[np.ndarray, " pieces"]
-    end: Float[np.ndarray, " pieces"]
-    root: Int[np.ndarray, " pieces"]
+    ray: Int[np.ndarray, " portions"]
+    start: Float[np.ndarray, " portions"]
+    end: Float[np.ndarray, " portions"]
+    root: Int[np.ndarray, " portions"]
 
-    def some(self, which: np.ndarray) -> Pieces:
+    def some(self, which: np.ndarray) -> Portions:
         """Those of the given numbers, or a mask."""
-        return Pieces(*(column[which] for column in self))
+        return Portions(*(column[which] for column in self))
 
 
 class Lists(NamedTuple):
@@ -43,15 +43,15 @@ class Lists(NamedTuple):
     length: Int[np.ndarray, " roots"]
     chord: Int[np.ndarray, " pairs"]
 
-    def batches(self, root: Int[np.ndarray, " pieces"]) -> list[np.ndarray]:
-        """Numbers of pieces, as many at a time as have about `PAIRS` chords over them together."""
+    def batches(self, root: Int[np.ndarray, " portions"]) -> list[np.ndarray]:
+        """Numbers of portions, as many at a time as have about `PAIRS` chords over them together."""
         ends = np.cumsum(self.length[root])
         pairs = int(ends[-1]) if len(ends) else 0
         some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(PAIRS, pairs, PAIRS)))
         return [part for part in some if len(part)]
 
-    def over(self, root: Int[np.ndarray, " pieces"]) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of a piece (a place in `root`) and a chord, piece by piece."""
+    def over(self, root: Int[np.ndarray, " portions"]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a portion (a place in `root`) and a chord, portion by portion."""
         which, place = ranges(self.first[root], self.length[root])
         return which, self.chord[place]
 
@@ -70,7 +70,7 @@ def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
     Those where the union of all chords of a ray begins or ends, as the medium does there: all of them, and where less than
     `FEW` chords are on one side, as a mean of few may change quickly. Of the others, where
     only a higher derivative jumps and which are cut at where the error demands it, the first in each of the bins that are
-    `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single piece, so that
+    `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single portion, so that
     none is overlooked between nodes.
     """
     ray, depth = np.tile(chords.ray, 2), np.concatenate([chords.entry, chords.exit])
@@ -89,7 +89,7 @@ def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
     return ray[kept], depth[kept]
 
 
-def cut(rays: Rays, cuts: list[Cuts]) -> Pieces:
+def cut(rays: Rays, cuts: list[Cuts]) -> Portions:
     """What lies between neighbouring cuts of a ray, between near and far."""
     count = len(rays.u)
     ends = np.repeat([rays.near, rays.far], count)
@@ -99,24 +99,24 @@ def cut(rays: Rays, cuts: list[Cuts]) -> Pieces:
     ray, depth = ray[order], depth[order]
     held = (ray[1:] == ray[:-1]) & (depth[1:] > depth[:-1])
     start, end = depth[:-1][held], depth[1:][held]
-    return Pieces(ray[:-1][held], start, end, np.arange(len(start)))
+    return Portions(ray[:-1][held], start, end, np.arange(len(start)))
 
 
-def lists(rays: Rays, pieces: Pieces, chords: Chords) -> Lists:
-    """Which chords lie over which pieces."""
+def lists(rays: Rays, portions: Portions, chords: Chords) -> Lists:
+    """Which chords lie over which portions."""
     width = 2 * (rays.far - rays.near)
 
     def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
         return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
 
-    last = len(pieces.ray) - 1
-    first = np.searchsorted(key(pieces.ray, pieces.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
-    beyond = np.searchsorted(key(pieces.ray, pieces.start), key(chords.ray, chords.exit)) + 1
+    last = len(portions.ray) - 1
+    first = np.searchsorted(key(portions.ray, portions.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
+    beyond = np.searchsorted(key(portions.ray, portions.start), key(chords.ray, chords.exit)) + 1
     first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
-    chord, piece = ranges(first, np.maximum(beyond - first, 0))
-    over = (pieces.ray[piece] == chords.ray[chord]) & (chords.entry[chord] < pieces.end[piece])
-    over &= chords.exit[chord] > pieces.start[piece]
-    chord, piece = chord[over], piece[over]
-    count = np.bincount(piece, minlength=len(pieces.ray))
-    small = piece.astype(np.uint16) if len(count) <= 1 << 16 else piece  # which sorts faster
+    chord, portion = ranges(first, np.maximum(beyond - first, 0))
+    over = (portions.ray[portion] == chords.ray[chord]) & (chords.entry[chord] < portions.end[portion])
+    over &= chords.exit[chord] > portions.start[portion]
+    chord, portion = chord[over], portion[over]
+    count = np.bincount(portion, minlength=len(portions.ray))
+    small = portion.astype(np.uint16) if len(count) <= 1 << 16 else portion  # which sorts faster
     return Lists(np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")])
