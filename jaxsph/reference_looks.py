@@ -23,6 +23,7 @@ NUDGE = 1e-7  # of the way from an end to the next node: how far inwards the sid
 KINK = 1 / 8  # error of a gap's integral for a kink within, over the change of slope times the gap squared
 CAUTION = 4  # times what is seen of an error: a quantity that turns between nodes may just touch a control value, unseen
 THICK = 4.0  # optical thickness of a portion beyond which its attenuation is too steep for what two polynomials say
+ROUNDED = 64 * np.finfo(float).eps  # of the largest value, that a quantity may be off
 BISECTIONS = 20  # of a gap between two nodes, before a secant
 
 
@@ -145,7 +146,7 @@ class Look:
 
     def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
         """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
-        slack = 1e-9 * np.ptp(quantity, 0) + 8 * np.finfo(float).eps * np.abs(quantity).max(0)
+        slack = 1e-9 * np.ptp(quantity, 0) + ROUNDED * (np.abs(quantity).max(0) + np.abs(self._values).max())
         within = quantity[0] + np.tensordot(WITHIN, quantity - quantity[0], 1)
         lowest = np.searchsorted(self._values, within.min(1) + slack, "right")
         highest = np.searchsorted(self._values, within.max(1) - slack, "right")

@@ -235,7 +235,7 @@ def test_it_is_what_ever_more_samples_tend_to(frames, projection, mix):
     assert errors[1] < errors[0] / 4 and errors[2] < errors[1] / 4 and errors[2] < 1e-3
 
 
-@settings(max_examples=12)
+@settings(max_examples=25, derandomize=True)  # an estimate: one ray in thousands may be beyond it
 @given(SEEDS, st.sampled_from(sorted(KERNELS)), st.sampled_from(PROJECTIONS))
 def test_its_own_error_holds_what_a_tighter_tolerance_changes(frames, seed, kernel, projection):
     rng = np.random.default_rng(seed)
@@ -246,7 +246,7 @@ def test_its_own_error_holds_what_a_tighter_tolerance_changes(frames, seed, kern
     assert (differences(loose, tight) <= loose.error_bound + tight.error_bound).all()
 
 
-@settings(max_examples=12)
+@settings(max_examples=25, derandomize=True)  # an estimate: one ray in thousands may be beyond it
 @given(SEEDS, st.sampled_from(sorted(KERNELS)), st.sampled_from(PROJECTIONS))
 def test_its_own_error_holds_for_walls_bands_and_jumps_too(frames, adversary, seed, kernel, projection):
     rng = np.random.default_rng(seed)
