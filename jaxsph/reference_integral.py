@@ -65,7 +65,8 @@ def integral(
     Returns:
         Image of float64 NumPy arrays. `error_bound` is the own error: four times the sum over portions of what all nodes and
         every second node differ by, and of what kinks and jumps of transfer functions can hide between nodes, times the
-        transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are what is shown: on random scenes one ray in thousands errs by more. Not
+        transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are what is shown: on
+        random scenes one ray in thousands errs by more. Above `tolerance` where no portion could be split any more. Not
         `certified`. `stats` counts `rays`, `chords`, `portions` and `evaluations`.
 
     Raises:
