@@ -94,7 +94,7 @@ def _spread(points: Points, middle: np.ndarray, perspective: bool) -> str:
 def _integral(profile: Profile, chords: Chords, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Of the profile along rays from `start` to `end`, (rays, samples), in radii; split where a profile may have a kink."""
     square = (chords.foot**2).sum(-1)[:, None]
-    rings = np.sqrt(np.maximum(_kinks(profile)[:, None, None] ** 2 - square, 0))
+    rings = np.sqrt(np.maximum(kinks(profile)[:, None, None] ** 2 - square, 0))
     breaks = [*-rings[::-1], *rings]
     total = np.zeros(np.broadcast_shapes(start.shape, end.shape))
     for low, high in itertools.pairwise(breaks):
@@ -104,17 +104,21 @@ def _integral(profile: Profile, chords: Chords, start: np.ndarray, end: np.ndarr
     return total
 
 
-def _kinks(profile: Profile) -> np.ndarray:
+def kinks(profile: Profile) -> np.ndarray:
     """Distances in [0, 1] between which a profile is smooth, from 0 to 1."""
     return np.linspace(0, 1, profile.values.shape[0]) if isinstance(profile, Table) else np.array([0.0, 1.0])
 
 
 def _value(profile: Profile, chords: Chords, t: np.ndarray) -> np.ndarray:
     """A profile at places along rays, (rays, samples)."""
-    offset = chords.foot[:, None] + t[..., None] * chords.direction[:, None]
+    return at_offset(profile, chords.foot[:, None] + t[..., None] * chords.direction[:, None], chords.attributes)
+
+
+def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.ndarray]) -> np.ndarray:
+    """A profile at offsets (..., 3) in radii, along world axes, of points with the given attributes (of any shape up to ...)."""
     if isinstance(profile, Shaped):
         with jax.enable_x64(True):
-            given = {name: jnp.full(t.shape, value) for name, value in chords.attributes.items()}
+            given = {name: jnp.asarray(np.broadcast_to(value, offset.shape[:-1])) for name, value in attributes.items()}
             x, y, z = (jnp.asarray(part) for part in np.moveaxis(offset, -1, 0))
             return np.asarray(profile.function((x, y, z), given), np.float64)
     distance = np.linalg.norm(offset, axis=-1)
@@ -123,5 +127,5 @@ def _value(profile: Profile, chords: Chords, t: np.ndarray) -> np.ndarray:
     if isinstance(profile, Ball):
         return np.ones_like(distance)
     if isinstance(profile, Table):
-        return np.interp(distance, _kinks(profile), np.asarray(profile.values, np.float64))
+        return np.interp(distance, kinks(profile), np.asarray(profile.values, np.float64))
     raise ValueError(f"`profile` {type(profile).__name__} is unknown to the reference, which has those of `model.profiles`")

@@ -1,0 +1,217 @@
+r"""The light integral itself, along the ray of each pixel, in float64 NumPy: what every way of sampling it is judged by.
+
+Flow: scene, camera, pixels -> rays -> portions -> light of portions, halved until it is known -> [reference_integral] -> image.
+
+$I = \int T(l)\,c(l)\,\sigma(l)\,dl$ over the path length l, with $T(l) = \exp(-\int_0^l \sigma)$.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxsph.model.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.reference_chords import Rays, blocks, rays_of
+from jaxsph.reference_looks import AtNodes, Light, light_of, where_thickness
+from jaxsph.reference_media import Part, Whole, parts_of
+from jaxsph.reference_portions import Portions, cut
+
+BLOCK = 128  # rays that share arrays
+ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
+MOST_PORTIONS = 1 << 16  # of a ray; beyond, its error is told as it is
+LEAST_TOLERANCE = 1e-12
+ROUNDING = 64 * np.finfo(float).eps  # of a ray's sums
+SHORTEST = 4 * np.finfo(float).eps  # of the depth
+
+Progress = Callable[[int, int], None]
+
+
+def integral(
+    scene: Scene,
+    camera: Camera,
+    *,
+    pixels: tuple[Any, Any] | None = None,
+    every: int = 1,
+    tolerance: float = 1e-7,
+    progress: Progress | None = None,
+) -> Image:
+    r"""The light integral along rays between `camera.near` and `camera.far`, by quadrature of a known error.
+
+    Extinctions of all parts add up, and so do their emissions, colour times extinction. (With `mix="opacity"` samples show the
+    sum of colours times opacities; in the limit of short intervals opacities are thicknesses: it has the same integral.)
+    Particles: $Q = \sum q V W / \sum V W$ wherever a support is, nothing elsewhere. Points are taken by their true density,
+    spread "chords"; "feet" and "centres" lay it elsewhere, as ways of rendering it.
+
+    Rays are cut where supports, cells of volumes and points begin and end, into portions; of supports that many others overlap
+    only some ends are cut at from the start. On a portion extinction and emission are taken as polynomials of degree 8 through
+    Chebyshev nodes, thickness as the integral of the one, light as that of the other times transmittance. Portions whose light or
+    transmittance differs from what every second node says are split: where a quantity crosses a control value of a transfer
+    function, at the end of a support, or halved.
+
+    Args:
+        scene: particles, volumes and points; their (possibly float32) numbers are taken as exact, as is the camera.
+        camera: where from, and how large the image is.
+        pixels: rows and columns of some pixels, integers of one shape, which the image's fields then have.
+        every: where `pixels` is None, only every so many rows and columns, as in `jaxsph.reference.render`.
+        tolerance: of a ray's colours and transmittance, an estimated error that is worked down to; at least 1e-12.
+        progress: called as `progress(done, total)` in rays.
+
+    Returns:
+        Image of float64 NumPy arrays. `error_bound` is the own error: four times the sum over portions of what all nodes and
+        every second node differ by, and of what kinks and jumps of transfer functions can hide between nodes, times the
+        transmittance in front. It is an estimate, and a cautious one, as the polynomials of all nodes are what is shown: on
+        random scenes one ray in thousands errs by more. Above `tolerance` where no portion could be split any more. Not
+        `certified`. `stats` counts `rays`, `chords`, `portions` and `evaluations`.
+
+    Raises:
+        ValueError: pixels out of the image, a tolerance below 1e-12, a scene of nothing, or of media unknown here.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, equations 1 and 2 (field). Kaehler, Abel & Hege 2007, equations 1 to 4 (parts).
+    """
+    started = time.perf_counter()
+    scene.check()
+    if scene.media:
+        raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
+    if not tolerance >= LEAST_TOLERANCE:
+        raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
+    rows, columns = _pixels(camera, pixels, every)
+    rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
+    found, counts = _all(rays, parts, tolerance, progress or (lambda done, total: None))
+    color: Any = found[:, :3].reshape(*rows.shape, 3)
+    transmittance, depth, error, evaluations = found[:, 3:].T.reshape(4, *rows.shape)
+    stats = _stats(found, counts) | {"seconds": {"cast": time.perf_counter() - started}}
+    return Image(color, transmittance, depth, error, evaluations, False, 0, stats)
+
+
+def _all(rays: Rays, parts: list[Whole], tolerance: float, told: Progress) -> tuple[np.ndarray, np.ndarray]:
+    """See `_block`."""
+    found, counts, done = np.empty((len(rays.u), 7)), np.zeros(2, int), 0
+    for some in blocks(rays, BLOCK):
+        found[some], more = _block(rays.some(some), parts, tolerance)
+        counts, done = counts + more, done + len(some)
+        told(done, len(rays.u))
+    return found, counts
+
+
+def _stats(found: np.ndarray, counts: np.ndarray) -> dict[str, Any]:
+    total = int(found[:, 6].sum())
+    of_image = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
+    return of_image | {"rays": len(found), "chords": int(counts[0]), "portions": int(counts[1])}
+
+
+def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple[Int[np.ndarray, "..."], Int[np.ndarray, "..."]]:
+    """Rows and columns that are asked for."""
+    if every < 1:
+        raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
+    if pixels is None:
+        sides = (np.arange(size)[every // 2 :: every] for size in (camera.height, camera.width))
+        rows, columns = np.meshgrid(*sides, indexing="ij")
+        return rows, columns
+    if every != 1:
+        raise ValueError(f"`every` = {every} goes with the whole image; give `pixels` or `every`")
+    if len(pixels) != 2:
+        raise ValueError(f"`pixels` must be a pair, rows and columns, got {len(pixels)} arrays; as `numpy.nonzero` gives them")
+    rows, columns = (np.asarray(part) for part in pixels)
+    if rows.shape != columns.shape:
+        raise ValueError(f"`pixels` must be rows and columns of one shape, got {rows.shape} and {columns.shape}")
+    for name, given, size in (("rows", rows, camera.height), ("columns", columns, camera.width)):
+        if given.size and given.dtype.kind not in "iu":
+            raise ValueError(f"`pixels` must be integers, but {name} are {given.dtype}; pixel 0 has its ray at 1/2")
+        if given.size and not (given.min() >= 0 and given.max() < size):
+            raise ValueError(f"`pixels` must have {name} from 0 to {size - 1}, got {given.min()} .. {given.max()}")
+    return rows.astype(int), columns.astype(int)
+
+
+def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
+    parts = [whole.seen_by(rays) for whole in wholes]
+    roots = cut(rays, [part.cuts() for part in parts])
+    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
+    for part in parts:
+        part.keep(held)
+    portions = roots.some(held)._replace(root=np.arange(held.sum()))
+    portions, light, evaluations = _refined(rays, parts, portions, tolerance)
+    chords = sum(len(part.chords.ray) for part in parts)
+    return np.concatenate([_composite(rays, portions, light), evaluations[:, None]], 1), np.array([chords, len(portions.ray)])
+
+
+def _refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float) -> tuple[Portions, Light, np.ndarray]:
+    """Split portions until the error of every ray is within tolerance, or no portion can be split."""
+    count = len(rays.u)
+    evaluations = np.zeros(count)
+
+    def look(some: Portions) -> Light:
+        seen = AtNodes.nothing(len(some.ray))
+        for part in parts:
+            part.add(seen, some)
+        evaluations[:] += np.bincount(some.ray, seen.evaluations, count)
+        return light_of(seen, (some.end - some.start) / 2 * rays.slant[some.ray])
+
+    light = look(portions)
+    for turn in range(ROUNDS):
+        error = light.error * _in_front(portions, light)
+        number = np.bincount(portions.ray, minlength=count)
+        wanting = (np.bincount(portions.ray, error, count) > tolerance) & (number < MOST_PORTIONS)
+        long = portions.end - portions.start > SHORTEST * np.abs(portions.end)
+        split = wanting[portions.ray] & long & (error > tolerance / (4 * np.maximum(number[portions.ray], 1)))
+        if not split.any():
+            break
+        where = _split(portions.some(split), light.crossing[split], parts, turn)
+        times = 1 + split
+        first = (np.cumsum(times) - times)[split]
+        portions = Portions(*(np.repeat(column, times) for column in portions))
+        portions.end[first], portions.start[first + 1] = where, where
+        new = np.stack([first, first + 1], 1).ravel()
+        fresh = look(portions.some(new))
+        for name, column in vars(light).items():
+            column = np.repeat(column, times, axis=0)
+            column[new] = getattr(fresh, name)
+            setattr(light, name, column)
+    return portions, light, evaluations
+
+
+def _split(portions: Portions, crossing: np.ndarray, parts: list[Part], turn: int) -> np.ndarray:
+    """Depths to split at: by turns crossings of control values, borders of supports, and always the middle."""
+    border = np.full(len(crossing), np.nan)
+    for part in parts:
+        border = np.where(np.isnan(border), part.border_by(portions), border)
+    where = (portions.start + portions.end) / 2
+    for place in ((border, crossing), (crossing, border), ())[turn % 3]:
+        where = np.where((place > portions.start) & (place < portions.end), place, where)
+    return where
+
+
+def _in_front(portions: Portions, light: Light) -> np.ndarray:
+    """Transmittance of all of a ray in front of each of its portions."""
+    return np.exp(-_thickness_before(portions, light))
+
+
+def _thickness_before(portions: Portions, light: Light) -> np.ndarray:
+    """Ray by ray: a sum over all would lose digits behind a wall."""
+    first = np.searchsorted(portions.ray, portions.ray)
+    place = np.arange(len(portions.ray)) - first
+    table = np.zeros((portions.ray.max(initial=-1) + 1, place.max(initial=-1) + 2))
+    table[portions.ray, place + 1] = light.thickness[:, -1]
+    return np.cumsum(table, 1)[portions.ray, place]
+
+
+def _composite(rays: Rays, portions: Portions, light: Light) -> np.ndarray:
+    """Front to back: colour, transmittance, depth of half transmittance and error, (rays, 6)."""
+    count, before = len(rays.u), _thickness_before(portions, light)
+    front, own = np.exp(-before), light.thickness[:, -1]
+    color = [np.bincount(portions.ray, front * channel, count) for channel in light.color.T]
+    depth, half = np.full(count, np.inf), np.log(2)
+    crossed = np.flatnonzero((before < half) & (before + own >= half))
+    there = portions.some(crossed)
+    share = where_thickness(light.thickness[crossed], half - before[crossed])
+    depth[there.ray] = there.start + share * (there.end - there.start)
+    transmittance = np.exp(-np.bincount(portions.ray, own, count))
+    error = np.bincount(portions.ray, front * light.error, count)
+    return np.stack([*color, transmittance, depth, np.where(error > 0, error + ROUNDING, 0)], 1)

@@ -1,0 +1,207 @@
+"""Light along portions of rays from what a quantity is at Chebyshev nodes: transfer functions, their kinks and jumps, quadrature.
+
+Flow: quantity at nodes of portions -> [reference_looks] -> extinction and emission at nodes -> light of portions.
+
+On a portion whatever is smooth is taken as the polynomial through `NODES` nodes, ends included; the polynomial through every
+second of them says how good that is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial import chebyshev
+
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.reference_portions import Portions
+
+NODES = 9
+PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 1
+NUDGE = 1e-7  # of the way from an end to the next node: how far inwards the side of a control value is looked at
+KINK = 1 / 8  # error of a gap's integral for a kink within, over the change of slope times the gap squared
+CAUTION = 4  # times what is seen of an error: a quantity that turns between nodes may just touch a control value, unseen
+THICK = 4.0  # optical thickness of a portion beyond which its attenuation is too steep for what two polynomials say
+ROUNDED = 64 * np.finfo(float).eps  # of the largest value, that a quantity may be off
+BISECTIONS = 20  # of a gap between two nodes, before a secant
+
+
+def _coefficients(place: np.ndarray) -> np.ndarray:
+    """Chebyshev coefficients of polynomials through values at nodes."""
+    return np.linalg.inv(chebyshev.chebvander(place, len(place) - 1))
+
+
+def _integration(place: np.ndarray) -> np.ndarray:
+    """From values at nodes to the integrals of their polynomial from -1 to each node."""
+    whole = chebyshev.chebint(_coefficients(place), lbnd=-1)
+    return chebyshev.chebvander(place, len(place)) @ whole
+
+
+COEFFICIENTS = _coefficients(PLACE)
+WITHIN = chebyshev.chebvander(PLACE[:-1, None] + np.diff(PLACE)[:, None] * [0.2, 0.4, 0.6, 0.8], NODES - 1) @ COEFFICIENTS
+INTEGRATION, EVERY_SECOND = _integration(PLACE), _integration(PLACE[::2])
+
+
+@dataclasses.dataclass
+class AtNodes:
+    """What is at nodes of portions, summed over media; each medium adds its own.
+
+    Attributes:
+        extinction: a unit of path length.
+        emission: colour times extinction.
+        doubt: error of light for what may lie unseen between nodes.
+        crossing: depth where a quantity crosses a control value, NaN where none does.
+        weight: how much extinction changes there.
+        evaluations: of kernels.
+    """
+
+    extinction: Float[np.ndarray, "nodes portions"]
+    emission: Float[np.ndarray, "3 nodes portions"]
+    doubt: Float[np.ndarray, " portions"]
+    crossing: Float[np.ndarray, " portions"]
+    weight: Float[np.ndarray, " portions"]
+    evaluations: Float[np.ndarray, " portions"]
+
+    @classmethod
+    def nothing(cls, portions: int) -> AtNodes:
+        """Empty space."""
+        none = [np.zeros(portions) for _ in range(3)]
+        return cls(
+            np.zeros((NODES, portions)), np.zeros((3, NODES, portions)), none[0], np.full(portions, np.nan), none[1], none[2]
+        )
+
+
+@dataclasses.dataclass
+class Light:
+    """What portions show from right in front of them.
+
+    Attributes:
+        color: emitted light, attenuated up to the portion's front.
+        thickness: optical thickness up to each node.
+        error: `CAUTION` times the difference between all nodes and every second, of the largest channel and transmittance
+            together, and doubt; 1 for portions that shine and are thicker than `THICK`.
+        crossing: see `AtNodes`.
+    """
+
+    color: Float[np.ndarray, "portions 3"]
+    thickness: Float[np.ndarray, "portions nodes"]
+    error: Float[np.ndarray, " portions"]
+    crossing: Float[np.ndarray, " portions"]
+
+
+def light_of(seen: AtNodes, half_path: Float[np.ndarray, " portions"]) -> Light:
+    """Integrate extinction up to every node, and emission times transmittance over the portion: of high order in both."""
+    color, thickness = _integrated(seen.extinction, seen.emission, half_path, INTEGRATION)
+    coarse, thinner = _integrated(seen.extinction[::2], seen.emission[:, ::2], half_path, EVERY_SECOND)
+    error = np.abs(color - coarse).max(0) + np.abs(np.exp(-thickness[-1]) - np.exp(-thinner[-1])) + seen.doubt
+    error = np.where((thickness[-1] > THICK) & seen.emission.any((0, 1)), 1, CAUTION * error)
+    return Light(color.T, thickness.T, error, seen.crossing)
+
+
+def _integrated(extinction: np.ndarray, emission: np.ndarray, half_path: np.ndarray, rule: np.ndarray) -> tuple[np.ndarray, ...]:
+    thickness = np.maximum(half_path * (rule @ extinction), 0)
+    return half_path * np.einsum("k,ckp->cp", rule[-1], emission * np.exp(-thickness)), thickness
+
+
+class Look:
+    """A transfer function in float64, as a medium's nodes are looked up in it.
+
+    At a jump the end of a portion is on the side that the portion is on, so that a portion that ends there is as smooth as any.
+    """
+
+    def __init__(self, transfer: TransferFunction):
+        values = np.asarray(transfer.values, np.float64)
+        table = np.concatenate([np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinction, np.float64)[None]])
+        width = np.append(np.diff(values), 0)
+        inverse = np.divide(1, width, out=np.zeros_like(width), where=width > 0)
+        change = np.append(np.diff(table), np.zeros((4, 1)), 1)
+        self._values, self._most = values, table[3].max()
+        self._start, self._inverse = np.append(values[:1], values), np.append(0, inverse)
+        self._base, self._change = np.append(table[:, :1], table, 1), np.append(np.zeros((4, 1)), change, 1)
+        self._rank = np.append(0, np.cumsum(np.append(True, width[:-1] > 0)))  # distinct control values up to each
+        light = np.concatenate([table[3:], table[:3] * table[3]])
+        self._jump, self._turn, self._bend = _bends(light, width)
+
+    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, slant: np.ndarray) -> None:
+        """Add what portions number `which` show for their `quantity` (nodes, which); nothing where that is NaN."""
+        there = ~np.isnan(quantity[0])
+        which, quantity = which[there], quantity[:, there]
+        inwards = quantity.copy()
+        inwards[0] += NUDGE * (quantity[1] - quantity[0])
+        inwards[-1] += NUDGE * (quantity[-2] - quantity[-1])
+        segment = np.searchsorted(self._values, inwards, "right")
+        part = np.clip((quantity - self._start[segment]) * self._inverse[segment], 0, 1)
+        pairs = zip(self._base, self._change, strict=True)
+        red, green, blue, extinction = (base[segment] + part * change[segment] for base, change in pairs)
+        seen.extinction[:, which] += extinction
+        seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
+        half = (portions.end[which] - portions.start[which]) / 2
+        upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
+        bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
+        skips = (np.abs(np.diff(self._rank[segment], axis=0)) > 1) | self._hidden(quantity, segment)
+        unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
+        seen.doubt[which] += np.minimum(unseen.sum(0), 1)
+        self._cross(seen, which, quantity, segment, portions)
+
+    def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
+        """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
+        slack = 1e-9 * np.ptp(quantity, 0) + ROUNDED * (np.abs(quantity).max(0) + np.abs(self._values).max())
+        within = quantity[0] + np.tensordot(WITHIN, quantity - quantity[0], 1)
+        lowest = np.searchsorted(self._values, within.min(1) + slack, "right")
+        highest = np.searchsorted(self._values, within.max(1) - slack, "right")
+        least, most = np.minimum(segment[1:], segment[:-1]), np.maximum(segment[1:], segment[:-1])
+        return (self._rank[lowest] < self._rank[least]) | (self._rank[highest] > self._rank[most])
+
+    def _cross(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, segment: np.ndarray, portions: Portions) -> None:
+        """Where the quantity crosses the control value that bends most, those amid a portion before those at its ends."""
+        upper = np.maximum(segment[1:], segment[:-1])
+        amid = 1 - ((PLACE[1:] + PLACE[:-1]) / 2) ** 2
+        weight = np.where(segment[1:] != segment[:-1], self._bend[upper] * amid[:, None], 0)
+        gap, best = weight.argmax(0), weight.max(0)
+        some = np.flatnonzero(best > seen.weight[which])
+        gap, of = gap[some], which[some]
+        value = self._values[upper[gap, some] - 1]
+        place = _crossing(COEFFICIENTS @ quantity[:, some], value, PLACE[gap], PLACE[gap + 1])
+        half = (portions.end[of] - portions.start[of]) / 2
+        seen.crossing[of] = portions.start[of] + (place + 1) * half
+        seen.weight[of] = best[some]
+
+
+def _bends(light: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How much light (4, points) jumps at control points, how much its slope changes, and both by the lesser width beside.
+
+    Entry k is of point k - 1, as segments are numbered; a jump's is with its later point.
+    """
+    none = np.zeros((4, 1))
+    rise = np.diff(light)
+    slope = np.divide(rise, width[:-1], out=np.zeros_like(rise), where=width[:-1] > 0)
+    before, after = np.append(0, width[:-1]), width
+    least = np.where((before > 0) & (after > 0), np.minimum(before, after), np.maximum(before, after))
+    jump = np.where(before > 0, 0, np.abs(np.concatenate([none, rise], 1)).max(0))
+    turn = np.abs(np.concatenate([slope, none], 1) - np.concatenate([none, slope], 1)).max(0)
+    jump[:1] = 0
+    both = jump + turn * least + np.finfo(float).tiny
+    return np.append(0, jump), np.append(0, turn), np.append(0, both)
+
+
+def _crossing(coefficients: np.ndarray, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Where polynomials take a value between `low` and `high`, on both sides of which they are on either side of it."""
+
+    def above(place: np.ndarray) -> np.ndarray:
+        return chebyshev.chebval(place, coefficients, tensor=False) - value
+
+    rises = above(high) > above(low)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        past = (above(middle) > 0) == rises
+        low, high = np.where(past, low, middle), np.where(past, middle, high)
+    before, after = above(low), above(high)
+    change = after - before
+    return low + (high - low) * np.clip(np.divide(-before, change, out=np.full_like(change, 0.5), where=change != 0), 0, 1)
+
+
+def where_thickness(thickness: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Share of portions before their thickness (portions, nodes) reaches `target` (portions,)."""
+    gap = np.clip((thickness < target[:, None]).sum(1) - 1, 0, NODES - 2)
+    return (_crossing(COEFFICIENTS @ thickness.T, target, PLACE[gap], PLACE[gap + 1]) + 1) / 2

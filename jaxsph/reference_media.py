@@ -1,0 +1,300 @@
+"""What a scene has along rays, in float64: particles, volumes and points at the nodes of portions.
+
+Flow: scene, rays -> [reference_media] -> cuts of rays; portions -> [reference_media] -> extinction and emission at nodes.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import numpy as np
+
+from jaxsph.model import kernels
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles
+from jaxsph.model.points import Points
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.volume import Volume
+from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
+from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
+from jaxsph.reference_points import at_offset, kinks
+from jaxsph.reference_portions import Cuts, Lists, Portions, borders, lists
+
+INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
+
+
+class Part(abc.ABC):
+    """One part of a scene, as some rays meet it; made by `seen_by`.
+
+    Attributes:
+        chords: what rays have inside its spheres; none of a part that is not made of spheres.
+    """
+
+    chords: Chords = NO_CHORDS
+
+    @abc.abstractmethod
+    def cuts(self) -> Cuts:
+        """Where it begins or ends, and what else portions must not hold inside."""
+
+    @abc.abstractmethod
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """Mask of the portions that it has something in."""
+
+    @abc.abstractmethod
+    def keep(self, which: np.ndarray) -> None:
+        """Number roots anew: only those of a mask are left."""
+
+    @abc.abstractmethod
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """Add what it has at their nodes."""
+
+    def border_by(self, portions: Portions) -> np.ndarray:
+        """The border nearest to the middle of each portion, where only a derivative jumps, or NaN."""
+        return np.full(len(portions.ray), np.nan)
+
+
+class Whole(abc.ABC):
+    """One part of a scene as a camera sees it."""
+
+    @abc.abstractmethod
+    def seen_by(self, rays: Rays) -> Part:
+        """As some rays meet it."""
+
+
+def parts_of(scene: Scene, camera: Camera) -> list[Whole]:
+    """All of a scene."""
+    parts: list[Whole] = []
+    if scene.particles is not None and scene.transfer is not None:
+        parts.append(AllParticles(scene.particles, scene.transfer, camera))
+    parts += [AllOfVolume(volume, look, camera) for volume, look in scene.volumes]
+    return parts + [AllPoints(points, camera) for points in scene.point_sets]
+
+
+def to_view(position: np.ndarray, camera: Camera) -> np.ndarray:
+    """World to view coordinates of places (n, 3)."""
+    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+
+
+class AllParticles(Whole):
+    """Particles; those of no volume are not there."""
+
+    def __init__(self, particles: Particles, transfer: TransferFunction, camera: Camera):
+        there = np.asarray(particles.valid) & (np.asarray(particles.volume) > 0)
+        columns = particles.support, particles.quantity, particles.volume
+        self.support, self.quantity, volume = (np.asarray(column, np.float64)[there] for column in columns)
+        center = to_view(particles.exact_position()[there], camera)
+        strength = volume / self.support**3
+        self.strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
+        self.spheres = Spheres(center, self.support, camera.is_perspective)
+        self.kernel, self.look = kernels.by_name(particles.kernel), Look(transfer)
+
+    def seen_by(self, rays: Rays) -> Part:
+        """See `Whole`."""
+        return ParticlesMet(self, rays)
+
+
+class ParticlesMet(Part):
+    """Particles that some rays meet."""
+
+    def __init__(self, whole: AllParticles, rays: Rays):
+        self._whole, self._rays = whole, rays
+        self.chords = whole.spheres.chords(rays)
+        self._scale = rays.slant[self.chords.ray] / whole.support[self.chords.sphere]
+        self._strength, self._quantity = whole.strength[self.chords.sphere], whole.quantity[self.chords.sphere]
+
+    def cuts(self) -> Cuts:
+        """See `Part`."""
+        return borders(self.chords, 1 / self._scale)
+
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """See `Part`."""
+        self._lists = lists(self._rays, roots, self.chords)
+        return self._lists.length > 0
+
+    def keep(self, which: np.ndarray) -> None:
+        """See `Part`."""
+        self._lists = self._lists.some(which)
+
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """See `Part`."""
+        count = self._lists.length[portions.root]
+        which = np.flatnonzero(count)
+        seen.evaluations += NODES * count
+        quantity = np.empty((NODES, len(which)))
+        for some in self._lists.batches(portions.root[which]):
+            quantity[:, some] = self._mean(portions.some(which[some]))
+        self._whole.look.add(seen, which, _filled(quantity), portions, self._rays.slant)
+
+    def _mean(self, portions: Portions) -> np.ndarray:
+        """Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs.
+
+        With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
+        """
+        which, chord = self._lists.over(portions.root)
+        first = np.searchsorted(which, np.arange(len(portions.ray)))
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+        scale, at = self._scale[chord], middle[which]
+        place = PLACE.copy()
+        place[[0, -1]] *= 1 - INWARDS
+        along = place[:, None] * (half[which] * scale)
+        into, left = (at - self.chords.entry[chord]) * scale, (self.chords.exit[chord] - at) * scale
+        inside = np.clip((into + along) * (left - along), 0, 1)
+        weight = self._strength[chord] * self._whole.kernel.of_square(1 - inside, np)
+        base = self._quantity[chord[first]]
+        rest = self._quantity[chord] - base[which]
+        total = np.add.reduceat(weight, first, axis=1)
+        moved = np.add.reduceat(weight * rest, first, axis=1)
+        return base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0)
+
+    def border_by(self, portions: Portions) -> np.ndarray:
+        """See `Part`."""
+        which, chord = self._lists.over(portions.root)
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+        which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
+        off = np.abs(border - middle[which])
+        near = off < half[which] / 2
+        which, border, off = which[near], border[near], off[near]
+        order = np.lexsort((-off, which))
+        found = np.full(len(portions.ray), np.nan)
+        found[which[order]] = border[order]  # the last is the nearest
+        return found
+
+
+def _filled(quantity: np.ndarray) -> np.ndarray:
+    """With its neighbour's where nothing weighs in float64, as at an end that is less than an eps away."""
+    for nodes in (range(1, NODES), range(NODES - 2, -1, -1)):
+        for node in nodes:
+            before = node - 1 if nodes.step > 0 else node + 1
+            quantity[node] = np.where(np.isnan(quantity[node]), quantity[before], quantity[node])
+    return quantity
+
+
+class AllOfVolume(Whole):
+    """A volume."""
+
+    def __init__(self, volume: Volume, transfer: TransferFunction, camera: Camera):
+        self.values, self.look = np.asarray(volume.values, np.float64), Look(transfer)
+        self._lower, self._spacing = volume.bounds()[0], np.asarray(volume.spacing, np.float64)
+        self._axes, self._eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
+
+    def seen_by(self, rays: Rays) -> Part:
+        """See `Whole`."""
+        start = (rays.start @ self._axes + self._eye - self._lower) / self._spacing
+        return VolumeMet(self, rays, start, rays.direction @ self._axes / self._spacing)
+
+
+class VolumeMet(Part):
+    """A volume that some rays meet; they are given in its lattice."""
+
+    def __init__(self, whole: AllOfVolume, rays: Rays, start: np.ndarray, direction: np.ndarray):
+        self._whole, self._rays, self._start, self._direction = whole, rays, start, direction
+        self._last = np.array(whole.values.shape) - 1
+        self._over: np.ndarray = np.zeros(0, bool)
+
+    def cuts(self) -> Cuts:
+        """Planes of lattice points, inside the box alone."""
+        start, direction = self._start, self._direction
+        with np.errstate(divide="ignore", invalid="ignore"):
+            planes = [(np.arange(last + 1) - start[:, [i]]) / direction[:, [i]] for i, last in enumerate(self._last)]
+            enter, leave = np.sort(np.stack([-start, self._last - start]) / direction, 0)
+        beside = (direction == 0) & ((start < 0) | (start > self._last))
+        enter = np.where(direction == 0, -np.inf, enter).max(1)
+        leave = np.where(beside, -np.inf, np.where(direction == 0, np.inf, leave)).min(1)
+        depth = np.concatenate([enter[:, None], leave[:, None], *planes], 1)
+        enter, leave = np.maximum(enter, self._rays.near), np.minimum(leave, self._rays.far)
+        ray, place = np.nonzero((depth >= enter[:, None]) & (depth <= leave[:, None]))
+        return ray, depth[ray, place]
+
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """See `Part`."""
+        at = self._at(roots.ray, (roots.start + roots.end) / 2)
+        self._over = np.all((at >= 0) & (at <= self._last), axis=-1)
+        return self._over
+
+    def keep(self, which: np.ndarray) -> None:
+        """See `Part`."""
+        self._over = self._over[which]
+
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """A portion is in one cell, whose cubic polynomial holds up to its ends."""
+        which = np.flatnonzero(self._over[portions.root])
+        own = portions.some(which)
+        middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
+        cell = np.clip(self._at(own.ray, middle).astype(int), 0, self._last - 1)
+        part = self._at(own.ray, middle + PLACE[:, None] * half) - cell
+        quantity = np.zeros((NODES, len(which)))
+        for corner in np.ndindex(2, 2, 2):
+            share = np.where(corner, part, 1 - part).prod(-1)
+            quantity += share * self._whole.values[tuple((cell + corner).T)]
+        self._whole.look.add(seen, which, quantity, portions, self._rays.slant)
+
+    def _at(self, ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        return self._start[ray] + depth[..., None] * self._direction[ray]
+
+
+class AllPoints(Whole):
+    """A point set, by its true density: where its light is, whatever the `spread` by which renderers lay it along rays."""
+
+    def __init__(self, points: Points, camera: Camera):
+        self.there = np.flatnonzero(np.asarray(points.valid))
+        self.points, self.axes = points, np.asarray(camera.axes, np.float64)
+        self.radius, self.extinction, self.color = (self._column(name) for name in ("radius", "extinction", "color"))
+        self.attributes = {name: np.asarray(value, np.float64)[self.there] for name, value in points.attributes.items()}
+        self.spheres = Spheres(to_view(points.exact_position()[self.there], camera), self.radius, camera.is_perspective)
+
+    def _column(self, name: str) -> np.ndarray:
+        return np.asarray(getattr(self.points, name), np.float64)[self.there]
+
+    def seen_by(self, rays: Rays) -> Part:
+        """See `Whole`."""
+        return PointsMet(self, rays)
+
+
+class PointsMet(Part):
+    """Points that some rays meet."""
+
+    def __init__(self, whole: AllPoints, rays: Rays):
+        self._whole, self._rays = whole, rays
+        self.chords = whole.spheres.chords(rays)
+
+    def cuts(self) -> Cuts:
+        """Ends, feet, and where rays cross spheres at which a profile may have a kink."""
+        chords = self.chords
+        foot, half = (chords.entry + chords.exit) / 2, (chords.exit - chords.entry) / 2
+        scale = self._rays.slant[chords.ray] / self._whole.radius[chords.sphere]
+        depths = []
+        for kink in kinks(self._whole.points.profile)[:-1]:
+            ring = np.sqrt(np.maximum(half**2 - (1 - kink**2) / scale**2, 0))
+            depths += [foot - ring, foot + ring]
+        depths += [chords.entry, chords.exit]
+        return np.tile(chords.ray, len(depths)), np.concatenate(depths)
+
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """See `Part`."""
+        self._lists: Lists = lists(self._rays, roots, self.chords)
+        return self._lists.length > 0
+
+    def keep(self, which: np.ndarray) -> None:
+        """See `Part`."""
+        self._lists = self._lists.some(which)
+
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """See `Part`."""
+        for some in self._lists.batches(portions.root):
+            self._add(seen, some, portions.some(some))
+
+    def _add(self, seen: AtNodes, some: np.ndarray, portions: Portions) -> None:
+        which, chord = self._lists.over(portions.root)
+        if not len(which):
+            return
+        whole, ray, point = self._whole, self.chords.ray[chord], self.chords.sphere[chord]
+        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+        depth = middle[which] + PLACE[:, None] * half[which]
+        place = self._rays.start[ray] + depth[..., None] * self._rays.direction[ray]
+        offset = (place - whole.spheres.center[point]) / whole.radius[point][:, None] @ whole.axes
+        attributes = {name: value[point] for name, value in whole.attributes.items()}
+        density = whole.extinction[point] * at_offset(whole.points.profile, offset, attributes)
+        held, first = np.unique(which, return_index=True)
+        seen.extinction[:, some[held]] += np.add.reduceat(density, first, axis=1)
+        seen.emission[:, :, some[held]] += np.add.reduceat(density * whole.color[point].T[:, None], first, axis=2)

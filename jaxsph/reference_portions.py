@@ -1,0 +1,122 @@
+"""Rays cut into portions: nothing begins or ends inside of a portion, and a list says which chords lie over it.
+
+Flow: rays, chords -> [reference_portions] -> reference_media -> reference_integral.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsph.reference_chords import Chords, Rays, ranges
+
+LONGEST = 0.25  # of a support: see `borders`
+FEW = 4  # chords, see `borders`
+PAIRS = 1 << 12  # of a portion and a chord, whose nodes are looked at at once: what a cache holds
+
+
+class Portions(NamedTuple):
+    """Parts of rays, in order of rays and, within a ray, of depth.
+
+    Attributes:
+        ray: number of its ray.
+        start, end: depths.
+        root: number of the portion of the first cut that it is a part of: lists are of those.
+    """
+
+    ray: Int[np.ndarray, " portions"]
+    start: Float[np.ndarray, " portions"]
+    end: Float[np.ndarray, " portions"]
+    root: Int[np.ndarray, " portions"]
+
+    def some(self, which: np.ndarray) -> Portions:
+        """Those of the given numbers, or a mask."""
+        return Portions(*(column[which] for column in self))
+
+
+class Lists(NamedTuple):
+    """Numbers of chords that lie over roots: `chord[first[i] : first[i] + length[i]]` over root i."""
+
+    first: Int[np.ndarray, " roots"]
+    length: Int[np.ndarray, " roots"]
+    chord: Int[np.ndarray, " pairs"]
+
+    def batches(self, root: Int[np.ndarray, " portions"]) -> list[np.ndarray]:
+        """Numbers of portions, as many at a time as have about `PAIRS` chords over them together."""
+        ends = np.cumsum(self.length[root])
+        pairs = int(ends[-1]) if len(ends) else 0
+        some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(PAIRS, pairs, PAIRS)))
+        return [part for part in some if len(part)]
+
+    def over(self, root: Int[np.ndarray, " portions"]) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a portion (a place in `root`) and a chord, portion by portion."""
+        which, place = ranges(self.first[root], self.length[root])
+        return which, self.chord[place]
+
+    def some(self, which: np.ndarray) -> Lists:
+        """Of some of the roots."""
+        return self._replace(first=self.first[which], length=self.length[which])
+
+
+Cuts = tuple[np.ndarray, np.ndarray]
+"""Numbers of rays, and depths on them."""
+
+
+def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
+    """Entries and exits that rays are cut at from the start.
+
+    Those where the union of all chords of a ray begins or ends, as the medium does there: all of them, and where less than
+    `FEW` chords are on one side, as a mean of few may change quickly. Of the others, where
+    only a higher derivative jumps and which are cut at where the error demands it, the first in each of the bins that are
+    `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single portion, so that
+    none is overlooked between nodes.
+    """
+    ray, depth = np.tile(chords.ray, 2), np.concatenate([chords.entry, chords.exit])
+    step = np.repeat([1, -1], len(chords.ray))
+    order = np.lexsort((-step, depth, ray))
+    ray, depth, step = ray[order], depth[order], step[order]
+    covering = np.cumsum(step)
+    octave = np.frexp(np.tile(radius, 2)[order])[1]
+    place = np.floor(depth / np.ldexp(LONGEST, octave - 1))
+    first = np.zeros(len(ray), bool)
+    within = np.lexsort((depth, octave, ray))
+    keys = ray[within], octave[within], place[within]
+    first[within[1:]] = np.logical_or.reduce([key[1:] != key[:-1] for key in keys])
+    first[within[:1]] = True
+    kept = first | (np.minimum(covering, covering - step) < FEW)
+    return ray[kept], depth[kept]
+
+
+def cut(rays: Rays, cuts: list[Cuts]) -> Portions:
+    """What lies between neighbouring cuts of a ray, between near and far."""
+    count = len(rays.u)
+    ends = np.repeat([rays.near, rays.far], count)
+    ray = np.concatenate([np.tile(np.arange(count), 2), *(ray for ray, _ in cuts)])
+    depth = np.clip(np.concatenate([ends, *(depth for _, depth in cuts)]), rays.near, rays.far)
+    order = np.lexsort((depth, ray))
+    ray, depth = ray[order], depth[order]
+    held = (ray[1:] == ray[:-1]) & (depth[1:] > depth[:-1])
+    start, end = depth[:-1][held], depth[1:][held]
+    return Portions(ray[:-1][held], start, end, np.arange(len(start)))
+
+
+def lists(rays: Rays, portions: Portions, chords: Chords) -> Lists:
+    """Which chords lie over which portions."""
+    width = 2 * (rays.far - rays.near)
+
+    def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
+
+    last = len(portions.ray) - 1
+    first = np.searchsorted(key(portions.ray, portions.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
+    beyond = np.searchsorted(key(portions.ray, portions.start), key(chords.ray, chords.exit)) + 1
+    first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
+    chord, portion = ranges(first, np.maximum(beyond - first, 0))
+    over = (portions.ray[portion] == chords.ray[chord]) & (chords.entry[chord] < portions.end[portion])
+    over &= chords.exit[chord] > portions.start[portion]
+    chord, portion = chord[over], portion[over]
+    count = np.bincount(portion, minlength=len(portions.ray))
+    small = portion.astype(np.uint16) if len(count) <= 1 << 16 else portion  # which sorts faster
+    return Lists(np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")])
