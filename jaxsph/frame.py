@@ -122,10 +122,8 @@ class Frame:
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
         scene = (grid, camera or self.camera, self.transfer, self.media)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
-        inputs = [
-            (*scene, schedule, lattice, self.min_transmittance, tolerance, nth)
-            for schedule, nth in zip(schedules, self._each, strict=True)
-        ]
+        how = lattice, self.min_transmittance, tolerance
+        inputs = [(*scene, schedule, *how, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
         method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays

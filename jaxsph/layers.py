@@ -74,7 +74,8 @@ def of_band(band: OfShards, *, plan: Plan) -> Layers:
     if band.cast[0].rays.error is not None:
         error = unshard(tuple(shard.rays.error for shard in band.cast), 0)
         bound = registry.screen(plan.screen).resolve(RayResult(color, error, depth), lists)[1]
-    return Layers(*pixels, over_pixels(spent), bound, over_pixels(verdict.full), levels)
+    color, transmittance, depth = pixels
+    return Layers(color, transmittance, depth, over_pixels(spent), bound, over_pixels(verdict.full), levels)
 
 
 def crop(bands: Layers, plan: Plan) -> Layers:

@@ -30,8 +30,8 @@ from jaxsph.model.medium import Medium
 class RayResult:
     """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance.
 
-    `error` is what colours and transmittance are estimated to be wrong by, None where nothing is estimated; `refined` what was spent
-    on that, and `left_out` is what rays that ended would have taken, kernel evaluations a ray of each packet; None where none can end.
+    `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
+    ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
     """
 
     color: Float[Array, "3 packets rows columns"]
@@ -77,11 +77,8 @@ def march(
         tolerance: what slabs are refined for, where the plan has room for that; None where they are not.
     """
     batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
-    together, ending, refining = (
-        Together.of(batches.num_packets, plan.tuning),
-        min_transmittance is not None,
-        tolerance is not None,
-    )
+    together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
+    refining = tolerance is not None
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples, integrator.halo) if ending else None
     starts = batches.compacted.start
 

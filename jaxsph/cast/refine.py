@@ -2,10 +2,10 @@ r"""Shorter segments where a tolerance needs them: slabs of a batch are marched 
 
 Flow: batch, light -> [refine: fronts -> levels -> march again] -> composite.
 
-All slabs of a batch are marched once with few samples. How wrong each is estimated to be (`Segments.compared`), times what is left
-of the light in front of it, is held against its share of the tolerance; slabs with a ray above it are marched again, with as many
-more samples as an error that falls with the square of their distance asks for, and compared again, `ROUNDS` times in all. Samples
-of a finer level lie evenly between those of the first.
+All slabs of a batch are marched once with few samples. How wrong each is estimated to be (`Segments.compared`), times what is
+left of the light in front of it, is held against its share of the tolerance; slabs with a ray above it are marched again, with as
+many more samples as an error that falls with the square of their distance asks for, and compared again, `ROUNDS` times in all.
+Samples of a finer level lie evenly between those of the first.
 
 Errors of slabs are of either sign, as they come from how the field bends here and there: those of a ray add up as independent
 ones do, $\epsilon^2 = \sum_k (T_k e_k)^2$. So of n slabs that a bundle has, each may have $\mathrm{REACH} / \sqrt n$ of the

@@ -65,7 +65,7 @@ class Segments(Integrator):
         return Segment((red_green.real, red_green.imag, blue.real), left[:, -1], thickness)
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
-        """The same with quadratic errors taken out, and with an estimate of the error: by how far long segments differ from it."""
+        """With quadratic errors taken out, and with an estimate of the error: by how far segments of twice the length differ."""
         always, double = task.slab[0] >= 0, task.every_other()
         short = medium.intervals(gathered, task), task
         long = medium.intervals(medium.every_other(gathered), double), double
