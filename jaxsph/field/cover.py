@@ -20,7 +20,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -119,15 +118,16 @@ def cover_of(
         label: `"quantity"`, or `"place"` for the number of a particle in the windows of its slab in place of that.
     """
     pivot = outer_pivot(inside, task.depth)
-    far = jnp.asarray(jnp.finfo(pivot.dtype).max, pivot.dtype)
-    nothing = jnp.zeros((2, *pivot.shape), pivot.dtype)
+    tasks, rays = pivot.shape
+    far = jnp.finfo(pivot.dtype).max
+    nothing = jnp.asarray([far, far, -far, -far, 0, 0, 0, 0], pivot.dtype)[None, :, None]  # one array: to put rows takes long
 
-    def find(items: Array, some: SlabTask, found: Ends) -> Ends:
-        here = jnp.minimum(items, pivot.shape[0] - 1)
-        ends = ends_of(ordered, rank, some, pivot[here], label)
-        return jax.tree.map(lambda old, new: old.at[:, items].set(new, mode="drop"), found, ends)
+    def find(items: Array, some: SlabTask, found: Array) -> Array:
+        ends = ends_of(ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], label)
+        return found.at[items].set(jnp.moveaxis(jnp.concatenate(ends), 0, 1), mode="drop")
 
-    return Cover(*over_groups(find, Ends(nothing + far, nothing - far, nothing, nothing), task, inside), pivot)
+    found = over_groups(find, jnp.broadcast_to(nothing, (tasks, nothing.size, rays)), task, inside)
+    return Cover(*(jnp.moveaxis(found[:, 2 * k : 2 * k + 2], 1, 0) for k in range(4)), pivot)
 
 
 def over_groups(
@@ -175,7 +175,7 @@ def ends_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "
     def add_block(nth: Array, so_far: list[Array]) -> list[Array]:
         block, labels = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
         parts = fusion_barrier(nth >= 0, shared_parts, block, lines)
-        begin, end = apart_of(fusion_barrier(nth >= 0, chords, parts, lines))
+        begin, end = fusion_barrier(nth >= 0, chords, parts, lines)
         return [
             _extreme(old, begin if front else end, end < apart if ahead else end >= apart, labels, front)
             for old, (ahead, front) in zip(so_far, EXTREMES, strict=True)
@@ -202,7 +202,7 @@ def shared_parts(block: Block, lines: Lines) -> tuple[Array, ...]:
     return x * lines.slope_u[:, None], y * lines.slope_v[:, None] + z, x * x, square - (y * y + z * z)
 
 
-def chords(parts: tuple[Array, ...], lines: Lines) -> Any:
+def chords(parts: tuple[Array, ...], lines: Lines) -> tuple[Array, Array]:
     """Where rays enter and leave particles, relative to the middle; far away in the wrong order where not in the slab."""
     along_u, along_v, x_square, rest = parts
     along = along_u + along_v
@@ -212,7 +212,7 @@ def chords(parts: tuple[Array, ...], lines: Lines) -> Any:
     begin, end = foot - half, foot + half
     valid = (inner > 0) & (end > lines.front[:, None]) & (begin < lines.back[:, None])
     far = jnp.finfo(foot.dtype).max
-    return together_of(jnp.where(valid, begin, far), jnp.where(valid, end, -far))
+    return jnp.where(valid, begin, far), jnp.where(valid, end, -far)
 
 
 def _extreme(so_far: Any, ends: Array, mine: Array, labels: Array, front: bool) -> Any:
