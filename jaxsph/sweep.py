@@ -73,18 +73,14 @@ def sweep(
 
     Args:
         scene, camera: what to render, and from where; or as many of both as the sequence has frames.
-        settings: the settings of full rate; default `Settings(integrator="samples")`. `tolerance`, `estimator` and `relax` are
-            the sweep's.
+        settings: of full rate, without tolerance, estimator and `relax`; default `Settings(integrator="samples")`.
         tolerances: each >= 0.
-        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, which
-            keep a tolerance against full rate of point samples, and are refused where `settings.integrator` is another; and
-            `"segments"`, which keeps it against the light integral. Default all that are not refused.
+        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, kept
+            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
         baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
             `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
-        repeats: turns, at least 1.
-        converged: at least 1.
-        integral: pixels of the whole image at which the light integral is taken (`jaxsph.reference.integral`), the same ones for
-            all settings; 0 for none. Scenes of `media` that it does not know have none.
+        repeats, converged: at least 1.
+        integral: at how many pixels to take the light integral (`jaxsph.reference.integral`, which knows no `media`); 0: none.
         name: of the scene, for the table.
         frames: a number for each frame; default 0, 1, ... of a sequence.
         folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
