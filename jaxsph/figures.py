@@ -177,9 +177,10 @@ def _error(points: Sequence[Point], title: str) -> Any:
     if tolerances:
         ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
         axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
-        axis.fill_between(ends, ends, [tolerances[-1] * 4] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
-        least = min(_shown(value or 0.0) for point in controlled for value in (point.kept, point.bound))
-        axis.set(xlim=ends, ylim=(min(least, ends[0]) / 2, tolerances[-1] * 4))
+        drawn = [_shown(value or 0.0) for point in controlled for value in (point.kept, point.bound)]
+        top = max(4 * tolerances[-1], 2 * max(drawn))
+        axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
+        axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
     for method, color in COLORS.items():
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
@@ -195,7 +196,7 @@ def _error(points: Sequence[Point], title: str) -> Any:
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
             axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
-    of_others = " (segments: light integral)" if any(point.method in ESTIMATING for point in controlled) else ""
+    of_others = "\n(segments: the light integral)" if any(point.method in ESTIMATING for point in controlled) else ""
     axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)

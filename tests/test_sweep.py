@@ -333,12 +333,15 @@ def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(ro
     more = [dataclasses.replace(row, method="segments", **taken) for row in rows if row.method == "interval"]
     points = figures.summary([*rows, *more])
     assert [point.kept for point in points[-2:]] == [0.02] * 2 and points[2].kept == rows[2].max_error
-    assert "segments: light integral" in figures._error(points, "a title").axes[0].get_ylabel()
+    (axis,) = figures._error(points, "a title").axes
+    assert "segments: the light integral" in axis.get_ylabel()
     shown = figures._integral(points, "a title").axes[1]
     assert shown.get_xlabel() == "largest error, against the light integral"
     assert "segments" in shown.get_legend_handles_labels()[1]
     unknown = figures.summary([*rows, *(dataclasses.replace(row, integral_max=None) for row in more)])
     assert "segments" not in str(figures._error(unknown, "a title").axes[0].get_legend_handles_labels())
+    far_off = [dataclasses.replace(point, integral=5.0) for point in points]
+    assert figures._error(far_off, "a title").axes[0].get_ylim()[1] > 5
     assert [path.name for path in figures.draw(rows, tmp_path)] == ["error.png", "pareto.png"]
 
 
