@@ -39,7 +39,7 @@ def measure(name: str, arguments: argparse.Namespace) -> list[Measurement]:
     folder = arguments.output / name
     chosen = {"name": name, "frames": arguments.frames, "repeats": arguments.repeats, "folder": folder}
     chosen |= {"baselines": arguments.baselines, "converged": arguments.converged}
-    rows = js.sweep(*place, js.Settings(samples=arguments.samples), **chosen)
+    rows = js.sweep(*place, js.Settings(samples=arguments.samples, integrator="samples"), **chosen)
     figures.draw(rows, folder)
     return rows
 

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 import jaxsph
 from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
 from jaxsph.cli_progressive import render_in_stages
-from jaxsph.console import UsageError, camera_line, largest, largest_difference, progress, say, span, time_line
+from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
 from jaxsph.model.camera import Bounded
 from jaxsph.scenes.view import snug, snug_box
@@ -115,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(sweep)
     cli_options.add_picture(sweep)
     cli_sweep.add_options(sweep)
+    sweep.set_defaults(integrator="samples")  # whose full rate bounds and the pilot keep a tolerance against
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument
     add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")
@@ -147,8 +148,7 @@ def _render(options: argparse.Namespace) -> None:
     image.save(output)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
     if settings.tolerance is not None:
-        known = "certified" if image.certified else "estimated"
-        say("error", f"at most {largest(image.error_bound):.2g} ({known}), tolerance {settings.tolerance:g}")
+        say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
     say("time", time_line(image, elapsed))
 
 
@@ -171,7 +171,7 @@ def _settings(options: argparse.Namespace) -> Settings:
         raise UsageError(f"--memory must be a positive number of GiB, got {options.memory:g}")
     given = {
         "samples": options.samples,
-        **{name: getattr(options, name, None) for name in ("tolerance", "estimator", "relax", "screen")},
+        **{name: getattr(options, name, None) for name in ("integrator", "tolerance", "estimator", "relax", "screen")},
         "memory_limit": None if options.memory is None else int(options.memory * 2**30),
     }
     given = {name: value for name, value in given.items() if value is not None}
@@ -299,7 +299,7 @@ def _demo(options: argparse.Namespace) -> None:
     for output in outputs:
         _require_writable(output)
     scene, camera = scenes.load("mixer", width=width, height=height)
-    settings = Settings(tolerance=DEMO_TOLERANCE)
+    settings = Settings(tolerance=DEMO_TOLERANCE, integrator="samples")
     exact = dataclasses.replace(settings, tolerance=None)
     every = max(min(width, height) // DEMO_CHECK, 1)
     with ThreadPoolExecutor(1) as beside, progress("render") as show:  # NumPy has time while XLA compiles

@@ -9,6 +9,9 @@ import argparse
 from typing import Any
 
 from jaxsph import scenes
+from jaxsph.model import Settings, registry
+
+INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registry.BOUNDING)
 
 
 def add_source(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
@@ -34,6 +37,8 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")
+    integrator = Settings().integrator
+    add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
     add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
     add(
         "--range",

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io import ParticleTable
-from jaxsph.model import Camera, Image
+from jaxsph.model import Camera, Image, Settings
+from jaxsph.model.registry import ESTIMATING
 
 
 class UsageError(Exception):
@@ -94,6 +95,14 @@ def camera_line(camera: Camera) -> str:
     target = eye + axes[2] * (near + far) / 2
     place = " ".join(f"{v:.5g}" for v in eye) + " --target " + " ".join(f"{v:.5g}" for v in target)
     return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
+
+
+def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:
+    """Largest error of any pixel, how it is known, and what it is measured against where that is not full rate."""
+    error = f"at most {largest(image.error_bound):.2g}"
+    if settings.integrator in ESTIMATING and settings.screen != "quadtree" and not by_quadtree:
+        return f"{error.replace('most', 'most about')} (estimated against the light integral)"
+    return f"{error} ({'certified' if image.certified else 'estimated'})"
 
 
 def time_line(image: Image, elapsed: float) -> str:

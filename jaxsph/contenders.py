@@ -15,14 +15,16 @@ import scipy
 from jaxtyping import Float
 
 from jaxsph.model import Camera, Settings
+from jaxsph.model.registry import ESTIMATING
 
 TOLERANCES = (0.001, 0.004, 0.01)
 ESTIMATORS: dict[str, dict[str, Any]] = {
-    "interval": {"estimator": "interval", "relax": 0.0},
-    "interval relaxed": {"estimator": "interval", "relax": 1.0},
-    "pilot": {"estimator": "pilot", "relax": 0.0},
+    "interval": {"integrator": "samples", "estimator": "interval", "relax": 0.0},
+    "interval relaxed": {"integrator": "samples", "estimator": "interval", "relax": 1.0},
+    "pilot": {"integrator": "samples", "estimator": "pilot", "relax": 0.0},
+    "segments": {"integrator": "segments", "relax": 0.0},
 }
-BASELINES = ("samples/2", "samples/4", "size/2", "size/4")
+BASELINES = ("samples/2", "samples/4", "segments/1", "segments/4", "size/2", "size/4")
 FULL_RATE = "full rate"
 
 
@@ -40,6 +42,11 @@ class Contender:
         return self.settings.tolerance
 
     @property
+    def is_against_integral(self) -> bool:
+        """Whether its tolerance is kept against the light integral, not against full rate."""
+        return self.tolerance is not None and self.settings.integrator in ESTIMATING
+
+    @property
     def kind(self) -> Hashable:
         """What fixes its plan besides the frame: all but the numbers that a plan does not depend on."""
         tolerance = None if self.tolerance is None else 0.0
@@ -53,14 +60,26 @@ class Contender:
         return dataclasses.replace(camera, width=width, height=height)
 
 
+def suitable(settings: Settings) -> tuple[str, ...]:
+    """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
+    allowed = {settings.integrator, *ESTIMATING}
+    return tuple(name for name, chosen in ESTIMATORS.items() if chosen["integrator"] in allowed)
+
+
 def contenders(
-    settings: Settings, tolerances: Sequence[float], estimators: Sequence[str], baselines: Sequence[str]
+    settings: Settings, tolerances: Sequence[float], estimators: Sequence[str] | None, baselines: Sequence[str]
 ) -> list[list[Contender]]:
     """Settings that take turns: full rate and baselines, then each estimator with all of its tolerances."""
+    estimators = suitable(settings) if estimators is None else estimators
     for name in estimators:
         if name not in ESTIMATORS:
             raise ValueError(f"`estimators` must be of {', '.join(map(repr, ESTIMATORS))}, got {name!r}")
-    groups = [[Contender(FULL_RATE, settings), *(baseline(settings, name) for name in dict.fromkeys(baselines))]]
+        if name not in suitable(settings):
+            raise ValueError(
+                f"`estimators` holds {name!r}, which keeps a tolerance against full rate of point samples, and full rate has "
+                f"`integrator={settings.integrator!r}`; leave it out, or give `integrator='samples'`"
+            )
+    groups = [[Contender(FULL_RATE, settings), *dict.fromkeys(baseline(settings, name) for name in baselines)]]
     for name in dict.fromkeys(estimators):
         chosen = [dataclasses.replace(settings, **ESTIMATORS[name], tolerance=float(t)) for t in dict.fromkeys(tolerances)]
         groups.append([Contender(name, one) for one in chosen])
@@ -68,14 +87,15 @@ def contenders(
 
 
 def baseline(settings: Settings, name: str) -> Contender:
-    """Uniform sampling that is coarser, or a smaller image: `"samples/K"` or `"size/K"`."""
-    matched = re.fullmatch(r"(samples|size)/([1-9]\d{0,5})", name)
+    """Uniform sampling with K times fewer points or segments, or a smaller image: `"samples/K"`, `"segments/K"` or `"size/K"`."""
+    name = "segments/1" if name == "segments" else name
+    matched = re.fullmatch(r"(samples|segments|size)/([1-9]\d{0,5})", name)
     if matched is None:
-        raise ValueError(f"`baselines` must be like 'samples/2' or 'size/4', got {name!r}")
+        raise ValueError(f"`baselines` must be like 'samples/2', 'segments', 'segments/2' or 'size/4', got {name!r}")
     factor = int(matched[2])
     if matched[1] == "size":
         return Contender(name, settings, factor)
-    return Contender(name, dataclasses.replace(settings, samples=-(-settings.samples // factor)))
+    return Contender(name, dataclasses.replace(settings, integrator=matched[1], samples=-(-settings.samples // factor)))
 
 
 def scaled_up(layers: Float[np.ndarray, "rows columns 4"], camera: Camera) -> Float[np.ndarray, "height width 4"]:

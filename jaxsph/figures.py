@@ -1,6 +1,6 @@
 """Figures of a sweep: error over tolerance, time over error, and both along a sequence of frames.
 
-Flow: measurements -> [figures] -> error.png, pareto.png, frames.png.
+Flow: measurements -> [figures] -> error.png, pareto.png, integral.png, frames.png.
 
 Drawn with matplotlib, which is optional. Where a sweep has several frames, errors are the largest and times the means of them.
 Times are shares of what full rate took in the same turns, as a busy machine is slow for both.
@@ -19,15 +19,16 @@ from jaxsph.contenders import ESTIMATORS, FULL_RATE
 from jaxsph.io.optional import require
 from jaxsph.io.replace import written_whole
 from jaxsph.measurement import Measurement
+from jaxsph.model.registry import ESTIMATING
 
-COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00"), strict=True))
+COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00", "#cc79a7"), strict=True))
 """Of the estimators: Okabe and Ito's, which all can tell apart."""
 
-MARKERS = dict(zip(ESTIMATORS, "osD", strict=True))
-MARKER_SIZES = dict(zip(ESTIMATORS, (10, 7, 4), strict=True))
+MARKERS = dict(zip(ESTIMATORS, "osDp", strict=True))
+MARKER_SIZES = dict(zip(ESTIMATORS, (11, 8, 5.5, 3.5), strict=True))
 """What is drawn later is smaller, so that equal results of two estimators are both seen."""
-LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4)), strict=True))
-BASELINE_COLORS = {"samples": "#8a8a8a", "size": "#a6761d"}
+LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4), (-6, 4)), strict=True))
+BASELINE_COLORS = {"samples": "#8a8a8a", "segments": "#7f5a9e", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
 MIN_SHOWN = 1e-7
@@ -39,7 +40,7 @@ SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A setting over all of its frames."""
+    """A setting over all of its frames: largest errors to full rate, to a converged image and to the light integral."""
 
     method: str
     tolerance: float | None
@@ -47,6 +48,13 @@ class Point:
     away: float
     bound: float | None
     time: float
+    integral: float | None = None
+    mean_integral: float | None = None
+
+    @property
+    def kept(self) -> float | None:
+        """The error that its tolerance is held against; None where it was not measured."""
+        return self.integral if self.method in ESTIMATING else self.error
 
 
 def require_matplotlib() -> None:
@@ -59,7 +67,8 @@ def require_matplotlib() -> None:
 
 
 def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
-    """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames.
+    """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames, `integral.png`
+    only where the light integral was taken.
 
     Returns:
         The paths of what was written.
@@ -76,6 +85,8 @@ def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
     points = summary(rows)
     figures = {"error.png": _error, "pareto.png": _pareto}
     written = [_saved(draw_one(points, _title(rows)), Path(folder) / name) for name, draw_one in figures.items()]
+    if any(point.integral is not None for point in points):
+        written.append(_saved(_integral(points, _title(rows)), Path(folder) / "integral.png"))
     if len({row.frame for row in rows}) > 1:
         written.append(_saved(_frames(rows, _title(rows, summed=False)), Path(folder) / "frames.png"))
     return written
@@ -91,7 +102,12 @@ def summary(rows: Sequence[Measurement]) -> list[Point]:
         bounds = [row.max_bound for row in group if row.max_bound is not None]
         errors = (max(row.max_error for row in group), max(row.max_error_converged for row in group))
         share = sum(row.total for row in group) / sum(row.full_total for row in group)
-        points.append(Point(method, tolerance, *errors, max(bounds, default=None), share))
+        largest, means = (
+            [value for value in (getattr(row, name) for row in group) if value is not None]
+            for name in ("integral_max", "integral_mean")
+        )
+        integral = max(largest, default=None), sum(means) / len(means) if means else None
+        points.append(Point(method, tolerance, *errors, max(bounds, default=None), share, *integral))
     return points
 
 
@@ -155,15 +171,16 @@ def _label_zero(axis: Any, errors: Iterable[float], which: str) -> None:
 
 def _error(points: Sequence[Point], title: str) -> Any:
     figure, (axis,) = _canvas(title, 1)
-    controlled = [point for point in points if point.tolerance is not None and point.tolerance > 0]
+    controlled = [point for point in points if point.tolerance and point.kept is not None]
     tolerances = sorted({point.tolerance for point in controlled if point.tolerance is not None})
     axis.set(xscale="log", yscale="log")  # before its limits: of a linear axis they would start below zero
     if tolerances:
         ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
         axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
-        axis.fill_between(ends, ends, [tolerances[-1] * 4] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
-        least = min(_shown(value) for point in controlled for value in (point.error, point.bound or 0.0))
-        axis.set(xlim=ends, ylim=(min(least, ends[0]) / 2, tolerances[-1] * 4))
+        drawn = [_shown(value or 0.0) for point in controlled for value in (point.kept, point.bound)]
+        top = max(4 * tolerances[-1], 2 * max(drawn))
+        axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
+        axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
     for method, color in COLORS.items():
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
@@ -175,22 +192,34 @@ def _error(points: Sequence[Point], title: str) -> Any:
                 "clip_on": False,
             }
             style["linewidth"] = MARKER_SIZES[method] / 3
-            axis.plot(x, [_shown(point.error) for point in row], label=f"{method}: error", **style)
+            axis.plot(x, [_shown(point.kept or 0.0) for point in row], label=f"{method}: error", **style)
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
             axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
-    axis.set(xlabel="tolerance", ylabel="largest error of a pixel, against full rate")
+    of_others = "\n(segments: the light integral)" if any(point.method in ESTIMATING for point in controlled) else ""
+    axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)
-    _label_zero(axis, [value for point in controlled for value in (point.error, point.bound or 0.0)], "y")
+    _label_zero(axis, [value or 0.0 for point in controlled for value in (point.kept, point.bound)], "y")
     _legend(figure, axis)
     return figure
 
 
 def _pareto(points: Sequence[Point], title: str) -> Any:
-    figure, axes = _canvas(title, 2, sharey=True)
     others = [point for point in points if point.method != FULL_RATE]
-    panels = (("error", others, "against full rate"), ("away", points, "against a converged image"))
+    ends = "largest error, against full rate", "largest error, against a converged image"
+    return _time_over_error(points, title, (("error", others, ends[0]), ("away", points, ends[1])))
+
+
+def _integral(points: Sequence[Point], title: str) -> Any:
+    known = [point for point in points if point.integral is not None]
+    ends = "mean error, against the light integral", "largest error, against the light integral"
+    return _time_over_error(known, title, (("mean_integral", known, ends[0]), ("integral", known, ends[1])))
+
+
+def _time_over_error(points: Sequence[Point], title: str, panels: Sequence[tuple[str, Sequence[Point], str]]) -> Any:
+    """Two panels: an attribute of points, which points, and what it is."""
+    figure, axes = _canvas(title, 2, sharey=True)
     for axis, (name, shown, against) in zip(axes, panels, strict=True):
         errors = [_shown(getattr(point, name)) for point in shown]
         axis.axhline(1, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
@@ -204,7 +233,7 @@ def _pareto(points: Sequence[Point], title: str) -> Any:
             axis.plot(error, point.time, linestyle="none", label=label, **_look(point.method, points))
         axis.margins(x=0.15)  # room for the labels
         _label_tolerances(axis, shown, errors)
-        axis.set(xscale="log", xlabel=f"largest error, {against}")
+        axis.set(xscale="log", xlabel=against)
         _label_zero(axis, [getattr(point, name) for point in shown], "x")
     axes[0].set_ylabel("time of a frame, over that of full rate")
     axes[0].set_ylim(0, 1.1 * max(1.0, *(point.time for point in points)))

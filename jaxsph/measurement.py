@@ -18,7 +18,7 @@ from jaxsph.io.replace import written_whole
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
 """Names in a sweep's folder: one JSON object a line, appended as it is measured; and the same as comma-separated values."""
 
-KEY = ("scene", "frame", "fingerprint", "method", "tolerance", "repeats", "dtype", "device", "jaxsph")
+KEY = ("scene", "frame", "fingerprint", "method", "tolerance", "repeats", "integral", "dtype", "device", "jaxsph")
 """What makes two measurements the same: a sweep does not measure again what its folder holds."""
 
 
@@ -32,15 +32,20 @@ class Measurement:
         scene, frame: what was rendered.
         fingerprint: digest of particles, transfer function, camera and settings.
         particles, width, height, samples: size of the frame at full rate, which all settings are compared with.
-        method: `"full rate"`, an estimator, `"samples/K"` or `"size/K"`.
-        tolerance: what error control was asked for; None without.
+        method: `"full rate"`, an estimator, `"samples/K"`, `"segments/K"` or `"size/K"`.
+        tolerance: what error control was asked for; None without. Segments keep it against the light integral, others against
+            full rate.
         certified: whether `max_bound` is proven.
         max_error, mean_error: against full rate.
-        over_tolerance: share of pixels whose error is over the tolerance; None without one.
+        over_tolerance: share of pixels whose error is over the tolerance; None without one. Of segments, it is the share of
+            those pixels that the integral was taken at, None if there are none; so is `over_bound`.
         max_bound: largest `error_bound`; None without error control.
         over_bound: share of pixels whose error is over their bound; None without error control.
         max_error_converged, mean_error_converged: against an image of `converged` times the samples.
         converged: that factor.
+        integral_mean, integral_p999, integral_max: mean, 99.9 % quantile and largest of the errors to the light integral, at
+            random pixels; None where it was not taken, or the scene holds media that it does not know.
+        integral: for how many pixels it was asked; 0 for none.
         evaluations, evaluations_full: kernel evaluations, and those of full rate.
         plan, compile: seconds to make the plan, 0 where an earlier one serves, and to compile what was not compiled before.
         grid, adapt, cast, image: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks for it.
@@ -70,6 +75,10 @@ class Measurement:
     max_error_converged: float
     mean_error_converged: float
     converged: int
+    integral_mean: float | None = None
+    integral_p999: float | None = None
+    integral_max: float | None = None
+    integral: int = 0
     evaluations: int
     evaluations_full: int
     plan: float
@@ -103,6 +112,8 @@ COLUMNS = tuple(field.name for field in dataclasses.fields(Measurement))
 
 def read_journal(path: str | Path) -> list[Measurement]:
     """The measurements in a journal, oldest first; none where there is no file. A last line without its end is left out.
+
+    Lines from before the light integral was taken are of 0 pixels of it.
 
     Raises:
         ValueError: a line that is not a measurement of this version.

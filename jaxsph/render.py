@@ -24,6 +24,7 @@ from jaxsph.frame import Band, Frame
 from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.registry import ESTIMATING
 from jaxsph.model.scene import Formulas, Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
@@ -210,10 +211,12 @@ def raise_for(word: int, planned: bool) -> None:
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     """What a file says of how its image was made."""
     exact = settings.tolerance is None
+    estimator = settings.integrator if settings.integrator in ESTIMATING else settings.estimator
     return (
         ("jaxsph.version", __version__),
+        ("jaxsph.integrator", settings.integrator),
         ("jaxsph.tolerance", "none" if exact else float(settings.tolerance)),
-        ("jaxsph.estimator", "none" if exact else settings.estimator),
+        ("jaxsph.estimator", "none" if exact else estimator),
         ("jaxsph.relax", "none" if exact else float(settings.relax)),
         ("jaxsph.certified", float(certified)),
         ("jaxsph.camera", camera.describe()),

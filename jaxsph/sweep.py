@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.contenders import BASELINES, ESTIMATORS, FULL_RATE, TOLERANCES, Contender, contenders, scaled_up
+from jaxsph.contenders import BASELINES, FULL_RATE, TOLERANCES, Contender, contenders, scaled_up
+from jaxsph.integral_error import IntegralAt, layers_of
 from jaxsph.measurement import JOURNAL, KEY, TABLE, Measurement, append, read_journal, write_table
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.plan import Plan
@@ -54,10 +55,11 @@ def sweep(
     settings: Settings | None = None,
     *,
     tolerances: Sequence[float] = TOLERANCES,
-    estimators: Sequence[str] = tuple(ESTIMATORS),
+    estimators: Sequence[str] | None = None,
     baselines: Sequence[str] = BASELINES,
     repeats: int = 3,
     converged: int = 8,
+    integral: int = 1000,
     name: str = "scene",
     frames: Sequence[float] | None = None,
     folder: str | os.PathLike[str] | None = None,
@@ -65,19 +67,20 @@ def sweep(
 ) -> list[Measurement]:
     """Measure error and time of every estimator at every tolerance, and of coarser sampling and smaller images.
 
-    The error of a pixel is the largest difference of any colour channel or alpha, to the same frame at full rate and to an
-    image of `converged` times the samples. Times are medians over `repeats` turns; each group of settings (the baselines,
-    an estimator) takes turns with full rate.
+    The error of a pixel is the largest difference of any colour channel or alpha: to the same frame at full rate, to an image
+    of `converged` times the samples and, at `integral` random pixels, to the light integral. Times are medians over `repeats`
+    turns; each group of settings (the baselines, an estimator) takes turns with full rate.
 
     Args:
         scene, camera: what to render, and from where; or as many of both as the sequence has frames.
-        settings: the settings of full rate; default `Settings()`. `tolerance`, `estimator` and `relax` are the sweep's.
+        settings: of full rate, without tolerance, estimator and `relax`; default `Settings(integrator="samples")`.
         tolerances: each >= 0.
-        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`.
-        baselines: `"samples/K"`, uniform sampling with K times fewer samples; `"size/K"`, an image K times smaller each
-            way, scaled up bilinearly.
-        repeats: turns, at least 1.
-        converged: at least 1.
+        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, kept
+            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
+        baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
+            `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
+        repeats, converged: at least 1.
+        integral: at how many pixels to take the light integral (`jaxsph.reference.integral`, which knows no `media`); 0: none.
         name: of the scene, for the table.
         frames: a number for each frame; default 0, 1, ... of a sequence.
         folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
@@ -93,14 +96,15 @@ def sweep(
     References:
         Hochstetter, Orthmann & Kolb 2016, section 7, tables 2 and 3, figures 11 and 12.
     """
-    settings = settings or Settings()
+    settings = settings or Settings(integrator="samples")
     if settings.tolerance is not None:
         raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
     _require_count("repeats", repeats)
     _require_count("converged", converged)
+    _require_count("integral", integral, least=0)
     groups = contenders(settings, tolerances, estimators, baselines)
     views = _views(scene, camera, frames)
-    shared = {"scene": name, "repeats": repeats, "converged": converged} | of_this_run()
+    shared = {"scene": name, "repeats": repeats, "converged": converged, "integral": integral} | of_this_run()
     each = [
         _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number}) for number, one, view in views
     ]
@@ -117,7 +121,8 @@ def _rows(
     """The table: what the folder holds of it, and what is measured now."""
     held = {row.key: row for row in read_journal(_journal(folder))} if folder is not None else {}
     tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
-    tick = _ticker(progress, sum(_num_renders(missing, repeats) for _, missing in tasks))
+    truths = 2 + bool(frames[0].shared["integral"])
+    tick = _ticker(progress, sum(_num_renders(missing, truths, repeats) for _, missing in tasks))
     plans: Plans = {}
     for frame, missing in tasks:
         for row in _measure(frame, groups[0][0], missing, plans, tick):
@@ -145,15 +150,15 @@ def _views(
     return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
 
 
-def _require_count(name: str, value: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}")
+def _require_count(name: str, value: int, least: int = 1) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}")
 
 
-def _num_renders(missing: list[list[Contender]], repeats: int) -> int:
-    """Images that `_measure` makes: two truths, one of each setting, and the turns."""
+def _num_renders(missing: list[list[Contender]], truths: int, repeats: int) -> int:
+    """Images that `_measure` makes: truths, one of each setting, and the turns."""
     turns = [[setting for setting in group if setting.method != FULL_RATE] for group in missing if group]
-    return 2 * bool(turns) + sum(len(turn) + repeats * (1 + len(turn)) for turn in turns)
+    return truths * bool(turns) + sum(len(turn) + repeats * (1 + len(turn)) for turn in turns)
 
 
 def _ticker(progress: Progress | None, total: int) -> Callable[[], None]:
@@ -175,10 +180,13 @@ def _measure(
     if not any(missing):
         return
     finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
-    truth = _First.of(frame, Contender("converged", finer), plans).layers
+    converged = _First.of(frame, Contender("converged", finer), plans).layers
     tick()
     of_full = _First.of(frame, full, plans)
     tick()
+    truths = _Truths(of_full, converged, IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"]))
+    if frame.shared["integral"]:
+        tick()
     for group in missing:
         firsts = [of_full]
         for setting in group:
@@ -188,7 +196,7 @@ def _measure(
         times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
         for first, turns in zip(firsts, times, strict=False):
             if first.setting in group:
-                found = _compared(first, of_full, truth) | _medians(turns) | {"full_total": _medians(times[0])["total"]}
+                found = _compared(first, truths) | _medians(turns) | {"full_total": _medians(times[0])["total"]}
                 yield Measurement(**frame.shared, **found)
 
 
@@ -214,7 +222,7 @@ class _First:
             plans[setting.kind] = make_plan(*view)
             planned = time.perf_counter() - started
             image = render(*view, plan=plans[setting.kind])
-        compiled, layers = image.stats["seconds"]["compile"], scaled_up(_layers(image), frame.camera)
+        compiled, layers = image.stats["seconds"]["compile"], scaled_up(layers_of(image), frame.camera)
         return cls(setting, plans[setting.kind], planned, compiled, image, layers)
 
 
@@ -228,7 +236,7 @@ def _in_turns(frame: _Frame, firsts: Sequence[_First], repeats: int, tick: Calla
             seconds = {stage: image.stats["seconds"][stage] for stage in STAGES}
             if first.setting.shrink > 1:
                 started = time.perf_counter()
-                scaled_up(_layers(image), frame.camera)
+                scaled_up(layers_of(image), frame.camera)
                 seconds["image"] += time.perf_counter() - started
             turns.append(seconds)
             tick()
@@ -242,34 +250,57 @@ def _medians(turns: list[dict[str, float]]) -> dict[str, float]:
     return stages | {"total": total, "deviation": statistics.median(abs(one - total) for one in sums)}
 
 
-def _compared(first: _First, full: _First, truth: Float[np.ndarray, "height width 4"]) -> dict[str, Any]:
+@dataclasses.dataclass(frozen=True)
+class _Truths:
+    """What images of a frame are compared with."""
+
+    full: _First
+    converged: Float[np.ndarray, "height width 4"]
+    integral: IntegralAt | None
+
+
+def _compared(first: _First, truths: _Truths) -> dict[str, Any]:
     """How wrong an image is, how wrong it was said to be, and the work it took."""
-    error, away = (np.abs(first.layers - other).max(-1) for other in (full.layers, truth))
-    tolerance = first.setting.tolerance
-    bound = None if tolerance is None else np.asarray(first.image.error_bound, np.float64)
-    return {
+    error, away = (np.abs(first.layers - other).max(-1) for other in (truths.full.layers, truths.converged))
+    found = {
         "method": first.setting.method,
-        "tolerance": tolerance,
-        "certified": bool(first.image.certified) and tolerance is not None,
+        "tolerance": first.setting.tolerance,
+        "certified": bool(first.image.certified) and first.setting.tolerance is not None,
         "max_error": float(error.max()),
         "mean_error": float(error.mean()),
-        "over_tolerance": None if tolerance is None else float((error > tolerance).mean()),
-        "max_bound": None if bound is None else float(bound.max()),
-        "over_bound": None if bound is None else float((error > bound).mean()),
         "max_error_converged": float(away.max()),
         "mean_error_converged": float(away.mean()),
         "evaluations": first.image.stats["evaluations"],
-        "evaluations_full": full.image.stats["evaluations"],
+        "evaluations_full": truths.full.image.stats["evaluations"],
         "plan": first.plan_seconds,
         "compile": first.compile_seconds,
         "bytes": first.plan.bytes,
     }
+    return found | _kept(first, error, truths.integral) | _to_integral(first, truths.integral)
 
 
-def _layers(image: Image) -> Float[np.ndarray, "height width 4"]:
-    """Colour and alpha, float64."""
-    alpha = 1 - np.asarray(image.transmittance, np.float64)
-    return np.concatenate([np.asarray(image.color, np.float64), alpha[..., None]], -1)
+def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: IntegralAt | None) -> dict[str, float | None]:
+    """Whether tolerance and bound hold, against what they are promised against."""
+    tolerance = first.setting.tolerance
+    if tolerance is None:
+        return dict.fromkeys(("over_tolerance", "max_bound", "over_bound"))
+    bound = np.asarray(first.image.error_bound, np.float64)
+    largest = float(bound.max())
+    if first.setting.is_against_integral:
+        if integral is None:
+            return {"over_tolerance": None, "max_bound": largest, "over_bound": None}
+        error, bound = integral.errors(first.layers), integral.at(bound)
+    over, beyond = float((error > tolerance).mean()), float((error > bound).mean())
+    return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
+
+
+def _to_integral(first: _First, integral: IntegralAt | None) -> dict[str, float | None]:
+    """How far an image is from the light integral."""
+    if integral is None:
+        return dict.fromkeys(("integral_mean", "integral_p999", "integral_max"))
+    errors = integral.errors(first.layers)
+    mean, quantile, largest = float(errors.mean()), float(np.quantile(errors, 0.999)), float(errors.max())
+    return {"integral_mean": mean, "integral_p999": quantile, "integral_max": largest}
 
 
 def _journal(folder: str | os.PathLike[str]) -> Path:

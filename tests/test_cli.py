@@ -80,6 +80,23 @@ def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
     assert np.abs(placed - np.asarray(io.read_image(tmp_path / "pasted.exr").color)).max() < 1e-3
 
 
+def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_integral_is(file, tmp_path, capsys):
+    arguments = ["--size", "12x8", "--samples", "16"]
+    code, out, err = run(capsys, "render", file, "-o", "out.exr", *arguments, "--integrator", "segments", "--tolerance", 0.01)
+    assert (code, err) == (0, [])
+    (line,) = (line for line in out.splitlines() if line.startswith("error"))
+    assert line.startswith("error     at most about ")
+    assert line.endswith(" (estimated against the light integral), tolerance 0.01")
+    image = io.read_image(tmp_path / "out.exr")
+    told = dict(image.metadata)
+    assert (told["jaxsph.integrator"], told["jaxsph.estimator"], told["jaxsph.certified"]) == ("segments", "segments", 0)
+    assert np.asarray(image.error_bound).max() > 0
+    code, out, _ = run(capsys, "render", file, "-o", "out.exr", *arguments, "--integrator", "samples", "--tolerance", 0.01)
+    told = dict(io.read_image(tmp_path / "out.exr").metadata)
+    assert code == 0 and (told["jaxsph.integrator"], told["jaxsph.estimator"]) == ("samples", "interval")
+    assert "(certified), tolerance 0.01" in out
+
+
 def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, "render", "scene:dam_break", "--particles", 60, "--frame", 0, *TINY)
@@ -113,6 +130,7 @@ WRONG_USAGE = [
     (["render", "FILE", "--size", "big"], "640x480"),
     (["render", "FILE", "--samples", "0"], "`samples` must be"),
     (["render", "FILE", "--samples", "many"], "invalid int"),
+    (["render", "FILE", "--integrator", "splat_bound"], "invalid choice"),
     (["render", "FILE", "--tolerance", "-1"], "`tolerance`"),
     (["render", "FILE", "-o", "out.jpg"], ".exr or .png"),
     (["render", "FILE", "--target", "0", "0", "0"], "--target needs --eye"),

@@ -12,14 +12,15 @@ import pytest
 
 import jaxsph as js
 from jaxsph import cli, figures, provenance
-from jaxsph.contenders import BASELINES, baseline, scaled_up
+from jaxsph.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
 from jaxsph.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
 
 PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
 CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2",)}
-ONCE = {"repeats": 1, "converged": 1}
+ONCE = {"repeats": 1, "converged": 1, "integral": 0}
+SETTINGS, POINTS_8, POINTS_4 = (js.Settings(samples=samples, integrator="samples") for samples in (SAMPLES, 8, 4))
 SOURCE = ["scene:radial", "--particles", PARTICLES, "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
-LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1]
+LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(view, folder):
-    return js.sweep(*view, js.Settings(samples=SAMPLES), **CHOSEN, **ONCE, name="radial", folder=folder)
+    return js.sweep(*view, SETTINGS, **CHOSEN, **ONCE, name="radial", folder=folder)
 
 
 def layers(image):
@@ -58,7 +59,7 @@ def test_there_is_a_row_for_every_setting_full_rate_first(rows):
 
 def test_errors_are_the_differences_of_the_images(view, rows):
     scene, camera = view
-    settings = js.Settings(samples=SAMPLES)
+    settings = SETTINGS
     full = js.render(scene, camera, settings)
     coarse = js.render(scene, camera, dataclasses.replace(settings, samples=SAMPLES // 2))
     error = np.abs(layers(coarse) - layers(full)).max(-1)
@@ -81,7 +82,8 @@ def test_certified_settings_keep_their_word(rows):
 
 def test_the_converged_image_has_that_many_times_the_samples(view, rows):
     """Half the samples against twice as many is what `samples/2` is against full rate."""
-    (half,) = js.sweep(*view, js.Settings(samples=SAMPLES // 2), estimators=(), baselines=(), repeats=1, converged=2)
+    few = dataclasses.replace(SETTINGS, samples=SAMPLES // 2)
+    (half,) = js.sweep(*view, few, estimators=(), baselines=(), **ONCE | {"converged": 2})
     assert half.max_error == 0 and half.max_error_converged == pytest.approx(rows[1].max_error, abs=1e-7)
     assert half.mean_error_converged == pytest.approx(rows[1].mean_error, abs=1e-7)
 
@@ -95,7 +97,7 @@ def test_stages_add_up_and_compiling_is_apart(rows):
 def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypatch):
     before = (folder / JOURNAL).read_text()
     steps = []
-    settings = js.Settings(samples=SAMPLES)
+    settings = SETTINGS
     more = {"name": "radial", "folder": folder, "progress": lambda done, total: steps.append((done, total))}
     assert js.sweep(*view, settings, **CHOSEN, **ONCE, **more) == rows
     assert not steps and (folder / JOURNAL).read_text() == before
@@ -104,6 +106,14 @@ def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypat
     added = (folder / JOURNAL).read_text().removeprefix(before).splitlines()
     assert [json.loads(line)["tolerance"] for line in added] == [0.1]
     assert steps == [(done, 5) for done in range(1, 6)]  # two truths, the new setting, and its turn with full rate
+
+
+def test_estimators_are_those_that_suit_full_rate():
+    assert suitable(SETTINGS) == tuple(ESTIMATORS)
+    assert suitable(js.Settings(integrator="segments")) == ("segments",)
+    groups = contenders(SETTINGS, (0.1,), None, ())
+    kept = {group[0].method: group[0].is_against_integral for group in groups}
+    assert kept == {"full rate": False, "interval": False, "interval relaxed": False, "pilot": False, "segments": True}
 
 
 @pytest.fixture
@@ -124,7 +134,7 @@ def by_reference(monkeypatch):
 
 def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
     scene, camera = js.scenes.load("radial", 50, width=24, height=16)
-    settings = js.Settings(samples=8)
+    settings = POINTS_8
     full, half = js.sweep(scene, camera, settings, estimators=(), baselines=("size/2",), **ONCE)
     small = js.reference.render(scene, dataclasses.replace(camera, width=12, height=8), settings)
     expected = np.abs(scaled_up(layers(small), camera) - layers(js.reference.render(scene, camera, settings))).max(-1)
@@ -135,11 +145,31 @@ def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
 
 def test_each_group_takes_turns_with_full_rate(by_reference):
     scene, camera = js.scenes.load("radial", 20, width=8, height=8)
-    chosen = {"tolerances": (0.1, 0.2), "estimators": ("pilot",), "baselines": ("size/2",), "repeats": 2}
-    rows = js.sweep(scene, camera, js.Settings(samples=4), **chosen)
+    chosen = {"tolerances": (0.1, 0.2), "estimators": ("pilot",), "baselines": ("size/2",), "repeats": 2, "integral": 0}
+    rows = js.sweep(scene, camera, POINTS_4, **chosen)
     truths, turns = [(None, 8)] * 2, [(None, 8), (0.1, 8), (0.2, 8)]
     assert by_reference == [*truths, (None, 4), *[(None, 8), (None, 4)] * 2, (0.1, 8), (0.2, 8), *turns * 2]
     assert all(row.full_total == 4 and row.repeats == 2 for row in rows)
+
+
+def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_held_against_it(by_reference):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.01,), "estimators": ("pilot", "segments"), "baselines": ("samples/2",), **ONCE}
+    steps = []
+    more = {"integral": 64, "progress": lambda done, total: steps.append((done, total))}
+    rows = js.sweep(scene, camera, POINTS_8, **chosen | more)
+    truth = layers(js.reference.integral(scene, camera))
+    images = [layers(js.reference.render(scene, camera, one)) for one in (POINTS_8, POINTS_4)]
+    full, half = (np.abs(image - truth).max(-1) for image in images)
+    for row, error in zip(rows, (full, half, full, full), strict=True):  # here all but the second are full rate
+        expected = (error.mean(), np.quantile(error, 0.999), error.max())
+        assert (row.integral_mean, row.integral_p999, row.integral_max) == pytest.approx(expected, abs=2e-6)
+    _, _, pilot, segments = rows
+    assert pilot.over_tolerance == pilot.over_bound == 0
+    assert segments.over_tolerance == (full > 0.01).mean() > 0 and segments.over_bound == (full > 0).mean()
+    assert steps[-1][0] == steps[-1][1] == len(steps)
+    without = js.sweep(scene, camera, POINTS_8, **chosen)[-1]
+    assert without.integral_max is without.over_tolerance is without.over_bound is None and without.key != segments.key
 
 
 def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
@@ -154,35 +184,35 @@ def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
 
     monkeypatch.setattr(module, "render", render)
     monkeypatch.setattr(module, "make_plan", lambda *_: made.append(None) or types.SimpleNamespace(bytes=len(made)))
-    rows = js.sweep(*zip(*views, strict=True), js.Settings(samples=4), estimators=(), baselines=(), **ONCE | {"converged": 2})
+    rows = js.sweep(*zip(*views, strict=True), POINTS_4, estimators=(), baselines=(), **ONCE | {"converged": 2})
     assert [(row.frame, row.bytes) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
 
 
 def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
     scene, camera = js.scenes.load("radial", 20, width=8, height=8)
-    chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "folder": tmp_path}
+    chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "integral": 0, "folder": tmp_path}
 
     def stop(done, total):
         if done == total:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        js.sweep(scene, camera, js.Settings(samples=4), **chosen, progress=stop)
+        js.sweep(scene, camera, POINTS_4, **chosen, progress=stop)
     assert [row.method for row in read_journal(tmp_path / JOURNAL)] == ["full rate"]
     by_reference.clear()
-    rows = js.sweep(scene, camera, js.Settings(samples=4), **chosen)
+    rows = js.sweep(scene, camera, POINTS_4, **chosen)
     assert [row.method for row in rows] == ["full rate", "pilot"] and len(by_reference) == 2 + 1 + 2
 
 
 def test_other_data_is_another_measurement(view):
     scene, camera = view
-    settings = js.Settings(samples=SAMPLES)
+    settings = SETTINGS
     moved = dataclasses.replace(scene.particles, quantity=scene.particles.quantity + 1e-3)
     nearer = dataclasses.replace(camera, near=camera.near * 0.9)
     wider = dataclasses.replace(camera, width=WIDTH + 1)
     variants = [(scene, camera, settings, 8), (dataclasses.replace(scene, particles=moved), camera, settings, 8)]
     variants += [(scene, nearer, settings, 8), (scene, wider, settings, 8), (scene, camera, settings, 4)]
-    variants += [(scene, camera, js.Settings(samples=SAMPLES, merge=False), 8)]
+    variants += [(scene, camera, dataclasses.replace(SETTINGS, merge=False), 8)]
     digests = [provenance.of_frame(*variant)["fingerprint"] for variant in variants]
     assert len(set(digests)) == len(variants) and digests[0] == provenance.of_frame(*view, settings, 8)["fingerprint"]
 
@@ -198,6 +228,13 @@ def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(row
     path.write_text('{"scene": "radial"}\n')
     with pytest.raises(ValueError, match=r"line 1 is not a measurement.*another folder"):
         read_journal(path)
+
+
+def test_lines_from_before_there_was_an_integral_are_read(rows, tmp_path):
+    new = {name: getattr(rows[1], name) for name in COLUMNS}
+    old = {name: value for name, value in new.items() if not name.startswith("integral")}
+    (tmp_path / JOURNAL).write_text(json.dumps(old) + "\n")
+    assert read_journal(tmp_path / JOURNAL) == [dataclasses.replace(rows[1], integral=0)]
 
 
 def test_the_csv_is_the_same_table(rows, tmp_path):
@@ -224,15 +261,23 @@ def test_a_smaller_image_is_read_where_its_rays_pass():
     inner = np.s_[2:-2, 2:-2]
     assert scaled_up(ramp(small), camera)[inner] == pytest.approx(ramp(camera)[inner], abs=1e-12)
     assert scaled_up(ramp(camera), camera) is not None and (scaled_up(ramp(camera), camera) == ramp(camera)).all()
-    assert [baseline(js.Settings(), name).shrink for name in BASELINES] == [1, 1, 2, 4]
-    assert [baseline(js.Settings(), name).settings.samples for name in BASELINES] == [128, 64, 256, 256]
+    made = [baseline(js.Settings(), name) for name in BASELINES]
+    assert [one.shrink for one in made] == [1, 1, 1, 1, 2, 4]
+    assert [one.settings.samples for one in made] == [128, 64, 256, 64, 256, 256]
+    assert [one.settings.integrator for one in made[:4]] == ["samples"] * 2 + ["segments"] * 2
+    assert baseline(js.Settings(), "segments") == made[2]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"estimators": ("exact",)}, "'interval', 'interval relaxed', 'pilot', got 'exact'"),
-        ({"baselines": ("pixels/2",)}, "'samples/2' or 'size/4', got 'pixels/2'"),
+        ({"estimators": ("exact",)}, "'interval', 'interval relaxed', 'pilot', 'segments', got 'exact'"),
+        (
+            {"estimators": ("pilot",), "settings": js.Settings(integrator="segments")},
+            "'pilot'.*full rate of point samples.*integrator='segments'",
+        ),
+        ({"baselines": ("pixels/2",)}, "'samples/2', 'segments', 'segments/2' or 'size/4', got 'pixels/2'"),
+        ({"integral": -1}, "`integral` must be an integer of at least 0, got -1"),
         ({"baselines": ("size/0",)}, "got 'size/0'"),
         ({"tolerances": (-1.0,)}, "`tolerance` must be >= 0"),
         ({"repeats": 0}, "`repeats` must be an integer of at least 1, got 0"),
@@ -282,16 +327,35 @@ def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, 
     assert lowest / 10 < bottom < lowest < max(CHOSEN["tolerances"]) < top
 
 
+def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(rows, tmp_path):
+    pytest.importorskip("matplotlib")
+    taken = {"integral_mean": 0.001, "integral_p999": 0.01, "integral_max": 0.02}
+    more = [dataclasses.replace(row, method="segments", **taken) for row in rows if row.method == "interval"]
+    points = figures.summary([*rows, *more])
+    assert [point.kept for point in points[-2:]] == [0.02] * 2 and points[2].kept == rows[2].max_error
+    (axis,) = figures._error(points, "a title").axes
+    assert "segments: the light integral" in axis.get_ylabel()
+    shown = figures._integral(points, "a title").axes[1]
+    assert shown.get_xlabel() == "largest error, against the light integral"
+    assert "segments" in shown.get_legend_handles_labels()[1]
+    unknown = figures.summary([*rows, *(dataclasses.replace(row, integral_max=None) for row in more)])
+    assert "segments" not in str(figures._error(unknown, "a title").axes[0].get_legend_handles_labels())
+    far_off = [dataclasses.replace(point, integral=5.0) for point in points]
+    assert figures._error(far_off, "a title").axes[0].get_ylim()[1] > 5
+    assert [path.name for path in figures.draw(rows, tmp_path)] == ["error.png", "pareto.png"]
+
+
 def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--frames", 0, 2, *LEAST_WORK)
     assert (code, err) == (0, [])
-    names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "frames.png")
+    names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "integral.png", "frames.png")
     assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == sorted(names)
     assert all(name in out for name in names) and "samples/2" in out and "frame 2" in out
     found = read_journal(tmp_path / "new" / "out" / JOURNAL)
     assert [(row.frame, row.method) for row in found] == [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
     assert {row.max_error for row in found[1::2]} == {rows[1].max_error}  # it does not move
+    assert all(0 < row.integral_mean <= row.integral_max and row.integral == 10 for row in found) and "to integral" in out
 
 
 def test_without_matplotlib_the_command_says_so_before_the_work(tmp_path, capsys, monkeypatch):
@@ -317,6 +381,8 @@ def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
         (["-o", "out", "--estimators", "exact"], "invalid choice"),
         (["-o", "out", "--baselines", "half"], "samples/2"),
         (["-o", "out", "--repeats", "0"], "at least 1"),
+        (["-o", "out", "--integral", "-1"], "at least 0"),
+        (["-o", "out", "--integrator", "splat_bound"], "invalid choice"),
         (["-o", "out", "--samples", "0"], "`samples` must be"),
         (["-o", "out", "--frames", "1", "1"], "different"),
         (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),

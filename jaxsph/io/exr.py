@@ -9,7 +9,8 @@
 | `work.evaluations` | kernel evaluations spent on the pixel |
 
 All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
-`jaxsph.version` and `certified` (`true` or `false`).
+`jaxsph.version`, `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`, `jaxsph.estimator` (`segments` of that
+integrator) and `certified` (`true` or `false`).
 """
 
 from __future__ import annotations

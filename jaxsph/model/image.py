@@ -24,7 +24,8 @@ class Image:
         color: premultiplied RGB in [0, 1].
         transmittance: what is left of the background's light, in [0, 1]; alpha is `1 - transmittance`.
         depth: view depth where transmittance falls to 1/2, inf where it never does, length units.
-        error_bound: largest difference to the reference image that a pixel can have; 0 at full rate.
+        error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full
+            rate. With a tolerance and `integrator="segments"`, the estimated error against the light integral.
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound.
         faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.

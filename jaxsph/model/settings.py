@@ -24,11 +24,15 @@ class Settings:
 
     Attributes:
         samples: fine samples N along every ray, at least 1.
-        tolerance: largest absolute difference to the reference image that any colour channel or alpha of any pixel may have;
-            `None` renders that reference image, at full rate.
-        estimator: how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections 4 and 5), `"pilot"`
-            estimates them from a coarse lattice of rays, and saves several times as many evaluations. It uses none of `relax`,
-            `super_pixels`, `merge` and `allocation`.
+        tolerance: largest absolute error that any colour channel or alpha of any pixel may have; `None` takes all samples of each
+            ray, at full rate. With `integrator="samples"` errors are measured against the reference image, which is that at full
+            rate. With `"segments"` they are measured against the light integral along the pixel's ray
+            (`jaxsph.reference.integral`): the error is estimated and nothing is certified; rays begin with a half of `samples`
+            segments, which are made shorter where the estimate asks for it, down to a quarter of what `samples` are apart.
+        estimator: of `integrator="samples"`, how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections
+            4 and 5), `"pilot"` estimates them from a coarse lattice of rays, and saves several times as many evaluations. It uses
+            none of `relax`, `super_pixels`, `merge` and `allocation`. Segments use neither, nor any of those: they estimate by
+            segments of twice the length.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
@@ -37,8 +41,11 @@ class Settings:
             does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict
             form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
-            (Hochstetter et al. 2016, section 2.2); `"step_doubling"` takes steps of at most a sample, and halves those that two
-            halves disagree with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
+            (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear from one to the next,
+            the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where supports begin and end
+            in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those that two halves disagree
+            with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point. `"splat_bound"` is for
+            `jaxsph.splat_bound`.
         step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
             ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs
             are compiled for it.
