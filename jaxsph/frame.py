@@ -37,6 +37,7 @@ from jaxsph.stages import (
     decide_by_pilot,
     decide_full_rate,
     ends,
+    least_transmittance,
     limits_of,
     probe_shard,
     sum_shard,
@@ -90,7 +91,7 @@ class Frame:
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
         allowed = None if limits is None else limits.tolerance
-        least = jnp.asarray(settings.min_transmittance, dtype) if ends(settings) else None
+        least = jnp.asarray(least_transmittance(settings), dtype) if ends(settings) else None
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
         return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least)

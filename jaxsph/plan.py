@@ -118,7 +118,7 @@ class Plan:
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
-        if is_refined(settings) != bool(self.cast.doublings):
+        if settings.is_refined != bool(self.cast.doublings):
             kind = "a tolerance" if self.cast.doublings else "no tolerance (`tolerance=None`)"
             raise ValueError(f"`plan` was made for {kind}, but settings ask for the other; make a new one with `jaxsph.plan`")
         wanted = _kind(settings)
@@ -247,7 +247,7 @@ def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
     lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
-    cast = dataclasses.replace(cast, doublings=DOUBLINGS if is_refined(settings) else 0)
+    cast = dataclasses.replace(cast, doublings=DOUBLINGS if settings.is_refined else 0)
     room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
@@ -293,7 +293,7 @@ def _control_plan(settings: Settings, choices: Choices, room: tuple[int, int]) -
 
 def _kind(settings: Settings) -> ControlPlan | type[PilotPlan] | None:
     """The kind of error control that settings ask for, whatever the frame."""
-    if settings.tolerance is None or is_refined(settings):
+    if settings.tolerance is None or settings.is_refined:
         return None
     if settings.estimator == "pilot":
         return PilotPlan
@@ -355,14 +355,9 @@ def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) ->
     return CastPlan(chunk, slab_samples, min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk), tuning)
 
 
-def is_refined(settings: Settings) -> bool:
-    """Whether samples are doubled where a tolerance needs it."""
-    return settings.tolerance is not None and settings.integrator in ESTIMATING
-
-
 def first_samples(settings: Settings) -> int:
     """Samples that rays are cut by before any are doubled."""
-    return -(-settings.samples // FIRST) if is_refined(settings) else settings.samples
+    return -(-settings.samples // FIRST) if settings.is_refined else settings.samples
 
 
 def along_rays(scene: Scene, settings: Settings) -> Settings:
@@ -388,7 +383,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
         pays = pays and settings.integrator == "samples"
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
-    if is_refined(settings) and settings.screen == "pixels":
+    if settings.is_refined:
         return settings
     for what, asked in beyond.items():
         if asked:

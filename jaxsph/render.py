@@ -35,7 +35,7 @@ from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
-from jaxsph.stages import ends
+from jaxsph.stages import ends, least_transmittance
 from jaxsph.version import __version__
 from jaxsph.viewing import Seen
 
@@ -191,7 +191,7 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
     if not ends(settings):
         return image
     let_through = lax.stop_gradient(image.transmittance)
-    left_out = jnp.where(let_through < settings.min_transmittance, let_through, 0)
+    left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
     return dataclasses.replace(image, error_bound=image.error_bound + left_out)
 
 

@@ -45,6 +45,8 @@ from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning
 from jaxsph.viewing import half_steps, sphere_depths
 
+ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
+
 
 def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """Jit a function as a stage, tuned by its keyword `tuning`; `quickly` where it takes longer to compile than to run."""
@@ -74,8 +76,8 @@ def limits_of(settings: Settings, dtype: Any) -> Limits | None:
         return None
     tolerance = settings.tolerance
     if ends(settings):  # which take a part of it
-        tolerance = tolerance - settings.min_transmittance
-    if not is_traced(tolerance):
+        tolerance = tolerance - least_transmittance(settings)
+    if not is_traced(tolerance) and not isinstance(tolerance, jax.Array):
         rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
         tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
     return Limits(jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype))
@@ -84,7 +86,13 @@ def limits_of(settings: Settings, dtype: Any) -> Limits | None:
 def ends(settings: Settings) -> bool:
     """Whether rays may end before their ends."""
     least = settings.min_transmittance
-    return is_traced(least) or float(least) > 0
+    return settings.is_refined or is_traced(least) or float(least) > 0
+
+
+def least_transmittance(settings: Settings) -> Any:
+    """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
+    least = settings.min_transmittance
+    return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
 
 
 class BandGrid(NamedTuple):

@@ -200,6 +200,11 @@ def _require_values(fixed: NonDiffInputs) -> None:
             "an image with super-pixels has no derivatives, as their colours come from bounds; "
             "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
         )
+    if fixed.tolerance is not None:
+        raise NotImplementedError(
+            "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
+            "as it needs"
+        )
     if fixed.lattice is not None:
         raise NotImplementedError(
             "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"

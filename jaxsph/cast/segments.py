@@ -58,21 +58,26 @@ class Segments(Integrator):
         extinction = fusion_barrier(always, _extinction, medium, intervals, task)
         thickness = extinction * task.path()
         left = fusion_barrier(always, transmitted, thickness)
-        red_green, blue = (
-            fusion_barrier(always, functools.partial(_emitted, channels=channels), medium, intervals, task, extinction, left)
-            for channels in (slice(0, 2), slice(2, 3))
+        red, green, blue = (
+            fusion_barrier(always, functools.partial(_color, channel=channel), medium, intervals, task, extinction)
+            for channel in range(3)
         )
-        return Segment((red_green.real, red_green.imag, blue.real), left[:, -1], thickness)
+        red_green = fusion_barrier(always, _emitted, red, green, left)
+        return Segment((red_green.real, red_green.imag, emitted([blue], left)[0]), left[:, -1], thickness)
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """With quadratic errors taken out, and with an estimate of the error: by how far segments of twice the length differ."""
         always, double = task.slab[0] >= 0, task.every_other()
         short = medium.intervals(gathered, task), task
         long = medium.intervals(medium.every_other(gathered), double), double
-        thickness, of_long = fusion_barrier(always, _thicknesses, medium, short, long)
-        left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, of_long))
-        given = medium, short, long, thickness, of_long, left, left_by_long
-        channels = [apart_of(fusion_barrier(always, functools.partial(_compared, nth=nth), *given)) for nth in range(3)]
+        own, double = (fusion_barrier(always, functools.partial(_amounts, channel=3), medium, *one) for one in (short, long))
+        thickness = fusion_barrier(always, carried, own, double)
+        left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, double))
+        channels = []
+        for channel in range(3):
+            parts = [fusion_barrier(always, functools.partial(_amounts, channel=channel), medium, *one) for one in (short, long)]
+            given = *parts, thickness, double, left, left_by_long
+            channels.append(apart_of(fusion_barrier(always, _colors_compared, *given)))
         through = left[:, -1] - left_by_long[:, -1]
         error = jnp.abs(through)
         for color, by_long in channels:
@@ -82,28 +87,20 @@ class Segments(Integrator):
         return Segment((red, green, blue), left[:, -1], thickness, error)
 
 
-def _thicknesses(medium: Medium, short: tuple[Any, SlabTask], long: tuple[Any, SlabTask]) -> tuple[Array, Array]:
-    """Optical thickness of segments, with quadratic errors taken out; and of those of twice the length."""
-    own, double = (_extinction(medium, *one) * one[1].path() for one in (short, long))
-    return own * extrapolated(own, double), double
+def _amounts(medium: Medium, intervals: Any, task: SlabTask, channel: int) -> Array:
+    """Emission of one colour, or extinction, of segments in all."""
+    (mean,) = medium.means(intervals, task, slice(channel, channel + 1))
+    return mean * task.path()
 
 
-def _compared(
-    medium: Medium,
-    short: tuple[Any, SlabTask],
-    long: tuple[Any, SlabTask],
-    thickness: Array,
-    of_long: Array,
-    left: Array,
-    left_by_long: Array,
-    *,
-    nth: int,
-) -> Any:
+def carried(short: Array, long: Array) -> Array:
+    """What segments have in all, with quadratic errors taken out."""
+    return short * extrapolated(short, long)
+
+
+def _colors_compared(short: Array, long: Array, thickness: Array, of_long: Array, left: Array, left_by_long: Array) -> Any:
     """One colour of slabs, and the same by segments of twice the length."""
-    (own,), (double,) = (medium.means(intervals, task, slice(nth, nth + 1)) for intervals, task in (short, long))
-    own, double = own * short[1].path(), double * long[1].path()
-    (color,) = colors_of([own * extrapolated(own, double)], thickness)
-    (color_of_long,) = colors_of([double], of_long)
+    (color,), (color_of_long,) = colors_of([carried(short, long)], thickness), colors_of([long], of_long)
     return together_of(emitted([color], left)[0], emitted([color_of_long], left_by_long)[0])
 
 
@@ -131,7 +128,11 @@ def _extinction(medium: Medium, intervals: Any, task: SlabTask) -> Array:
     return extinction
 
 
-def _emitted(medium: Medium, intervals: Any, task: SlabTask, extinction: Array, left: Array, *, channels: slice) -> Array:
-    """One or two colours of slabs, as real and imaginary part."""
-    first, *second, _ = emitted(colors_of(medium.means(intervals, task, channels), extinction), left)
-    return lax.complex(first, second[0] if second else jnp.zeros_like(first))
+def _color(medium: Medium, intervals: Any, task: SlabTask, extinction: Array, *, channel: int) -> Array:
+    """Mean colour of segments, at hand before it is composited: a loop over segments would find it anew for each."""
+    return colors_of(medium.means(intervals, task, slice(channel, channel + 1)), extinction)[0]
+
+
+def _emitted(red: Array, green: Array, left: Array) -> Array:
+    """Two colours of slabs, as real and imaginary part."""
+    return lax.complex(*emitted([red, green], left)[:2])

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.model.registry import INTEGRATORS, SCREENS
+from jaxsph.model.registry import ESTIMATING, INTEGRATORS, SCREENS
 
 ESTIMATORS = ("interval", "pilot")
 LEAF_PIXELS = 4, 8, 16, 32
@@ -76,6 +76,11 @@ class Settings:
     leaf_estimator: str = "hierarchical"
     min_transmittance: Any = 0.0
     memory_limit: int | None = None
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether samples are doubled along rays where a tolerance needs it."""
+        return self.tolerance is not None and self.integrator in ESTIMATING and self.screen == "pixels"
 
     def __post_init__(self) -> None:
         if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
