@@ -83,7 +83,10 @@ def test_a_ball_around_the_camera_is_cut_by_near_and_far(place, size, near, dept
 def test_balls_of_several_quantities_and_one_extinction_have_the_alpha_of_their_union(seed):
     """Of all sizes. Two of them: what they cover of a slab is at most two pieces, which its pivot splits or which are one."""
     rng = np.random.default_rng(seed)
-    position, support = rng.uniform(-0.8, 0.8, (2, 3)).astype(np.float32), (1.2 * 10 ** -rng.uniform(0, 1.5, 2)).astype(np.float32)
+    position, support = (
+        rng.uniform(-0.8, 0.8, (2, 3)).astype(np.float32),
+        (1.2 * 10 ** -rng.uniform(0, 1.5, 2)).astype(np.float32),
+    )
     particles = balls(position, support, rng.uniform(0, 1, 2).astype(np.float32), rng.uniform(0.1, 1, 2).astype(np.float32))
     view, looks = camera(), dataclasses.replace(GREY, colors=jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
     image = shown(js.Scene(particles, looks), view)
@@ -229,7 +232,9 @@ def test_colours_never_exceed_alpha_and_what_has_one_colour_shows_it(seed):
     colors = rng.uniform(0, 1, (3, 3))
     for same in (False, True):
         given = colors[:1] * np.ones((3, 1)) if same else colors
-        looks = js.TransferFunction.from_points(*(np.float32(part) for part in (np.sort(rng.uniform(0, 1, 3)), given, extinction)))
+        looks = js.TransferFunction.from_points(
+            *(np.float32(part) for part in (np.sort(rng.uniform(0, 1, 3)), given, extinction))
+        )
         image = shown(js.Scene(particles, looks), view)
         color, alpha = np.asarray(image.color), np.asarray(image.alpha)[..., None]
         assert (color >= 0).all() and (color <= alpha + 2e-6).all() and (alpha <= 1).all()

@@ -73,7 +73,13 @@ def test_two_pieces_on_either_side_of_an_outer_sample_are_told_apart(k, data):
     share = st.floats(AWAY, 1 - AWAY)
     end = DEPTH[k] - 0.3 * data.draw(share)
     begin = DEPTH[k] + 0.3 * data.draw(share)
-    check([(end - data.draw(st.sampled_from([0.1, 0.45, 3.0])), end), (begin, begin + data.draw(st.sampled_from([0.1, 0.45, 3.0])))], DEPTH[k])
+    check(
+        [
+            (end - data.draw(st.sampled_from([0.1, 0.45, 3.0])), end),
+            (begin, begin + data.draw(st.sampled_from([0.1, 0.45, 3.0]))),
+        ],
+        DEPTH[k],
+    )
 
 
 def test_what_is_inside_at_both_ends_is_so_all_along():
@@ -95,6 +101,7 @@ def test_means_are_of_the_part_that_is_inside():
     looks = TransferFunction.from_points([0.0, 1.0], [[0, 0, 1.0], [1, 0, 0]], [0.0, 2.0])
     near, far, share = (jnp.asarray(part, jnp.float32)[None, :, None] for part in ([0.0, 0.5], [1.0, 0.5], [0.25, 0.0]))
     made = Intervals(near, far, share)
-    red, green, blue, extinction = (np.asarray(mean)[0, :, 0] for mean in means_of(MeanTables.of(looks.segments()), made, slice(0, 4)))
+    red, green, blue, extinction = (
+        np.asarray(mean)[0, :, 0] for mean in means_of(MeanTables.of(looks.segments()), made, slice(0, 4))
+    )
     np.testing.assert_allclose([red, green, blue, extinction], [[0.25 * 2 / 3, 0], [0, 0], [0.25 / 3, 0], [0.25, 0]], atol=1e-6)
-
