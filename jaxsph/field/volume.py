@@ -3,8 +3,8 @@
 Flow: volume, camera -> [volume: grid -> look-up] -> integrator.
 
 Between samples the quantity is taken for linear, and where a ray enters and leaves the box is found, with the quantity there: in
-a slab that is one place each. Slabs in which the transfer function shows nothing are not marched, see `access.macrocells`. As a medium it shares samples with
-others, so light from all of them meets in the right order (Kaehler, Abel & Hege 2007).
+a slab that is one place each. Slabs in which the transfer function shows nothing are not marched, see `access.macrocells`. As a
+medium it shares samples with others, so light from all of them meets in the right order (Kaehler, Abel & Hege 2007).
 """
 
 from __future__ import annotations
