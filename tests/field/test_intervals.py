@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +42,7 @@ def found(pieces, pivot):
 def check(pieces, pivot):
     """That where intervals are inside, the quantity is that of the line, and shares are those of the pieces."""
     near, far, share = found(pieces, pivot)
-    for k, (first, last) in enumerate(zip(DEPTH[:-1], DEPTH[1:], strict=True)):
+    for k, (first, last) in enumerate(itertools.pairwise(DEPTH)):
         parts = [(max(piece[0], first), min(piece[1], last)) for piece in pieces if piece]
         parts = [part for part in parts if part[0] < part[1]]
         assert len(parts) < 2

@@ -56,6 +56,12 @@ class Rays(NamedTuple):
         half = np.sqrt(np.maximum(np.asarray(square) - away, 0) / length)
         return tuple(np.clip(end, self.near, self.far) for end in (foot - half, foot + half))
 
+    def in_box(self, lower, upper):
+        """Path length (rays,) in a box along the axes."""
+        faces = (np.stack([lower, upper]).astype(float)[:, None] - self.start) / self.direction
+        begin, end = (np.clip(depth, self.near, self.far) for depth in (faces.min(0).max(1), faces.max(0).min(1)))
+        return np.maximum(end - begin, 0) * self.slant
+
     def within(self, center, square):
         """Path length (rays,) in the union of balls."""
         begin, end = self.chords(center, square)
