@@ -137,11 +137,12 @@ def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
 def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
     """All media, particles first if there are any."""
     grid, _ = _seen(inputs, fixed)
-    media = tuple(medium.in_band(grid) for medium in inputs.media)
+    between = method.integrator.between
+    media = tuple(medium.in_band(grid).for_means() if between else medium.in_band(grid) for medium in inputs.media)
     if inputs.transfer is None:
         return media
     segments = inputs.transfer.segments()
-    tables = MeanTables.of(segments) if method.integrator.between else None
+    tables = MeanTables.of(segments) if between else None
     return ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), *media
 
 

@@ -245,11 +245,11 @@ class PointsMedium(Medium):
     ) -> tuple[PointsMedium, OfPlaces]:
         """See `Medium.pull`: sums have the same cotangents for each point, which is met again."""
 
-        def optics(sums: tuple[Array, ...], places: OfPlaces) -> list[Array]:
-            return self.optics(sums, _moved(task, places))
+        def met(sums: tuple[Array, ...], places: OfPlaces) -> list[Array]:
+            return self.met(sums, _moved(task, places))
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        of_gathered, places = jax.vjp(optics, gathered, there)[1](cotangents)
+        of_gathered, places = jax.vjp(met, gathered, there)[1](cotangents)
         of_sums = jnp.stack(of_gathered)
 
         def add(nth: Array, carry: tuple[Any, ...], number: int, part: SlabTask) -> tuple[Any, ...]:

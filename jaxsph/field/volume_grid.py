@@ -60,6 +60,25 @@ class VolumeGrid:
         within = [(at >= 0) & (at <= points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
         return within[0] & within[1] & within[2]
 
+    def moved_inside(self, coordinates: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
+        """The nearest points of the box."""
+        return [jnp.clip(at, 0, points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
+
+    def clipped(
+        self, begin: list[Float[Array, "..."]], end: list[Float[Array, "..."]]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The shares of the way from grid coordinates to others at which the box begins and ends; nothing of it has no length."""
+        enter, leave = jnp.zeros_like(begin[0]), jnp.ones_like(begin[0])
+        for first, last, points in zip(begin, end, self.values.shape, strict=True):
+            change = last - first
+            moves = jnp.abs(change) > jnp.finfo(change.dtype).eps  # of a cell; else its derivatives could overflow
+            inverse = 1 / jnp.where(moves, change, 1)
+            faces = -first * inverse, (points - 1 - first) * inverse
+            inside = (first >= 0) & (first <= points - 1)
+            enter = jnp.maximum(enter, jnp.where(moves, jnp.minimum(*faces), jnp.where(inside, 0, 1)))
+            leave = jnp.minimum(leave, jnp.where(moves, jnp.maximum(*faces), jnp.where(inside, 1, 0)))
+        return jnp.minimum(enter, 1), jnp.maximum(leave, 0)
+
     def interpolate(self, coordinates: list[Float[Array, "a b c"]]) -> Float[Array, "a b c"]:
         """The trilinear field at grid coordinates; those outside are moved to the nearest cell's own trilinear field."""
         whole, part = zip(*(_cell(at, points) for at, points in zip(coordinates, self.values.shape, strict=True)), strict=True)

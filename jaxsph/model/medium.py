@@ -73,6 +73,10 @@ class Medium(abc.ABC):
         """What `seen_by` made, with what it needs of the grid of a band (`access.grid.Grid`); by default as it is."""
         return self
 
+    def for_means(self) -> Medium:
+        """The same with what `means` reads of it, made once, outside of loops; by default as it is."""
+        return self
+
     def faults(self) -> Int[Array, ""]:
         """What is wrong with the numbers of a medium that `seen_by` made, as a fault word; by default nothing."""
         return jnp.int32(faults.NONE)
