@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -81,6 +82,9 @@ def render(
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace.
         CapacityError: eager, when a given `plan` is too small for this frame.
 
+    Warns:
+        UserWarning: eager, where segments cannot keep a tolerance everywhere; `error_bound` says where.
+
     References:
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
     """
@@ -111,6 +115,10 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
     raise_for(word, planned)
     image = with_ended_rays(assemble(layers, word), settings)
+    word |= int(missed(image, settings))
+    if word & faults.TOLD:
+        share = float((np.asarray(image.error_bound) > settings.tolerance).mean())
+        warnings.warn(f"{share:.2%} of the pixels: {faults.describe(word)}", stacklevel=3)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -170,11 +178,12 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan)
     word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)]) | seen.viewed.faults
     layers = crop(layers, plan)
     image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
+    word = word | missed(image, settings)
     filled, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
     stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": filled, "pairs": pairs}
     certified = _certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
-    return dataclasses.replace(image, certified=certified, stats=stats)
+    return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
 
 
 def _refined_traced(frame: Frame, seen: Seen, settings: Settings, run: Traced) -> Image:
@@ -193,6 +202,14 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
     let_through = lax.stop_gradient(image.transmittance)
     left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
     return dataclasses.replace(image, error_bound=image.error_bound + left_out)
+
+
+def missed(image: Image, settings: Settings) -> Int[Array, ""]:
+    """Fault bit of a tolerance that segments were refined for, and that the estimate is above somewhere."""
+    if not settings.is_refined:
+        return jnp.int32(faults.NONE)
+    above = lax.stop_gradient(image.error_bound) > settings.tolerance
+    return faults.raised(faults.TOLERANCE_MISSED, above.any())
 
 
 def _certifies(plan: Plan) -> bool:

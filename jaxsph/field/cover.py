@@ -32,7 +32,7 @@ from jaxsph.numerics.fusion import fusion_barrier
 
 Carry = TypeVar("Carry")
 GROUP = 32  # slabs whose chords are held at once
-BLOCK = 8  # particles of each, unrolled
+BLOCK = 16  # particles of each, unrolled
 EXTREMES = (True, True), (True, False), (False, True), (False, False)  # whether in front of the pivot, and whether a front
 
 
@@ -127,7 +127,8 @@ def cover_of(
         return found.at[items].set(jnp.moveaxis(jnp.concatenate(ends), 0, 1), mode="drop")
 
     found = over_groups(find, jnp.broadcast_to(nothing, (tasks, nothing.size, rays)), task, inside)
-    return Cover(*(jnp.moveaxis(found[:, 2 * k : 2 * k + 2], 1, 0) for k in range(4)), pivot)
+    front, back, of_front, of_back = (jnp.moveaxis(found[:, first : first + 2], 1, 0) for first in (0, 2, 4, 6))
+    return Cover(front, back, of_front, of_back, pivot)
 
 
 def over_groups(
