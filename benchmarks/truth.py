@@ -1,11 +1,13 @@
 """Claim: more samples bring an image nearer to the light integral along each pixel's ray, and this is how near.
 
-Built-in scenes and particle files at 512 x 512, as integrators and numbers of samples render them, against
-`jaxsph.reference.integral` at random pixels among those that any particle touches. A pixel's error is its largest difference over
-red, green, blue and alpha. Integrals are kept in `--cache`, so that another integrator is judged by the same. Writes
+Built-in scenes and particle files at 512 x 512, as points and segments of several numbers of samples render them, and segments
+refined for tolerances, against `jaxsph.reference.integral` at random pixels among those that any particle touches. A pixel's
+error is its largest difference over red, green, blue and alpha. Images are timed in turns, compiled programs only; what compiling
+takes is told apart, as the time of the first image. For each segments' image `points_time` is the time that uniform points take
+for the same 99.9 % error, by a power law between the two numbers of samples beside it. Integrals are kept in `--cache`. Writes
 `results/truth.json`; ends in an assert on mean errors.
 
-    python benchmarks/truth.py [SCENE or FILE ...] [--integrators samples ...] [--samples 64 256 1024] [--cache FOLDER]
+    python benchmarks/truth.py [SCENE or FILE ...] [--samples 64 128 256 512] [--tolerances 0.03 0.01 0.004] [--cache FOLDER]
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ import argparse
 import itertools
 import json
 import pathlib
+import statistics
 import sys
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -31,6 +35,7 @@ from jaxsph.reference_media import to_view
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 RESULTS = pathlib.Path(__file__).with_name("results") / "truth.json"
+ROUNDING = 1e-6
 HEADER = f"{'scene':24s} {'integrator':12s} samples     mean   99.9 %      max  evaluations a pixel  seconds"
 Record = dict[str, Any]
 
@@ -76,45 +81,92 @@ def integral(name: str, scene: js.Scene, camera: js.Camera, options: argparse.Na
     return kept
 
 
-def rendered(scene: js.Scene, camera: js.Camera, settings: js.Settings, truth: dict[str, np.ndarray]) -> Record:
-    """Errors of a rendering at the pixels; the second of two is timed, as the first may compile."""
-    for _ in range(2):
-        begun = time.perf_counter()
+def light_of(image: js.Image) -> np.ndarray:
+    """Red, green, blue and alpha."""
+    return np.concatenate([np.asarray(image.color), np.asarray(image.alpha)[..., None]], 2)
+
+
+def timed(scene: js.Scene, camera: js.Camera, settings: js.Settings) -> tuple[js.Image, float]:
+    """An image, and the seconds that it took."""
+    begun = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a tolerance that is missed is in the table
         image = js.render(scene, camera, settings)
-        light = np.concatenate([np.asarray(image.color), np.asarray(image.alpha)[..., None]], 2)
-        seconds = time.perf_counter() - begun
-    error = np.abs(light[truth["rows"], truth["columns"]] - truth["light"]).max(1)
+    light_of(image)
+    return image, time.perf_counter() - begun
+
+
+def compared(image: js.Image, settings: js.Settings, truth: dict[str, np.ndarray]) -> Record:
+    """Errors of an image at the pixels, and how they are told."""
+    place = truth["rows"], truth["columns"]
+    error = np.abs(light_of(image)[place] - truth["light"]).max(1)
     errors = {"mean": error.mean(), "p999": np.quantile(error, 0.999), "max": error.max()}
-    asked = {"integrator": settings.integrator, "samples": settings.samples}
-    number = image.stats["evaluations"] / (camera.width * camera.height)
-    return asked | {key: float(value) for key, value in errors.items()} | {"evaluations": number, "seconds": seconds}
+    asked = {"integrator": settings.integrator, "samples": settings.samples, "tolerance": settings.tolerance}
+    number = image.stats["evaluations"] / (image.width * image.height)
+    found = asked | {key: float(value) for key, value in errors.items()} | {"evaluations": number}
+    if settings.tolerance is None:
+        return found
+    told, wrong = np.asarray(image.error_bound)[place], error > ROUNDING
+    ratio = np.quantile(told[wrong] / error[wrong], [0.01, 0.5, 0.99]).tolist() if wrong.any() else None
+    over = {f"over_{times}": float((error > times * settings.tolerance).mean()) for times in (1, 3)}
+    missed = float((told > settings.tolerance).mean())
+    return found | over | {"estimate_over_error": ratio, "told_over": missed, "faults": int(image.faults)}
+
+
+def same_error(row: Record, points: list[Record]) -> float | None:
+    """Seconds that points take for the same 99.9 % error, by a power law; None where no two of them enclose it."""
+    ordered = sorted(points, key=lambda point: point["p999"])
+    for better, worse in itertools.pairwise(ordered):
+        if better["p999"] <= row["p999"] <= worse["p999"] and better["p999"] < worse["p999"]:
+            share = np.log(row["p999"] / better["p999"]) / np.log(worse["p999"] / better["p999"])
+            return float(better["seconds"] ** (1 - share) * worse["seconds"] ** share)
+    return None
 
 
 def measure(name: str, options: argparse.Namespace) -> Record:
     """All renderings of a scene against its integral."""
     scene, camera = view(name, options.size)
     truth = integral(pathlib.Path(name).name, scene, camera, options)
-    rows = []
-    for integrator in options.integrators:
-        for samples in options.samples:
-            row = rendered(scene, camera, js.Settings(samples=samples, integrator=integrator), truth)
-            errors = f"{row['mean']:8.1e} {row['p999']:8.1e} {row['max']:8.1e}"
-            work = f"{row['evaluations']:20.0f} {row['seconds']:8.3f}"
-            print(f"{pathlib.Path(name).name:24s} {integrator:12s} {samples:7d} {errors} {work}", flush=True)
-            rows.append(row)
+    chosen = [js.Settings(samples=n) for n in options.points]
+    chosen += [js.Settings(samples=n, integrator="segments") for n in options.samples]
+    chosen += [js.Settings(integrator="segments", tolerance=tolerance) for tolerance in options.tolerances]
+    firsts = [timed(scene, camera, settings) for settings in chosen]
+    turns = [[timed(scene, camera, settings)[1] for settings in chosen] for _ in range(options.repeats)]
+    rows = [compared(image, settings, truth) | {"first": first} for (image, first), settings in zip(firsts, chosen, strict=True)]
+    for row, seconds in zip(rows, zip(*turns, strict=True), strict=True):
+        row["seconds"] = statistics.median(seconds)
+    points = [row for row in rows if row["integrator"] == "samples"]
+    for row in rows:
+        if row["integrator"] != "samples":
+            row["points_time"] = same_error(row, points)
+        print(line(pathlib.Path(name).name, row), flush=True)
     own = {key: float(truth[key]) for key in ("error", "seconds", "evaluations", "portions")}
     pixels = {"pixels": len(truth["rows"]), "particles": scene.particles.num_particles}
     return {"scene": pathlib.Path(name).name, **pixels, "integral": own, "rows": rows}
+
+
+def line(name: str, row: Record) -> str:
+    """A row as text."""
+    asked = f"{row['samples']:d}" if row["tolerance"] is None else f"t {row['tolerance']:g}"
+    errors = f"{row['mean']:8.1e} {row['p999']:8.1e} {row['max']:8.1e}"
+    saved = "" if not row.get("points_time") else f"  points for as much {row['points_time'] / row['seconds']:.2f}"
+    told = (
+        ""
+        if row["tolerance"] is None
+        else f"  over {row['over_1']:.4f} {row['over_3']:.4f} told/true {row['estimate_over_error']}"
+    )
+    return (
+        f"{name:24s} {row['integrator']:12s} {asked:>7s} {errors} {row['evaluations']:20.0f} {row['seconds']:8.3f}{saved}{told}"
+    )
 
 
 def check(records: list[Record]) -> list[str]:
     """Where more samples are no nearer on average."""
     wrong = []
     for record in records:
-        for integrator in {row["integrator"] for row in record["rows"]}:
-            means = [
-                row["mean"] for row in sorted(record["rows"], key=lambda row: row["samples"]) if row["integrator"] == integrator
-            ]
+        uniform = sorted((row for row in record["rows"] if row["tolerance"] is None), key=lambda row: row["samples"])
+        for integrator in {row["integrator"] for row in uniform}:
+            means = [row["mean"] for row in uniform if row["integrator"] == integrator]
             if any(after >= before for before, after in itertools.pairwise(means)):
                 wrong.append(f"{record['scene']}: {integrator} does not come nearer: {means}")
     return wrong
@@ -123,8 +175,10 @@ def check(records: list[Record]) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=SCENES, help="built-in scenes (mixer:2 is a frame) or particle files")
-    parser.add_argument("--integrators", nargs="+", default=["samples"], help="values of `Settings(integrator=...)`")
-    parser.add_argument("--samples", nargs="+", type=int, default=[64, 256, 1024])
+    parser.add_argument("--points", nargs="+", type=int, default=[64, 128, 256, 512, 1024, 2048], help="samples of points")
+    parser.add_argument("--samples", nargs="+", type=int, default=[64, 128, 256, 512], help="samples of segments")
+    parser.add_argument("--tolerances", nargs="*", type=float, default=[0.03, 0.01, 0.004], help="of segments")
+    parser.add_argument("--repeats", type=int, default=3, help="turns that medians are taken of")
     parser.add_argument("--size", type=int, default=512, help="pixels on a side")
     parser.add_argument("--pixels", type=int, default=4000, help="how many are compared")
     parser.add_argument("--tolerance", type=float, default=1e-7, help="of the integral")

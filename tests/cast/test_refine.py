@@ -1,0 +1,128 @@
+"""Slabs that are marched again for a tolerance: what is promised of images with `integrator="segments"` and a tolerance."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.numerics import faults
+
+SEGMENTS = js.Settings(integrator="segments", samples=96, tolerance=0.01)
+
+
+def frame(size: int = 48, particles: int = 2000) -> tuple[js.Scene, js.Camera]:
+    return js.scenes.load("flubber", particles=particles, width=size, height=size)
+
+
+def errors(image: js.Image, scene: js.Scene, camera: js.Camera) -> np.ndarray:
+    truth = js.reference.integral(scene, camera, every=4)
+    color, alpha = np.asarray(image.color)[2::4, 2::4], np.asarray(image.alpha)[2::4, 2::4]
+    return np.maximum(np.abs(color - truth.color).max(-1), np.abs(alpha - truth.alpha))
+
+
+def test_a_tolerance_is_kept_against_the_light_integral() -> None:
+    scene, camera = frame()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        image = js.render(scene, camera, SEGMENTS)
+    found = errors(image, scene, camera)
+    assert (found > 0.01).mean() <= 0.01 and found.max() < 0.03
+    assert not image.certified and image.faults in (0, faults.TOLERANCE_MISSED)
+
+
+@pytest.mark.slow
+def test_a_smaller_tolerance_is_a_smaller_error_for_more_evaluations() -> None:
+    scene, camera = frame()
+    images = [js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=t)) for t in (0.1, 0.02)]
+    assert errors(images[1], scene, camera).mean() < errors(images[0], scene, camera).mean()
+    assert images[1].stats["evaluations"] > images[0].stats["evaluations"]
+    assert np.asarray(images[1].error_bound).mean() < np.asarray(images[0].error_bound).mean()
+
+
+@pytest.mark.slow
+def test_a_tolerance_that_cannot_be_kept_is_told() -> None:
+    scene, camera = frame(24)
+    hopeless = dataclasses.replace(SEGMENTS, samples=8, tolerance=1e-5)
+    with pytest.warns(UserWarning, match="give more `samples`"):
+        image = js.render(scene, camera, hopeless)
+    assert image.faults == faults.TOLERANCE_MISSED
+    assert (np.asarray(image.error_bound) > 1e-5).any()
+
+
+@pytest.mark.slow
+def test_one_program_serves_all_tolerances_and_faults_are_told_under_jit() -> None:
+    scene, camera = frame(24)
+    plan = js.plan(scene, camera, SEGMENTS)
+    traces = []
+
+    @jax.jit
+    def draw(settings: js.Settings) -> js.Image:
+        traces.append(1)
+        image = js.render(scene, camera, settings, plan=plan)
+        return image.color, image.error_bound, image.faults
+
+    loose, told, word = draw(dataclasses.replace(SEGMENTS, tolerance=0.05))
+    tight, told_tight, _ = draw(dataclasses.replace(SEGMENTS, tolerance=0.005))
+    assert len(traces) == 1 and int(word) in (0, faults.TOLERANCE_MISSED)
+    assert np.asarray(told_tight).mean() < np.asarray(told).mean()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        eager = js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=0.005), plan=plan)
+    np.testing.assert_allclose(np.asarray(tight), np.asarray(eager.color), atol=2e-5)
+    assert np.isfinite(np.asarray(loose)).all()
+
+
+def test_a_plan_with_a_tolerance_is_refused_without_one() -> None:
+    scene, camera = frame(24)
+    plan = js.plan(scene, camera, SEGMENTS)
+    with pytest.raises(ValueError, match="samples"):
+        js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=None), plan=plan)
+    twice = dataclasses.replace(SEGMENTS, tolerance=None, samples=48)
+    with pytest.raises(ValueError, match="was made for a tolerance"):
+        js.render(scene, camera, twice, plan=plan)
+
+
+@pytest.mark.slow
+def test_derivatives_of_refined_images_are_refused() -> None:
+    scene, camera = frame(16, 200)
+    plan = js.plan(scene, camera, SEGMENTS)
+
+    def total(quantity: jax.Array) -> jax.Array:
+        particles = dataclasses.replace(scene.particles, quantity=quantity)
+        return js.render(dataclasses.replace(scene, particles=particles), camera, SEGMENTS, plan=plan).color.sum()
+
+    with pytest.raises(NotImplementedError, match="refined for a tolerance"):
+        jax.grad(total)(scene.particles.quantity)
+
+
+@pytest.mark.slow
+def test_bands_and_shards_do_not_change_a_refined_image() -> None:
+    scene, camera = frame(96)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        whole = js.render(scene, camera, SEGMENTS)
+        limit = int(0.75 * js.plan(scene, camera, SEGMENTS).bytes)
+        banded = js.render(scene, camera, dataclasses.replace(SEGMENTS, memory_limit=limit))
+    difference = np.abs(np.asarray(whole.color) - np.asarray(banded.color))
+    assert difference.max() <= SEGMENTS.tolerance  # batches are of other slabs: what is in front is known at other times
+
+
+@pytest.mark.slow
+def test_volumes_and_points_are_refined_with_particles() -> None:
+    scene, camera = frame(32, 500)
+    lower, upper = np.asarray(scene.particles.position).min(0), np.asarray(scene.particles.position).max(0)
+    grid = np.linspace(0, 1, 9)
+    values = (np.sin(5 * grid)[:, None, None] + grid[None, :, None] * grid[None, None, :]).astype(np.float32)
+    volume = js.Volume.from_array(values, lower, (upper - lower) / 8)
+    look = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 1], [1, 1, 0]], [0.0, 2.0])
+    points = js.Points.from_arrays(np.asarray(scene.particles.position)[:5], 0.2, [1.0, 0.2, 0.2], 3.0)
+    both = dataclasses.replace(scene, volume=volume, volume_transfer=look, points=points)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        image = js.render(both, camera, SEGMENTS)
+    assert (errors(image, both, camera) > 0.01).mean() <= 0.02
