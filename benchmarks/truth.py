@@ -102,7 +102,7 @@ def compared(image: js.Image, settings: js.Settings, truth: dict[str, np.ndarray
     error = np.abs(light_of(image)[place] - truth["light"]).max(1)
     errors = {"mean": error.mean(), "p999": np.quantile(error, 0.999), "max": error.max()}
     asked = {"integrator": settings.integrator, "samples": settings.samples, "tolerance": settings.tolerance}
-    number = image.stats["evaluations"] / (image.width * image.height)
+    number = image.stats["evaluations"] / image.transmittance.size
     found = asked | {key: float(value) for key, value in errors.items()} | {"evaluations": number}
     if settings.tolerance is None:
         return found
