@@ -47,7 +47,9 @@ class Seen(NamedTuple):
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes", "between_samples"))
-def view_scene(scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool) -> Seen:
+def view_scene(
+    scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool = False
+) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
     dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
