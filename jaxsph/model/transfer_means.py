@@ -19,6 +19,7 @@ Differentiation: in the ends and in control points, without differences of nearl
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -28,7 +29,18 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.transfer import SELECT_ALL, locate
 from jaxsph.model.transfer_slopes import smooth_means
-from jaxsph.model.transfer_tables import EXTINCTION, FARTHEST, MeanTables, at, beyond, ends, integral_between, split, widened
+from jaxsph.model.transfer_tables import (
+    EXTINCTION,
+    MeanTables,
+    at,
+    beyond,
+    ends,
+    greater,
+    integral_between,
+    lesser,
+    ordered,
+    split,
+)
 
 __all__ = ["MeanTables", "mean_emission", "mean_extinction"]
 
@@ -49,8 +61,15 @@ def mean_emission(
 def _means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     if tables.points.shape[0] <= SELECT_ALL:
         return _over_all_pieces(rows, tables, near, far)
-    even, uneven = (functools.partial(means, rows) for means in (_over_even_pieces, _over_uneven_pieces))
-    return lax.cond(tables.segments.even, even, uneven, tables, near, far)
+    even, uneven = (functools.partial(_packed, means, rows) for means in (_over_even_pieces, _over_uneven_pieces))
+    packed = lax.cond(tables.segments.even, even, uneven, tables, near, far)
+    return [packed.real, packed.imag] if len(rows) == 2 else packed
+
+
+def _packed(means: Callable[..., list[Array]], rows: range, *given: Any) -> Any:
+    """Two means as one complex number: XLA then makes one kernel of them, and finds pieces once."""
+    found = means(rows, *given)
+    return lax.complex(*found) if len(rows) == 2 else found
 
 
 @_means.defjvp
@@ -66,7 +85,7 @@ def _over_all_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     totals, begin = [jnp.zeros_like(lo) for _ in rows], start
     for k in range(last):
-        end = jnp.clip(points[k + 1], start, stop) if k + 1 < last else stop
+        end = lesser(stop, greater(start, points[k + 1])) if k + 1 < last else stop
         width = end - begin
         middle = (begin - points[k]) + width / 2
         line = [base + slope * middle for base, slope in zip(tables.base[:, k], tables.slope[:, k], strict=True)]
@@ -82,12 +101,11 @@ def _over_even_pieces(rows: range, tables: MeanTables, near: Array, far: Array) 
     """For evenly spaced control points: places are counted in pieces, no control point is read."""
     values, count = tables.segments.start, tables.points.shape[0] - 1
     rate = count / (values[-1] - values[0])
-    near, far = (jnp.clip((end - values[0]) * rate, -FARTHEST, FARTHEST) for end in (near, far))
-    lo, hi = jnp.minimum(near, far), widened(jnp.maximum(near, far), count)
+    lo, hi = ordered((near - values[0]) * rate, (far - values[0]) * rate, count)
     below, above, start, stop = split(lo, hi, jnp.zeros_like(rate), jnp.full_like(rate, count))
     i, j = (jnp.clip(place.astype(jnp.int32), 0, count) for place in (start, stop))
     begin = start - i.astype(lo.dtype)
-    first = jnp.minimum(stop - i.astype(lo.dtype), 1) - begin
+    first = lesser(1, stop - i.astype(lo.dtype)) - begin
     last = jnp.where(i == j, 0, stop - j.astype(lo.dtype))
     pieces = (i, begin + first / 2, first, first), (j, last / 2, last, last)
     return _with_ends(rows, tables, _over_outer_pieces(rows, tables, *pieces), (below, above), hi - lo)
@@ -99,7 +117,7 @@ def _over_uneven_pieces(rows: range, tables: MeanTables, near: Array, far: Array
     lo, hi = ends(tables, near, far)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     i, j = (locate(tables.segments, place / tables.unit)[0] for place in (start, stop))
-    first = jnp.minimum(stop, at(points, jnp.minimum(i + 1, points.shape[0] - 1))) - start
+    first = lesser(at(points, jnp.minimum(i + 1, points.shape[0] - 1)), stop) - start
     begin, last = start - at(points, i), jnp.where(i == j, 0, stop - at(points, j))
     scale, last_scale = at(tables.inverse, i), at(tables.inverse, j)
     pieces = (i, (begin + first / 2) * scale, first * scale, first), (j, last / 2 * last_scale, last * last_scale, last)

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from jaxsph.model.transfer import SELECT_ALL, locate
-from jaxsph.model.transfer_tables import EXTINCTION, MeanTables, at, beyond, ends, split
+from jaxsph.model.transfer_tables import EXTINCTION, FARTHEST, MeanTables, at, beyond, split, widened
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Part:
 
 def smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     """Means for their derivatives' sake; the values are right but for what rounding does to jumps."""
-    lo, hi = ends(tables, near, far)
+    lo, hi = _symmetric_ends(tables, near, far)
     below, above, start, stop = split(lo, hi, tables.points[0], tables.points[-1])
     few = tables.points.shape[0] <= SELECT_ALL
     parts = (_all_parts if few else _outer_parts)(tables, lo, hi, start, stop)
@@ -65,6 +65,12 @@ def smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> li
         return results
     i, j = _found(tables, start, stop)
     return [total + _whole(tables, row, i, j) / (hi - lo) for row, total in zip(rows, results, strict=True)]
+
+
+def _symmetric_ends(tables: MeanTables, near: Array, far: Array) -> tuple[Array, Array]:
+    """Positions of both ends; where they are equal, each moves both by half."""
+    near, far = (jnp.clip(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))
+    return jnp.minimum(near, far), widened(jnp.maximum(near, far), 1)
 
 
 def _moving(value: Array, like: Array) -> Array:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.transfer import SELECT_ALL, Segments
 
-WIDENED = 4  # eps of a range's upper end, and of the control points', that it is widened by
+WIDENED = 1  # eps of a range's upper end and of the control points' that it is widened by: at least its next number
 FARTHEST = 2.0**120  # times the largest control point: where quantities are clamped, such that nothing overflows
 MAX_EXPONENT = 120  # of the power of two that makes positions of quantities
 ALL_PAIRS = 128  # up to this many control points, integrals between any two are kept: one gather for four
@@ -129,8 +129,29 @@ def at(row: Array, i: Array) -> Array:
 
 def ends(tables: MeanTables, near: Array, far: Array) -> tuple[Array, Array]:
     """Positions of the lower and the upper end of ranges, widened."""
-    near, far = (jnp.clip(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))
-    return jnp.minimum(near, far), widened(jnp.maximum(near, far), 1)
+    return ordered(near * tables.unit, far * tables.unit, 1)
+
+
+def ordered(near: Array, far: Array, reach: float) -> tuple[Array, Array]:
+    """The lower and the upper end, clamped and widened; with NaN for either, one of them is NaN."""
+    near, far = (clamped(end, -FARTHEST, FARTHEST) for end in (near, far))
+    ascending = near < far
+    return jnp.where(ascending, near, far), widened(jnp.where(ascending, far, near), reach)
+
+
+def lesser(a: Array | float, b: Array) -> Array:
+    """Minimum as one instruction: `b` if either is NaN, where `jnp.minimum` takes several to find NaN."""
+    return jnp.where(a < b, a, b)
+
+
+def greater(a: Array | float, b: Array) -> Array:
+    """Maximum, like `lesser`."""
+    return jnp.where(a > b, a, b)
+
+
+def clamped(value: Array, low: Array | float, high: Array | float) -> Array:
+    """`value` between two bounds; NaN stays."""
+    return lesser(high, greater(low, value))
 
 
 def widened(end: Array, reach: float) -> Array:
@@ -140,9 +161,9 @@ def widened(end: Array, reach: float) -> Array:
 
 def split(lo: Array, hi: Array, first: Array, last: Array) -> tuple[Array, Array, Array, Array]:
     """Lengths of a range below and above the control points, and ends of what lies among them."""
-    below = jnp.minimum(hi, first) - jnp.minimum(lo, first)
-    above = jnp.maximum(hi, last) - jnp.maximum(lo, last)
-    return below, above, jnp.clip(lo, first, last), jnp.clip(hi, first, last)
+    below = lesser(first, hi) - lesser(first, lo)
+    above = greater(last, hi) - greater(last, lo)
+    return below, above, clamped(lo, first, last), clamped(hi, first, last)
 
 
 jax.tree_util.register_dataclass(MeanTables, data_fields=[f.name for f in dataclasses.fields(MeanTables)], meta_fields=[])
