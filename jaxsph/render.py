@@ -117,8 +117,9 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     image = with_ended_rays(assemble(layers, word), settings)
     word |= int(missed(image, settings))
     if word & faults.TOLD:
-        share = float((np.asarray(image.error_bound) > settings.tolerance).mean())
-        warnings.warn(f"{share:.2%} of the pixels: {faults.describe(word)}", stacklevel=3)
+        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
+        pixels = f"{number} of {image.error_bound.size} pixels"
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=3)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
