@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from jaxsph.access.host_sorting import depth_order
+from jaxsph.along_rays import along_rays, first_samples
 from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures, measure
 from jaxsph.model import registry
@@ -32,7 +33,7 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.plan import FrameShape, Plan, along_rays, choose, first_samples, fitted, next_class
+from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class
 from jaxsph.viewing import Seen, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still

@@ -67,9 +67,9 @@ class Segments(Integrator):
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """With quadratic errors taken out, and with an estimate of the error: by how far segments of twice the length differ."""
-        always, double = task.slab[0] >= 0, task.every_other()
+        always, every_other = task.slab[0] >= 0, task.every_other()
         short = medium.intervals(gathered, task), task
-        long = medium.intervals(medium.every_other(gathered), double), double
+        long = medium.intervals(medium.every_other(gathered), every_other), every_other
         own, double = (fusion_barrier(always, functools.partial(_amounts, channel=3), medium, *one) for one in (short, long))
         thickness = fusion_barrier(always, carried, own, double)
         left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, double))

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from jaxsph.access.octree_build import OctreePlan
 from jaxsph.field.octree_sums import Columns, LeafSums, OctreeMedium, Place, SeenSpheres, octree_over
-from jaxsph.field.points import NUM_COLUMNS, PointsMedium, Row
+from jaxsph.field.point_rays import NUM_COLUMNS, Row
+from jaxsph.field.points import PointsMedium
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.camera import Camera
 from jaxsph.model.points import Points

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.access.grid import Grid
 from jaxsph.field.fetch import particle_at
 from jaxsph.field.moved import LEAST_ROUNDING, ROUNDINGS, Moved, Places, Splats
+from jaxsph.field.point_rays import NUM_COLUMNS, PointRays, Row
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model.camera import Camera
@@ -35,27 +36,6 @@ from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 4  # points whose chords are held at once
 PARTS = 4, 16  # of the slabs of a task that have loops of their own: points are clustered
-NUM_COLUMNS = 8  # of a row of the table: read, and added to, as one
-
-
-class Row(NamedTuple):
-    """Points in view space, as columns.
-
-    Attributes:
-        x, y, z: of the centre, length units.
-        inverse: of the radius.
-        strength: extinction times radius: the thickness of a chord of length 1 in radii.
-        red, green, blue: in [0, 1].
-    """
-
-    x: Array
-    y: Array
-    z: Array
-    inverse: Array
-    strength: Array
-    red: Array
-    green: Array
-    blue: Array
 
 
 class Listed(NamedTuple):
@@ -138,7 +118,7 @@ class PointsMedium(Medium):
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
         """With a block of points more."""
-        rays = _Rays.of(task, self.axes)
+        rays = PointRays.of(task, self.axes)
 
         def found(nth: Array) -> tuple[list[Array], Array]:
             some = self._fetch(task, nth)
@@ -197,7 +177,7 @@ class PointsMedium(Medium):
 
         def add(nth: Array, sums: Moved, task: SlabTask) -> Moved:
             def found(nth: Array) -> Moved:
-                return self._splats(self._fetch(task, nth), _Rays.of(task, self.axes)).moved()
+                return self._splats(self._fetch(task, nth), PointRays.of(task, self.axes)).moved()
 
             return jax.tree.map(jnp.add, sums, fusion_barrier(nth >= 0, found, nth))
 
@@ -205,7 +185,7 @@ class PointsMedium(Medium):
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, functools.partial(add, task=turns.task), turns.of(sums)), sums)
         return sums
 
-    def _splats(self, some: _Some, rays: _Rays) -> Splats:
+    def _splats(self, some: _Some, rays: PointRays) -> Splats:
         """A block of points as splats; of no strength where they are none."""
         if self.lists is None:
             raise ValueError("points are asked for without the lists of a band; call `in_band` first")
@@ -259,7 +239,7 @@ class PointsMedium(Medium):
             def sums(inputs: tuple[Any, ...]) -> Array:
                 row, of_some, axes, profile, places = inputs
                 medium = dataclasses.replace(self, profile=profile)
-                rays = _Rays.of(_moved(task, places).first(number), axes)
+                rays = PointRays.of(_moved(task, places).first(number), axes)
                 thickness = medium._thickness(some._replace(row=row, attributes=of_some), rays)
                 colors = jnp.stack([jnp.ones_like(row.red), row.red, row.green, row.blue])
                 return jnp.einsum("cbk,bksr->cbsr", colors, thickness, precision=lax.Precision.HIGHEST)
@@ -294,7 +274,7 @@ class PointsMedium(Medium):
             Row(*jnp.moveaxis(row, -1, 0)), {name: one[point] for name, one in self.attributes.items()}, point, inside, splat
         )
 
-    def _thickness(self, some: _Some, rays: _Rays) -> Float[Array, "tasks points intervals rays"]:
+    def _thickness(self, some: _Some, rays: PointRays) -> Float[Array, "tasks points intervals rays"]:
         """Of the intervals of rays, by each of some points."""
         row = Row(*(column[:, :, None] for column in some.row))
         foot, away = rays.nearest(row)
@@ -330,7 +310,7 @@ class PointsMedium(Medium):
 
         return lax.cond((some.splat | ~some.inside).all(), whole, both)
 
-    def _along(self, some: _Some, rays: _Rays, away: list[Array], square: Array, ends: Array) -> Array:
+    def _along(self, some: _Some, rays: PointRays, away: list[Array], square: Array, ends: Array) -> Array:
         """Integrals of the profile between neighbouring `ends`, in radii."""
         if isinstance(self.profile, Shaped):
             foot = [part[:, :, None] for part in rays.in_world(away)]
@@ -349,52 +329,6 @@ class _Some(NamedTuple):
     point: Int[Array, "tasks points"]
     inside: Bool[Array, "tasks points"]
     splat: Bool[Array, "tasks points"] | None
-
-
-class _Rays(NamedTuple):
-    """Rays of tasks, one by one.
-
-    Attributes:
-        u, v: ray coordinates.
-        border: depths between intervals.
-        slant: path length a unit of depth.
-        axes: of the camera.
-    """
-
-    u: Float[Array, "tasks rays"]
-    v: Float[Array, "tasks rays"]
-    border: Float[Array, "tasks intervals_and_one 1"]
-    slant: Float[Array, "tasks rays"]
-    axes: Float[Array, "3 3"]
-    perspective: bool
-
-    @classmethod
-    def of(cls, task: SlabTask, axes: Array) -> _Rays:
-        u, v = task.ray_coordinates()
-        slant = jnp.sqrt(1 + u * u + v * v) if task.perspective else jnp.ones_like(u)
-        return cls(u, v, task.border[..., None], slant, axes, task.perspective)
-
-    def nearest(self, row: Row) -> tuple[Array, list[Array]]:
-        """Depth of the foot of centres on rays, (tasks, points, rays), and the offset of it from the centre."""
-        u, v = self.u[:, None], self.v[:, None]
-        if not self.perspective:
-            foot = jnp.broadcast_to(row.z, (*row.z.shape[:2], u.shape[2]))
-            return foot, [u - row.x, v - row.y, jnp.zeros_like(foot)]
-        # from the depth of the centre on: what is small is not the difference of what is large
-        x, y = row.x - u * row.z, row.y - v * row.z
-        further = (x * u + y * v) / (self.slant[:, None] ** 2)
-        return row.z + further, [u * further - x, v * further - y, further]
-
-    def direction_in_world(self) -> list[Array]:
-        """Of length 1, (tasks, rays)."""
-        ahead = jnp.ones_like(self.u)
-        if not self.perspective:
-            return self.in_world([jnp.zeros_like(self.u), jnp.zeros_like(self.u), ahead])
-        return self.in_world([part / self.slant for part in (self.u, self.v, ahead)])
-
-    def in_world(self, view: list[Array]) -> list[Array]:
-        """Directions of view space along the axes of the world."""
-        return [sum(self.axes[k, axis] * view[k] for k in range(3)) for axis in range(3)]  # type: ignore[misc]
 
 
 def _moved(task: SlabTask, places: OfPlaces) -> SlabTask:
