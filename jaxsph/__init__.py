@@ -5,7 +5,7 @@ from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
-from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -17,6 +17,7 @@ from jaxsph.version import __version__
 
 __all__ = [
     "Camera",
+    "CameraPath",
     "CapacityError",
     "Coarsened",
     "Image",

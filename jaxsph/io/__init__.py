@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.assemble import Report, particles_from_table
+from jaxsph.io.camera_paths import read_camera_path, write_camera_path
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.points import PointsReport, points_from_table
@@ -43,6 +44,7 @@ __all__ = [
     "nearest_neighbour_supports",
     "particles_from_table",
     "points_from_table",
+    "read_camera_path",
     "read_image",
     "read_particles",
     "read_points",
@@ -50,6 +52,7 @@ __all__ = [
     "read_volume",
     "read_volume_table",
     "volume_from_table",
+    "write_camera_path",
     "write_image",
     "write_volume",
 ]

@@ -9,13 +9,13 @@ Source: Springel, User guide for GADGET-2, section 6.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from .damage import DataError, explained
 from .gadget_hdf5 import PERIODIC_NOTE
-from .table import ParticleTable
+from .table import ParticleTable, time_of
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
@@ -68,7 +68,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         box_size = (edge, edge, edge) if edge > 0 else None
         if box_size:
             said.append(f"periodic box of {edge:g}: {PERIODIC_NOTE}")
-        return ParticleTable(columns.pop("POS"), columns, support, box_size=box_size, source=SOURCE, conventions=tuple(said))
+        more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
+        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
 
 def looks_like(start: bytes) -> bool:

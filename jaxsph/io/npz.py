@@ -6,8 +6,9 @@
 | `support_radius` or `support`, `volume` | one number, or (N,) |
 | `particle_mass` or `mass`, `density` | one number, or (N,) |
 | any other array of N rows | a column |
+| `time` or `t` | one number: when |
 
-Other single numbers (a time, a rest density) are not particle data and are left out.
+Other single numbers (a rest density) are not particle data and are left out.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 
 from .damage import DataError, explained
 from .quantities import ROLES
-from .table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns
+from .table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns, time_of
 from .unpack import DEFLATE_RATIO, read_up_to
 
 SOURCE = "NumPy archive"
@@ -31,6 +32,7 @@ SUFFIX = ".npy"
 POSITION_NAMES = ("position", "positions", "coordinates", "points", "xyz")
 BROADCAST_NAMES = (*SUPPORT_NAMES, *VOLUME_NAMES, *ROLES["mass"], *ROLES["density"])
 NUMBERS = "fiub"
+TIME_NAMES = ("time", "t")
 
 
 def read(path: Path) -> ParticleTable:
@@ -48,7 +50,8 @@ def read(path: Path) -> ParticleTable:
                 raise DataError(f"`{stored}` must hold numbers, got dtype {position.dtype}")
             if len(position.shape) != 2 or position.shape[1] != 3:
                 raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
-            return table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
+            table = table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
+            return dataclasses.replace(table, time=_time(arrays))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +71,11 @@ class _Array:
             content = read_up_to(stream, self.entry.file_size)
         values = np.frombuffer(content, self.dtype)
         return values.reshape(self.shape, order="F" if self.is_fortran else "C")
+
+
+def _time(arrays: dict[str, _Array]) -> float | None:
+    stored = next((arrays[name] for want in TIME_NAMES for name in arrays if plain(name) == want), None)
+    return time_of(stored.load()) if stored is not None and stored.shape in ((), (1,)) and stored.dtype.kind in NUMBERS else None
 
 
 def _columns(arrays: dict[str, _Array], count: int) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +37,8 @@ class ParticleTable:
         support: (N,) support radius $H > 0$ where the file defines one, or `None`. Length units of `position`.
         volume: (N,) particle volume $V > 0$ where the file defines one, or `None`.
         box_size: edge lengths of a periodic box, or `None`. Particles are not repeated across its faces.
+        time: of the snapshot as the file says it, in the unit of its code (a scale factor where that is the code's time), or
+            `None`.
         source: name of the file format.
         path: the file, for messages; empty when the table was made in memory.
         conventions: sentences which say how supports and volumes were got, and what was left out.
@@ -50,6 +53,7 @@ class ParticleTable:
     support: Float[np.ndarray, " particles"] | None = None
     volume: Float[np.ndarray, " particles"] | None = None
     box_size: tuple[float, float, float] | None = None
+    time: float | None = dataclasses.field(default=None, kw_only=True)
     source: str = "memory"
     path: str = ""
     conventions: tuple[str, ...] = ()
@@ -124,6 +128,13 @@ def table_from_columns(
 def native(array: np.ndarray) -> np.ndarray:
     """`array` in the byte order of this machine."""
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+
+
+def time_of(value: Any) -> float | None:
+    """A stored time as a number; `None` where it is not one finite number."""
+    stored = np.ravel(np.asarray(value))
+    usable = len(stored) == 1 and stored.dtype.kind in "iuf" and np.isfinite(stored[0])
+    return float(stored[0]) if usable else None
 
 
 def scalar_of_width_one(column: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
-"""What is looked at and from where: particles, points, kernels, volume, transfer function, camera, scene, settings, image."""
+"""What is looked at and from where: particles, points, kernels, volume, transfer function, camera, camera path, scene, settings, image."""
 
 from jaxsph.model.camera import Camera
+from jaxsph.model.camera_path import CameraPath
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
 from jaxsph.model.points import Points
@@ -9,4 +10,4 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
 
-__all__ = ["Camera", "Image", "Particles", "Points", "Scene", "Settings", "TransferFunction", "Volume"]
+__all__ = ["Camera", "CameraPath", "Image", "Particles", "Points", "Scene", "Settings", "TransferFunction", "Volume"]
