@@ -5,12 +5,14 @@ from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
+from jaxsph.frames import FrameFile, render_frames
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
+from jaxsph.snapshots import Snapshots
 from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
@@ -20,6 +22,7 @@ __all__ = [
     "CameraPath",
     "CapacityError",
     "Coarsened",
+    "FrameFile",
     "Image",
     "IsoSurface",
     "Particles",
@@ -28,6 +31,7 @@ __all__ = [
     "Progressive",
     "Scene",
     "Settings",
+    "Snapshots",
     "TransferFunction",
     "Volume",
     "__version__",
@@ -41,6 +45,7 @@ __all__ = [
     "progressive",
     "reference",
     "render",
+    "render_frames",
     "resample",
     "scenes",
     "splat_bound",

@@ -48,6 +48,7 @@ def plan(
     like: Plan | None = None,
     slab_samples: int | None = None,
     tuning: Tuning | None = None,
+    headroom: float = 1.0,
 ) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
@@ -58,14 +59,18 @@ def plan(
         slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
             support is in samples.
         tuning: of another kind of machine than holds the particles (`jaxsph.numerics.tuning`), to compile for it or to compare.
+        headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
+            There is room for more particles where `like` has too little.
 
     Raises:
-        ValueError: under a trace; when even a band of one row of tiles exceeds `settings.memory_limit`; where `like` is for
-            another image or kind of error control.
+        ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
+            `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
     settings = settings or Settings()
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    if not headroom >= 1:
+        raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
     scene = reachable(scene, settings)
     settings = along_rays(scene, settings)
     shape = dataclasses.replace(shape_of(spheres_of(scene), camera, settings), headroom=1.0)
@@ -79,7 +84,17 @@ def plan(
     measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
+    if headroom > 1 and (like is None or not like.serves(made)):
+        outgrown = like is not None and shape.num_particles > like.num_particles
+        made = fitted(measures, _with_headroom(shape, headroom, outgrown), settings, choices)
     return made if like is None else like.grown(made)
+
+
+def _with_headroom(shape: FrameShape, headroom: float, more_particles: bool) -> FrameShape:
+    """A frame with room for more pairs, for one more class of support and, where those were outgrown, for more particles."""
+    capacity = capacity_class(math.ceil(headroom * shape.num_particles)) if more_particles else shape.num_particles
+    classes = min(shape.num_classes + 1, MAX_CLASSES)
+    return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
 
 
 def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -> Seen:

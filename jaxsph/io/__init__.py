@@ -20,6 +20,7 @@ from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.camera_paths import read_camera_path, write_camera_path
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
+from jaxsph.io.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
@@ -34,6 +35,7 @@ __all__ = [
     "FORMATS",
     "DataError",
     "Format",
+    "MovieInfo",
     "ParticleTable",
     "PointsReport",
     "Report",
@@ -41,6 +43,7 @@ __all__ = [
     "available_quantities",
     "is_volume",
     "kernel_sum",
+    "movie_info",
     "nearest_neighbour_supports",
     "particles_from_table",
     "points_from_table",
@@ -54,6 +57,7 @@ __all__ = [
     "volume_from_table",
     "write_camera_path",
     "write_image",
+    "write_movie",
     "write_volume",
 ]
 

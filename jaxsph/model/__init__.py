@@ -1,4 +1,4 @@
-"""What is looked at and from where: particles, points, kernels, volume, transfer function, camera, camera path, scene, settings, image."""
+"""What is looked at and from where: particles, points, kernels, volume, transfer function, cameras, scene, settings, image."""
 
 from jaxsph.model.camera import Camera
 from jaxsph.model.camera_path import CameraPath

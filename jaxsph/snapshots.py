@@ -1,0 +1,187 @@
+"""A sequence of particle files as one thing that changes in time: one look for all of it, and particles at any moment.
+
+Flow: files -> survey -> [snapshots] -> Scene at a time -> frames.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph import io, scenes
+from jaxsph.io.matching import Matched, between, ids_of, match
+from jaxsph.model import Particles, Scene, TransferFunction
+from jaxsph.model.particles import capacity_class
+from jaxsph.survey import Reading, Survey, surveyed
+
+
+class Loaded(NamedTuple):
+    """The particles of one snapshot, and what is known of who they are."""
+
+    columns: dict[str, np.ndarray]
+    kernel: str
+    ids: np.ndarray | str
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Snapshots:
+    """Particles that change from file to file; make it with `from_files`.
+
+    Attributes:
+        survey: the files in the order of time, and what they hold.
+        transfer: what they look like, all of them.
+    """
+
+    survey: Survey
+    transfer: TransferFunction
+    _loaded: dict[int, Loaded] = dataclasses.field(default_factory=dict, repr=False)
+    _matched: dict[int, Matched | str] = dataclasses.field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_files(
+        cls,
+        paths: Iterable[str | os.PathLike[str]],
+        quantity: str | None = None,
+        *,
+        support: float | None = None,
+        kernel: str = "poly6",
+        part_type: int | None = None,
+        transfer: TransferFunction | None = None,
+        colormap: str = "viridis",
+        gaps: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Snapshots:
+        """Read all files once, for their times and the range of the quantity over all of them.
+
+        Args:
+            paths: of particle files, in any order: times in the files order them, else numbers in their names.
+            quantity, support, kernel, part_type: as for `jaxsph.io.read_particles`; a quantity that is chosen is chosen by the
+                file in the middle, and taken of all.
+            transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
+                that suits the file in the middle.
+            colormap: name of a colour map.
+            gaps: whether numbers may be missing in the names of the files.
+            progress: called as `progress(done, total)` after every file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: files that cannot be read, each by name; two of one time; a number that is missing.
+        """
+        survey = surveyed(paths, Reading(quantity, support, kernel, part_type), gaps=gaps, progress=progress)
+        if transfer is None:
+            transfer = scenes.default_transfer(survey.middle, colormap, survey.span)
+        return cls(survey, transfer)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Of the snapshots, ascending."""
+        return self.survey.order.times
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all particles of all snapshots: something to frame."""
+        return self.survey.bounds()
+
+    def at(self, time: float) -> Scene:
+        """Particles at a time: those of a file, or between two.
+
+        Where ids match, particles move straight and evenly from one file to the next, on the shortest way in a periodic box;
+        supports and volumes change geometrically, the quantity linearly. Those that are in one of the two alone are there for
+        the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file as it is.
+        """
+        particles = self._particles(*self.place(time))
+        return Scene(particles=particles, transfer=self.transfer)
+
+    def moments(self, times: Sequence[float]) -> list[Moment]:
+        """Sources of frames at such times, each read when it is its turn."""
+        return [Moment(self, float(time)) for time in times]
+
+    def place(self, time: float) -> tuple[int, float]:
+        """Which snapshot is before a time, and the share of the way to the next, in [0, 1)."""
+        times = self.times
+        if not times[0] <= time <= times[-1]:
+            raise ValueError(f"`time` must lie in [{times[0]:g}, {times[-1]:g}], where there are snapshots, got {time:g}")
+        before = bisect.bisect_right(times, time) - 1
+        if before == len(times) - 1:
+            return before, 0.0
+        return before, (time - times[before]) / (times[before + 1] - times[before])
+
+    def fingerprint(self, time: float) -> str:
+        """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
+        before, share = self.place(time)
+        files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
+        digest = hashlib.sha256(repr((files, share, self.survey.reading, self.survey.quantity)).encode())
+        for leaf in jax.tree.leaves(self.transfer):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return digest.hexdigest()
+
+    def _particles(self, before: int, share: float) -> Particles:
+        first = self._load(before)
+        if share == 0:
+            return self._packed(first.columns, first.kernel)
+        second = self._load(before + 1)
+        if before not in self._matched:
+            self._matched.clear()
+            self._matched[before] = match(first.ids, second.ids)
+        matched = self._matched[before]
+        if isinstance(matched, str):
+            nearer = first if share < 0.5 else second
+            return self._packed(nearer.columns, nearer.kernel)
+        return self._packed(between(first.columns, second.columns, matched, share, self.survey.box), first.kernel)
+
+    def _load(self, number: int) -> Loaded:
+        """A snapshot's particles; those of two files are kept."""
+        if number not in self._loaded:
+            for other in [other for other in self._loaded if abs(other - number) > 1]:
+                del self._loaded[other]
+            while len(self._loaded) > 1:
+                del self._loaded[min(self._loaded)]
+            file = self.survey.files[number]
+            table = self.survey.reading.table(file.path)
+            particles, _ = io.particles_from_table(table, self.survey.quantity, *self.survey.reading.how)
+            exact = particles.exact_position()[np.asarray(particles.valid)]
+            self._loaded[number] = Loaded({**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table))
+        return self._loaded[number]
+
+    def _packed(self, columns: dict[str, np.ndarray], kernel: str) -> Particles:
+        """Particles with room for those of the largest file, and of one structure, so that all frames share programs."""
+        wide = self.survey.wide
+        position = columns["position"] if wide else columns["position"].astype(np.float32)
+        others = {name: column.astype(position.dtype) for name, column in columns.items() if name != "position"}
+        made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity)
+        if wide and made.dtype == jnp.float32 and made.position_rest is None:
+            made = dataclasses.replace(made, position_rest=jnp.asarray(np.zeros(made.position.shape, np.float32)))
+        return made
+
+    @property
+    def capacity(self) -> int:
+        """Entries of the particle arrays at any time."""
+        return capacity_class(max(file.num_particles for file in self.survey.files))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what was read, so that a source can be sent to where its frame is rendered."""
+        return {**self.__dict__, "_loaded": {}, "_matched": {}}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """A sequence at a time, as the source of a frame."""
+
+    snapshots: Snapshots
+    time: float
+
+    def __call__(self) -> Scene:
+        """The scene, read now."""
+        return self.snapshots.at(self.time)
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest of all that its picture depends on, known without reading particles."""
+        return self.snapshots.fingerprint(self.time)

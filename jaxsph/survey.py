@@ -1,0 +1,259 @@
+"""What the files of a sequence hold, found by reading each once before anything is rendered.
+
+Flow: paths -> [survey] -> Snapshots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph import io
+from jaxsph.io.matching import Matched, ids_of, match
+from jaxsph.io.quantities import choose_quantity
+from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
+from jaxsph.model import Particles
+from jaxsph.model.colormaps import value_range
+
+MAX_VALUES = 1 << 16
+"""Values of a file that the range over all files is taken from, evenly spread over its particles."""
+FAR = 4.0
+"""Supports that particles may move between snapshots before it is said that straight ways are a guess."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How files are read: as for `jaxsph.io.read_particles`."""
+
+    quantity: str | None = None
+    support: float | None = None
+    kernel: str = "poly6"
+    part_type: int | None = None
+
+    @property
+    def how(self) -> tuple[float | None, str]:
+        """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
+        return self.support, self.kernel
+
+    def table(self, path: Path) -> io.ParticleTable:
+        """What a file holds."""
+        return io.read_table(path, part_type=self.part_type)
+
+
+@dataclasses.dataclass(frozen=True)
+class SnapshotFile:
+    """One file of a sequence.
+
+    Attributes:
+        path: the file.
+        identity: its name, size in bytes, and time of change in nanoseconds.
+        num_particles: in it.
+        time: as the file says it, or None.
+        lower, upper: corners of the box around its particles, with their supports where the file has them.
+    """
+
+    path: Path
+    identity: tuple[str, int, int]
+    num_particles: int
+    time: float | None
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """From one file to the next.
+
+    Attributes:
+        matched: particles that are in both, by their ids.
+        vanish, appear: particles that are in one alone.
+        moved: median way of a particle over the median support; None where supports are not in the file.
+        why: why ids could not be matched; None where they could.
+    """
+
+    matched: int = 0
+    vanish: int = 0
+    appear: int = 0
+    moved: float | None = None
+    why: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Survey:
+    """What the files of a sequence hold.
+
+    Attributes:
+        files: in the order of time.
+        order: when they are.
+        reading: how they were read.
+        quantity: full name of what is shown, of all of them.
+        middle: particles of the file in the middle.
+        report: what was settled for those.
+        span: range of nearly all values of all files.
+        box: edges of the periodic box that all files have, or None.
+        wide: whether positions are float64 in any file.
+        steps: from each file to the next, as they were read; none where times have another order than names.
+    """
+
+    files: tuple[SnapshotFile, ...]
+    order: Order
+    reading: Reading
+    quantity: str
+    middle: Particles
+    report: io.Report
+    span: tuple[float, float]
+    box: tuple[float, float, float] | None
+    wide: bool
+    steps: tuple[Step, ...]
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all particles of all files."""
+        filled = [file for file in self.files if file.num_particles]
+        if not filled:
+            return np.zeros(3), np.zeros(3)
+        return np.min([file.lower for file in filled], 0), np.max([file.upper for file in filled], 0)
+
+    def told(self) -> list[str]:
+        """Sentences on what is between the files."""
+        together = [step for step in self.steps if step.why is None]
+        said = []
+        for why in dict.fromkeys(step.why for step in self.steps if step.why is not None):
+            number = sum(step.why == why for step in self.steps)
+            said.append(f"{number} of {len(self.steps)} intervals show the nearer snapshot, as {why}")
+        if together:
+            counts = [f"{sum(getattr(step, name) for step in together):,} {name}" for name in ("matched", "vanish", "appear")]
+            where = f"in {len(together)} of {len(self.steps)} intervals: {', '.join(counts)}"
+            said.insert(0, f"particles move straight and evenly where ids match, {where}")
+        far = max((step.moved for step in together if step.moved is not None), default=0.0)
+        if far > FAR:
+            said.append(f"the median particle moves by up to {far:.2g} supports from file to file: straight ways are a guess")
+        return said
+
+
+def surveyed(
+    paths: Iterable[str | os.PathLike[str]],
+    reading: Reading,
+    *,
+    gaps: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Survey:
+    """Read all files once; see `Snapshots.from_files`."""
+    named = _by_name([Path(path) for path in paths])
+    if not named:
+        raise ValueError("`paths` must be at least one particle file, got none")
+    for path in named:
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: there is no such file")
+    if not gaps:
+        require_no_gap(named)
+    middle, report = _middle(named, reading)
+    looking = _Looking(reading, report.quantity, float(np.asarray(middle.support).max(initial=0)))
+    for number, path in enumerate(named, 1):
+        looking.look(path)
+        if progress is not None:
+            progress(number, len(named))
+    looking.refuse_unread(len(named))
+    order = in_order(named, [file.time for file in looking.files])
+    as_read = order.indices == tuple(range(len(named)))
+    return Survey(
+        files=tuple(looking.files[place] for place in order.indices),
+        order=order,
+        reading=reading,
+        quantity=report.quantity,
+        middle=middle,
+        report=report,
+        span=value_range(np.concatenate(looking.values)),
+        box=looking.boxes[0] if len(set(looking.boxes)) == 1 else None,
+        wide=looking.wide,
+        steps=tuple(looking.steps) if as_read else (),
+    )
+
+
+def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
+    """The file in the middle, or the next to it that can be read: those that cannot are told of later, all at once."""
+    nearest = sorted(paths, key=lambda path: abs(paths.index(path) - len(paths) // 2))
+    for path in nearest:
+        try:
+            return io.particles_from_table(reading.table(path), reading.quantity, *reading.how)
+        except (ValueError, OSError) as error:
+            if path == nearest[-1]:
+                raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error
+    raise AssertionError("there is a last path")
+
+
+def _by_name(paths: list[Path]) -> list[Path]:
+    numbers = numbers_of(paths)
+    return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths, strict=True))]
+
+
+class _Looking:
+    """What is found in one file after the other, of which two at a time are in memory."""
+
+    def __init__(self, reading: Reading, quantity: str, support: float) -> None:
+        self._reading, self._quantity, self._support = reading, quantity, support
+        self._last: io.ParticleTable | None = None
+        self._unread: list[str] = []
+        self.files: list[SnapshotFile] = []
+        self.values: list[np.ndarray] = []
+        self.boxes: list[Any] = []
+        self.steps: list[Step] = []
+        self.wide = False
+
+    def look(self, path: Path) -> None:
+        """Read a file; what cannot be read is kept for `refuse_unread`."""
+        try:
+            table = self._reading.table(path)
+            values = self._values(table)
+        except (ValueError, OSError) as error:
+            self._unread.append(str(error) if str(path) in str(error) else f"{path}: {error}")
+            return
+        reach = self._reach(table)
+        position, known = table.position.astype(np.float64) if len(table) else np.zeros((1, 3)), path.stat()
+        identity = path.name, known.st_size, known.st_mtime_ns
+        box = position.min(0) - reach, position.max(0) + reach
+        self.files.append(SnapshotFile(path, identity, len(table), table.time, *box))
+        self.values.append(values[:: max(len(values) // MAX_VALUES, 1)])
+        self.boxes.append(table.box_size)
+        self.wide |= table.position.dtype == np.float64
+        if self._last is not None:
+            self.steps.append(_step(self._last, table, table.box_size))
+        self._last = table
+
+    def refuse_unread(self, number: int) -> None:
+        """Raise `ValueError` that names every file that could not be read."""
+        if self._unread:
+            raise ValueError(
+                f"{len(self._unread)} of {number} snapshots cannot be read, so nothing is rendered: {'; '.join(self._unread)}"
+            )
+
+    def _values(self, table: io.ParticleTable) -> np.ndarray:
+        try:
+            return choose_quantity(table, self._quantity)[0]
+        except io.DataError:  # a density that is summed over neighbours is not in the file
+            return io.particles_from_table(table, self._quantity, *self._reading.how)[0].to_numpy()["quantity"]
+
+    def _reach(self, table: io.ParticleTable) -> float:
+        if self._reading.support is not None:
+            return self._reading.support
+        return self._support if table.support is None else float(table.support.max(initial=0))
+
+
+def _step(first: io.ParticleTable, second: io.ParticleTable, box: tuple[float, ...] | None) -> Step:
+    found = match(ids_of(first), ids_of(second))
+    if isinstance(found, str):
+        return Step(why=found)
+    return Step(len(found.first), len(found.only_first), len(found.only_second), _moved(first, second, found, box))
+
+
+def _moved(first: io.ParticleTable, second: io.ParticleTable, found: Matched, box: tuple[float, ...] | None) -> float | None:
+    if first.support is None or not len(found.first):
+        return None
+    way = second.position[found.second].astype(np.float64) - first.position[found.first]
+    if box is not None:
+        way -= np.asarray(box) * np.round(way / np.asarray(box))
+    return float(np.median(np.linalg.norm(way, axis=1)) / np.median(first.support))
