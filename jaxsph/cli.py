@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxsph
-from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
+from jaxsph import cli_cache, cli_movie, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
 from jaxsph.cli_progressive import render_in_stages
 from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
@@ -116,6 +116,12 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_picture(sweep)
     cli_sweep.add_options(sweep)
     sweep.set_defaults(integrator="samples")  # whose full rate bounds and the pilot keep a tolerance against
+    movie = command("movie", _movie, "make a movie", cli_movie.MORE)
+    cli_options.add_source(movie, several=True)
+    _add_parts(movie)
+    cli_movie.add_options(movie)
+    cli_options.add_picture(movie)
+    cli_options.add_control(movie)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument
     add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")
@@ -150,6 +156,10 @@ def _render(options: argparse.Namespace) -> None:
     if settings.tolerance is not None:
         say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
     say("time", time_line(image, elapsed))
+
+
+def _movie(options: argparse.Namespace) -> None:
+    cli_movie.run(options, _settings(options), _scene)
 
 
 def _sweep(options: argparse.Namespace) -> None:

@@ -6,6 +6,7 @@ Flow: sources, cameras, settings -> [frames: FrameTask] -> plan -> render -> ima
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import os
@@ -55,13 +56,36 @@ class FrameTask:
 
     def fingerprint(self, scene: Scene | None = None) -> str:
         """A digest of all that the picture depends on; of files, of their names, sizes and times of change."""
-        mark = getattr(self.source, "fingerprint", None)
-        parts = [__version__, jax.config.read("jax_enable_x64"), dataclasses.replace(self.settings, memory_limit=None)]
-        camera = self.camera
-        digest = hashlib.sha256(repr((parts, camera.width, camera.height, camera.projection, camera.stride, mark)).encode())
-        for leaf in jax.tree.leaves((camera, None if mark is not None else scene or self.scene())):
-            digest.update(np.ascontiguousarray(leaf).tobytes())
-        return "f" + digest.hexdigest()[:24]
+        mark = getattr(self.source, "fingerprint", None) or digest_of(scene or self.scene())
+        settings = dataclasses.replace(self.settings, memory_limit=None)
+        parts = __version__, jax.config.read("jax_enable_x64"), settings, digest_of(self.camera), mark
+        return "f" + hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Still:
+    """One scene as the source of many frames, of which a digest is taken once."""
+
+    scene: Scene
+
+    def __call__(self) -> Scene:
+        """The scene."""
+        return self.scene
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """A digest of all of its arrays, and of what they are called."""
+        return digest_of(self.scene)
+
+
+def digest_of(tree: Any) -> str:
+    """A digest of a tree of arrays: structure, types, shapes and numbers."""
+    leaves, structure = jax.tree.flatten(tree)
+    digest = hashlib.sha256(repr(structure).encode())
+    for leaf in map(np.asarray, leaves):
+        digest.update(f"{leaf.dtype} {leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +215,7 @@ def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int
             raise ValueError(
                 f"`{name}` must be one of them for all frames or an iterable of one a frame, got {type(value).__name__}"
             )
-    sources = _read(sources)
+    sources = Still(sources) if isinstance(sources, Scene) else _read(sources)
     one_source, one_camera = _is_one(sources), isinstance(cameras, Camera)
     if not one_source and not one_camera:
         _require_as_many(sources, cameras)

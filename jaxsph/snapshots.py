@@ -22,6 +22,9 @@ from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.particles import capacity_class
 from jaxsph.survey import Reading, Survey, surveyed
 
+ROUNDING = 1e-9
+"""Share of the way between two snapshots by which a time may miss one of them, and mean it."""
+
 
 class Loaded(NamedTuple):
     """The particles of one snapshot, and what is known of who they are."""
@@ -111,7 +114,8 @@ class Snapshots:
         before = bisect.bisect_right(times, time) - 1
         if before == len(times) - 1:
             return before, 0.0
-        return before, (time - times[before]) / (times[before + 1] - times[before])
+        share = (time - times[before]) / (times[before + 1] - times[before])
+        return (before + 1, 0.0) if share > 1 - ROUNDING else (before, share if share > ROUNDING else 0.0)
 
     def fingerprint(self, time: float) -> str:
         """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""

@@ -179,10 +179,12 @@ def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
     nearest = sorted(paths, key=lambda path: abs(paths.index(path) - len(paths) // 2))
     for path in nearest:
         try:
-            return io.particles_from_table(reading.table(path), reading.quantity, *reading.how)
+            table = reading.table(path)
         except (ValueError, OSError) as error:
             if path == nearest[-1]:
                 raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error
+            continue
+        return io.particles_from_table(table, reading.quantity, *reading.how)
     raise AssertionError("there is a last path")
 
 

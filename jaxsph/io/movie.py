@@ -8,8 +8,13 @@ Colours are display-referred, as in PNG files, and become Y'CbCr by ITU-R BT.709
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
+import subprocess
+import tempfile
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,25 +30,28 @@ from .replace import written_whole
 SUFFIX = ".mp4"
 PURPOSE, EXTRA = "writing movies", "movie"
 MAX_FPS = 1000.0
-QUALITY = 6.5  # of ten: a rate factor of 17 of x264, at which differences to the frames are hard to see
-TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv")
+CODING = ("-c:v", "libx264", "-crf", "17", "-preset", "medium")  # at this rate factor differences to the frames are hard to see
 CONVERSION = ("-vf", "scale=in_range=full:out_range=limited:out_color_matrix=bt709,format=yuv420p")
+TAGS = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv")
 PLAYABLE = ("-movflags", "+faststart")
+MAX_DENOMINATOR = 10_000  # of a rate: 24000/1001 is one
 
 
 class MovieInfo(NamedTuple):
-    """What a decoder finds in a movie: frames, seconds, frames a second, and pixels a row and a column."""
+    """What a decoder finds in a movie: frames, seconds, frames a second, size in pixels, codec, and format of pixels."""
 
     frames: int
     seconds: float
     fps: float
     width: int
     height: int
+    codec: str
+    pixels: str
 
 
-def require_movie_library() -> Any:
-    """`imageio_ffmpeg`, which brings an encoder; `ImportError` says how to install it."""
-    return require("imageio_ffmpeg", PURPOSE, EXTRA)
+def encoder() -> str:
+    """The program that encodes and decodes, of `imageio-ffmpeg`; `ImportError` says how to install it."""
+    return str(require("imageio_ffmpeg", PURPOSE, EXTRA).get_ffmpeg_exe())
 
 
 def write_movie(path: str | os.PathLike[str], frames: Iterable[Any], fps: float = 24.0) -> None:
@@ -60,7 +68,8 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[Any], fps: float 
             be written to.
         ImportError: `imageio-ffmpeg` is not installed.
     """
-    file, library = Path(path), require_movie_library()
+    file = Path(path)
+    encoder()
     if file.suffix.lower() != SUFFIX:
         raise ValueError(f"{file}: movies are written as {SUFFIX}, not as {file.suffix!r}")
     if not 0 < fps <= MAX_FPS:
@@ -70,17 +79,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[Any], fps: float 
     if first is None:
         raise ValueError("`frames` must be at least one, got none")
     with written_whole(file) as temporary:
-        size = _even(first).shape[1::-1]
-        options = {"pix_fmt_in": "rgb24", "pix_fmt_out": "yuv420p", "fps": fps, "quality": QUALITY, "macro_block_size": 1}
-        more = [*CONVERSION, *TAGS, *PLAYABLE]
-        writer = library.write_frames(str(temporary), size, **options, ffmpeg_log_level="error", output_params=more)
-        try:
-            writer.send(None)
-            _send(writer, first, pixels)
-        finally:
-            writer.close()
-        if not temporary.stat().st_size:
-            raise ValueError(f"{file}: the encoder has written nothing; is there room on the disk?")
+        _encode(temporary, _even(first), map(_even, pixels), fps)
 
 
 def movie_info(path: str | os.PathLike[str]) -> MovieInfo:
@@ -91,26 +90,53 @@ def movie_info(path: str | os.PathLike[str]) -> MovieInfo:
         ValueError: it is no movie.
         ImportError: `imageio-ffmpeg` is not installed.
     """
-    file, library = Path(path), require_movie_library()
+    file, program = Path(path), encoder()
     if not file.exists():
         raise FileNotFoundError(f"{file}: there is no such file")
-    try:
-        reader = library.read_frames(str(file))
-        known = next(reader)
-        frames = sum(1 for _ in reader)
-    except (OSError, RuntimeError, StopIteration) as error:
-        raise DataError(f"{file}: cannot be decoded as a movie") from error
-    width, height = known["size"]
-    return MovieInfo(frames, float(known["duration"]), float(known["fps"]), int(width), int(height))
+    command = [program, "-nostdin", "-i", str(file), "-map", "0:v:0", "-progress", "pipe:1", "-f", "null", "-"]
+    found = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    counts = re.findall(r"^frame=(\d+)", found.stdout, re.MULTILINE)
+    times = re.findall(r"Duration: (\d+):(\d+):([\d.]+)", found.stderr)
+    streams = re.findall(r"Video: (\w+).*?, (\w+)[(,].*?, (\d+)x(\d+).*?, ([\d.]+) fps", found.stderr)
+    if found.returncode or not (counts and times and streams):
+        raise DataError(f"{file}: cannot be decoded as a movie; it is damaged or of another kind")
+    (hours, minutes, seconds), (codec, pixels, width, height, fps) = times[0], streams[0]
+    duration = 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    return MovieInfo(int(counts[-1]), duration, float(fps), int(width), int(height), codec, pixels)
 
 
-def _send(writer: Any, first: np.ndarray, others: Iterable[np.ndarray]) -> None:
-    writer.send(np.ascontiguousarray(_even(first)))
-    for number, frame in enumerate(others, 2):
-        if frame.shape != first.shape:
-            sizes = (f"{shape[1]} x {shape[0]}" for shape in (frame.shape, first.shape))
-            raise ValueError("frames of a movie must be of one size, but frame {} is {} and the first {}".format(number, *sizes))
-        writer.send(np.ascontiguousarray(_even(frame)))
+def _encode(path: Path, first: np.ndarray, others: Iterable[np.ndarray], fps: float) -> None:
+    height, width, _ = first.shape
+    rate = str(Fraction(fps).limit_denominator(MAX_DENOMINATOR))
+    given = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate, "-i", "-")
+    command = [encoder(), "-y", "-v", "error", *given, "-an", *CODING, *CONVERSION, *TAGS, *PLAYABLE, str(path)]
+    with tempfile.TemporaryFile() as said:
+        group = 0 if os.name == "posix" else None  # one of its own, so that an interrupt is ours to handle
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said}
+        process = subprocess.Popen(command, **pipes, process_group=group)
+        assert process.stdin is not None
+        try:
+            for number, frame in enumerate(itertools.chain([first], others), 1):
+                _require_size(frame, first, number)
+                process.stdin.write(np.ascontiguousarray(frame).data)
+            process.stdin.close()
+        except BrokenPipeError:  # why is in what it said
+            pass
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            code = process.wait()
+        if code:
+            said.seek(0)
+            reason = " ".join(said.read().decode(errors="replace").split())
+            raise ValueError(f"the movie could not be encoded: {reason or f'the encoder ended with {code}'}")
+
+
+def _require_size(frame: np.ndarray, first: np.ndarray, number: int) -> None:
+    if frame.shape != first.shape:
+        sizes = [f"{shape[1]} x {shape[0]}" for shape in (frame.shape, first.shape)]
+        raise ValueError(f"frames of a movie must be of one size, but frame {number} is {sizes[0]} and the first {sizes[1]}")
 
 
 def _pixels(frame: Any) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,0 +1,283 @@
+"""The command `movie`: one file or a sequence of snapshots, seen by a camera that may move, as frames and an MP4 file.
+
+Flow: files, options -> Snapshots, CameraPath -> render_frames -> [cli_movie] -> frames, movie, lines of text.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxsph import cli_particles, io, scenes
+from jaxsph.cli_points import Together
+from jaxsph.console import UsageError, camera_line, progress, say, span
+from jaxsph.frames import FrameFile, Source, Still, render_frames
+from jaxsph.model import Camera, CameraPath, Scene, Settings
+from jaxsph.model.camera import Bounded
+from jaxsph.model.camera_path import middle
+from jaxsph.snapshots import Snapshots
+from jaxsph.survey import Reading, Survey, surveyed
+
+MORE = "Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped."
+SECONDS = 10.0
+"""How long a movie is where nothing says so."""
+DIRECTIONS = 36
+"""Sides that a camera that goes around is to see all from."""
+EVERY = 5.0
+"""Seconds between two lines on what is done, where no bar is shown."""
+
+OneScene = Callable[[argparse.Namespace], tuple[Scene, Camera]]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of the command besides those of its source and picture."""
+    parser.set_defaults(size=None)
+    more = "(default: named after the first source, here); frames are in OUT_frames"
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT.mp4", help=more)
+    group = parser.add_argument_group("movie")
+    add = group.add_mutually_exclusive_group().add_argument
+    add("--camera", type=Path, metavar="KEYS.json", help="key frames of the camera; times are seconds of the movie")
+    add("--orbit", type=float, metavar="DEGREES", help="go around, counterclockwise as seen from above; 360 can be looped")
+    add = group.add_argument
+    add("--fps", type=float, default=24.0, metavar="F", help="frames a second (default 24)")
+    add("--frames", type=int, metavar="N", help="(default: as long as KEYS; else 10 s, or one a snapshot if those are more)")
+    add("--frame-format", choices=("png", "exr"), default="png", help="of the frames (default png)")
+    add("--gaps", action="store_true", help="go on where numbers are missing in the names of a sequence")
+
+
+def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) -> None:
+    """Say what is shown, render the frames that are not there, and write the movie."""
+    output = _checked(options)
+    io.movie.encoder()
+    _choose_size(options)
+    if len(options.source) > 1:
+        snapshots = _sequence(options)
+        shown: Bounded = snapshots
+        camera = _framed(shown, options)
+        number = len(snapshots.times)
+    else:
+        options.source = options.source[0]
+        scene, camera = one_scene(options)
+        snapshots, shown, number = None, _shown(scene, camera), 1
+    path = _path(options, camera, shown)
+    frames = _number_of_frames(options, path, number)
+    cameras = _cameras(path, options, camera, shown, frames)
+    sources: Still | Sequence[Source] = Still(scene) if snapshots is None else _moments(snapshots, frames)
+    say("camera", camera_line(cameras[0]))
+    folder = output.with_name(f"{output.stem}_frames")
+    pattern = folder / f"{{:05d}}.{options.frame_format}"
+    files = _render(render_frames(sources, cameras, settings, output=pattern), frames, folder)
+    io.write_movie(output, files, options.fps)
+    padded = " and a row or column to make both even" if cameras[0].width % 2 or cameras[0].height % 2 else ""
+    size = f"{cameras[0].width} x {cameras[0].height}{padded}"
+    say("movie", f"{output}, {frames} frames, {frames / options.fps:.4g} s at {options.fps:g} a second, {size}")
+
+
+def _checked(options: argparse.Namespace) -> Path:
+    """The output, once options make sense."""
+    output: Path = options.output or Path(Path(options.source[0].removeprefix("scene:")).stem + ".mp4")
+    if output.suffix.lower() != ".mp4":
+        raise UsageError(f"{output}: a movie must be .mp4; its frames may be EXR by --frame-format exr")
+    if not output.parent.is_dir():
+        raise ValueError(f"{output}: there is no folder {output.parent} to write it to; make it first")
+    if not 0 < options.fps <= io.movie.MAX_FPS:
+        raise UsageError(f"--fps must lie in (0, {io.movie.MAX_FPS:g}], got {options.fps:g}")
+    if options.frames is not None and options.frames < 1:
+        raise UsageError(f"--frames must be at least 1, got {options.frames}")
+    if options.orbit is not None and not (math.isfinite(options.orbit) and options.orbit):
+        raise UsageError(f"--orbit must be degrees other than 0, got {options.orbit:g}")
+    if options.progressive:
+        raise UsageError("--progressive is for one image; frames of a movie are rendered to their end")
+    if len(options.source) == 1 and options.camera is None and options.orbit is None:
+        raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
+    placed = [name for name in ("eye", "target", "fov") if getattr(options, name) is not None]
+    if options.camera is not None and placed:
+        raise UsageError(f"--{placed[0]} and --camera exclude each other; KEYS.json places the camera")
+    return output
+
+
+def _choose_size(options: argparse.Namespace) -> None:
+    """The size asked for, else that of the file of key frames, else 512 x 512."""
+    options.sized = options.size is not None
+    options.size = options.size or (512, 512)
+
+
+def _sequence(options: argparse.Namespace) -> Snapshots:
+    """The snapshots and their look, as said on the way."""
+    for path in options.source:
+        if path.startswith("scene:") or (Path(path).exists() and io.is_volume(path)):
+            raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
+    for name in ("particles", "frame", "iso", "volume", "points", "mix"):
+        if getattr(options, name, None) is not None:
+            raise UsageError(f"--{name} is not for a sequence of particle files")
+    if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
+        raise UsageError(f"--support must be > 0, got {options.support:g}")
+    reading = Reading(options.quantity, options.support, options.kernel or "poly6", options.part_type)
+    with progress("read", " files") as show:
+        survey = _surveyed(options, reading, show)
+    _say_survey(survey)
+    asked = options.range
+    options.range = options.range or survey.span
+    transfer = cli_particles.transfer(survey.middle, options, survey.quantity)
+    of_range = "as asked for" if asked else f"nearly all values of all {len(survey.files)} snapshots"
+    say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
+    return Snapshots(survey, transfer)
+
+
+def _surveyed(options: argparse.Namespace, reading: Reading, show: Callable[[int, int], None] | None) -> Survey:
+    try:
+        return surveyed(options.source, reading, gaps=options.gaps, progress=show)
+    except ValueError as error:
+        if "missing" in str(error) and not options.gaps:
+            raise ValueError(f"{error}; --gaps goes on without") from error
+        raise
+
+
+def _say_survey(survey: Survey) -> None:
+    files, times = survey.files, survey.order.times
+    counts = span([file.num_particles for file in files])
+    say("sequence", f"{len(files)} snapshots, {files[0].path} to {files[-1].path}, {counts} particles each")
+    say("times", f"{span(times)}, {survey.order.told}")
+    for sentence in survey.told():
+        say("between", sentence)
+    say("support", survey.report.support)
+    say("volume", survey.report.volume)
+    for note in survey.report.notes:
+        say("note", note)
+
+
+def _shown(scene: Scene, camera: Camera) -> Bounded:
+    """The box around all parts of a scene or, where parts do not say how large they are, around what the camera sees of depth."""
+    parts: list[Bounded] = [volume for volume, _ in scene.volumes] + list(scene.point_sets)
+    parts += [] if scene.particles is None else [scene.particles]
+    if parts and not scene.media:
+        return Together([("", part) for part in parts])
+    near, far = float(camera.near), float(camera.far)
+    wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
+    return _Box(np.array(middle(camera)), max(wide, (far - near) / 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Box:
+    middle: np.ndarray
+    reach: float
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.middle - self.reach, self.middle + self.reach
+
+
+def _framed(shown: Bounded, options: argparse.Namespace) -> Camera:
+    """The camera asked for, or one that frames all that there ever is."""
+    width, height = options.size
+    up, fov = options.up or (0.0, 1.0, 0.0), options.fov or 45.0
+    try:
+        if options.eye is None:
+            if options.target is not None:
+                raise UsageError("--target needs --eye: from where should it be looked at?")
+            return Camera.framing(shown, up=up, fov_degrees=fov, width=width, height=height)
+        lower, upper = shown.bounds()
+        target = (lower + upper) / 2 if options.target is None else options.target
+        made = Camera.look_at(options.eye, target, up, fov, width, height, near=1e-3, far=1.0)
+        return scenes.view.snug_box(made, lower, upper)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _path(options: argparse.Namespace, camera: Camera, shown: Bounded) -> CameraPath | None:
+    """Key frames, if there is a file of them."""
+    if options.camera is None:
+        return None
+    size = {"width": camera.width, "height": camera.height} if options.sized else {}
+    return io.read_camera_path(options.camera, shown=shown, **size)
+
+
+def _number_of_frames(options: argparse.Namespace, path: CameraPath | None, snapshots: int) -> int:
+    if options.frames is not None:
+        return int(options.frames)
+    if path is not None and path.end > path.start:
+        return round((path.end - path.start) * options.fps) + 1
+    return max(snapshots, round(SECONDS * options.fps))
+
+
+def _cameras(
+    path: CameraPath | None, options: argparse.Namespace, camera: Camera, shown: Bounded, frames: int
+) -> Sequence[Camera]:
+    """One a frame: frame k is k / fps seconds after the first key; an orbit ends where its next frame would begin anew."""
+    if path is None and options.orbit is None:
+        return [camera] * frames
+    if path is None:
+        path = _orbit(options, camera, shown, frames / options.fps)
+    return [path.at(path.start + frame / options.fps) for frame in range(frames)]
+
+
+def _orbit(options: argparse.Namespace, camera: Camera, shown: Bounded, seconds: float) -> CameraPath:
+    """Around the middle of all there is, or the target, from where all is in view from every side unless the eye is given."""
+    lower, upper = shown.bounds()
+    center = (lower + upper) / 2 if options.target is None else np.asarray(options.target, np.float64)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
+    radius = float(np.linalg.norm(corners - center, axis=1).max()) or 0.5
+    up = options.up or (0.0, 1.0, 0.0)
+    if options.eye is None:
+        camera = _all_round(camera, shown, up)
+    try:
+        return CameraPath.orbit(camera, options.orbit, center=center, radius=radius, up=up, seconds=seconds)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+def _all_round(camera: Camera, shown: Bounded, up: Any) -> Camera:
+    """A camera with the same line of sight, as far away as the side that needs it most asks for."""
+    forward = np.asarray(camera.axes, np.float64)[2]
+    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    how = {"up": up, "fov_degrees": 2 * math.degrees(math.atan(float(camera.half_height)))}
+    how |= {"width": camera.width, "height": camera.height}
+    turns = [Rotation.from_rotvec(2 * np.pi * side / DIRECTIONS * axis).apply(forward) for side in range(DIRECTIONS)]
+    lower, upper = shown.bounds()
+    center = (lower + upper) / 2
+    views = [Camera.framing(shown, direction=direction, **how) for direction in turns]
+    distance = max(float(np.linalg.norm(view.exact_eye() - center)) for view in views)
+    width, height = camera.width, camera.height
+    eye = center - distance * forward
+    return Camera.look_at(eye, center, up, how["fov_degrees"], width, height, near=0.5 * distance, far=2 * distance)
+
+
+def _moments(snapshots: Snapshots, frames: int) -> Sequence[Source]:
+    """Evenly in time from the first snapshot to the last."""
+    return snapshots.moments(np.linspace(snapshots.times[0], snapshots.times[-1], frames).tolist())
+
+
+def _render(rendered: Iterator[FrameFile], frames: int, folder: Path) -> list[Path]:
+    """The files of all frames; on the way, said how far it is."""
+    files: list[Path] = []
+    made, started, last = 0, time.perf_counter(), 0.0
+    try:
+        with progress("render", " frames") as show:
+            for frame in rendered:
+                files.append(frame.path)
+                made += frame.rendered
+                now = time.perf_counter() - started
+                if show is not None:
+                    show(len(files), frames)
+                elif made and (now - last > EVERY or len(files) == frames):
+                    last = now
+                    say("frame", f"{len(files)} of {frames}, {now / made:.2f} s each, {_left(now, made, frames - len(files))}")
+    except KeyboardInterrupt:
+        say("stopped", f"{len(files)} of {frames} frames are in {folder}; the same command goes on from there")
+        raise
+    there = "" if made == frames else f", {frames - made} of which were there already"
+    say("frames", f"{folder}, {frames} files{there}; {time.perf_counter() - started:.2f} s")
+    return files
+
+
+def _left(seconds: float, made: int, frames: int) -> str:
+    minutes, rest = divmod(round(seconds / made * frames), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d} left"
