@@ -23,6 +23,7 @@ from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.transfers import read_transfer, write_transfer
 from jaxsph.io.volume_table import VolumeTable
 from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.image import Image
@@ -47,10 +48,12 @@ __all__ = [
     "read_particles",
     "read_points",
     "read_table",
+    "read_transfer",
     "read_volume",
     "read_volume_table",
     "volume_from_table",
     "write_image",
+    "write_transfer",
     "write_volume",
 ]
 
