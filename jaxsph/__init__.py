@@ -1,11 +1,13 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
-from jaxsph import io, reference, scenes
+from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
+from jaxsph.met import Met, met
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.domains import control_values
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -21,6 +23,7 @@ __all__ = [
     "Coarsened",
     "Image",
     "IsoSurface",
+    "Met",
     "Particles",
     "Plan",
     "Points",
@@ -32,8 +35,11 @@ __all__ = [
     "__version__",
     "coarse_bound",
     "coarsened",
+    "control_values",
+    "image_figure",
     "in_octree",
     "io",
+    "met",
     "octree_plans",
     "plan",
     "prepare",
@@ -44,4 +50,5 @@ __all__ = [
     "scenes",
     "splat_bound",
     "sweep",
+    "transfer_figure",
 ]

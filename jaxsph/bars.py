@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxsph.io.labels import CODE_UNITS
 from jaxsph.model.scales import Scale
 from jaxsph.model.transfer import TransferFunction
 
-CODE_UNITS = "code units"
 LOG_PREFIX = "log10:"
 STEPS = 256
 MAX_TICKS = 7
@@ -47,7 +47,7 @@ class Axis:
     def title(self) -> str:
         """Label and unit, with powers as matplotlib writes them."""
         name = self.label[len(LOG_PREFIX) :] if self.is_logarithm else self.label
-        return f"{name} ({written(self.unit)})"
+        return f"{name} ({raised(self.unit)})"
 
     @property
     def scale(self) -> Scale:
@@ -98,7 +98,7 @@ def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarra
     return color, extinction[left] * (1 - part) + extinction[right] * part
 
 
-def written(unit: str) -> str:
+def raised(unit: str) -> str:
     """A unit with its powers raised."""
     return POWER.sub(r"$^{\\mathregular{\1}}$", unit)
 

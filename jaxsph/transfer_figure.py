@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.bars import CODE_UNITS, STEPS, Axis, look_up
+from jaxsph.bars import STEPS, Axis, look_up
+from jaxsph.io.labels import Labels
 from jaxsph.io.optional import require
 from jaxsph.met import Met, met
 from jaxsph.model.camera import Camera
@@ -28,9 +29,7 @@ def transfer_figure(
     scene: Scene | None = None,
     camera: Camera | None = None,
     *,
-    label: str = "quantity",
-    unit: str = CODE_UNITS,
-    factor: float = 1.0,
+    labels: Labels | str = "quantity",
     title: str = "",
     rays: int = 2000,
     bins: int = 96,
@@ -44,8 +43,7 @@ def transfer_figure(
     Args:
         transfer: one of the scene's own, or another for its particles (without particles, its first volume).
         scene, camera: see `jaxsph.met`; without them the function alone is drawn.
-        label: name of the quantity; `log10:NAME` is shown as NAME on a logarithmic axis.
-        unit, factor: of the axis, and numbers in it over those of the quantity.
+        labels: see `jaxsph.io.labels_of`; or the name of the quantity, in code units.
         title: above the figure.
         rays, bins: of the histogram.
 
@@ -63,7 +61,8 @@ def transfer_figure(
     if (scene is None) != (camera is None):
         raise ValueError("`scene` and `camera` go together; give both, or neither for the function alone")
     found = None if scene is None or camera is None else _met(transfer, scene, camera, rays, bins)
-    axis = Axis(transfer, label, unit, factor)
+    labels = Labels.of(labels)
+    axis = Axis(transfer, labels.quantity, labels.unit, labels.factor)
     figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     upper, strip = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (9, 1)})

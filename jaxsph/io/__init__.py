@@ -19,6 +19,7 @@ from jaxtyping import Float
 from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
+from jaxsph.io.labels import Labels, labels_of
 from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
@@ -34,6 +35,7 @@ __all__ = [
     "FORMATS",
     "DataError",
     "Format",
+    "Labels",
     "ParticleTable",
     "PointsReport",
     "Report",
@@ -41,6 +43,7 @@ __all__ = [
     "available_quantities",
     "is_volume",
     "kernel_sum",
+    "labels_of",
     "nearest_neighbour_supports",
     "particles_from_table",
     "points_from_table",

@@ -22,6 +22,7 @@ import numpy as np
 from .damage import DataError
 from .datasets import read_dataset, read_positions
 from .table import ParticleTable, plain
+from .units import of_gadget
 
 SOURCE = "Gadget HDF5"
 SWIFT_SOURCE = "SWIFT HDF5"
@@ -80,7 +81,8 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     box_size = _box(header)
     if box_size is not None:
         said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
-    return ParticleTable(position, columns, support, None, box_size, SWIFT_SOURCE if swift else SOURCE, conventions=tuple(said))
+    source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
+    return ParticleTable(position, columns, support, None, box_size, source, conventions=tuple(said), units=units)
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:

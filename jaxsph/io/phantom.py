@@ -15,6 +15,7 @@ import numpy as np
 from .damage import DataError
 from .datasets import numeric_datasets, read_dataset, read_positions
 from .table import ParticleTable, scalar_of_width_one
+from .units import of_phantom
 
 SOURCE = "Phantom HDF5"
 GAS = 1
@@ -65,7 +66,8 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     ]
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
-    return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, (h / hfact) ** 3, source=SOURCE, conventions=tuple(said))
+    units, volume = of_phantom(header, columns), (h / hfact) ** 3
+    return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, volume, source=SOURCE, conventions=tuple(said), units=units)
 
 
 def _choose(kinds: np.ndarray, part_type: int | None) -> int:

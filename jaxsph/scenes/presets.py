@@ -5,7 +5,7 @@ Flow: kind of data, Particles or Volume -> [presets] -> TransferFunction.
 | preset | colours | domain | extinction over the map | for |
 |---|---|---|---|---|
 | `fluid` | viridis | linear | rises with the square | liquids, concentrations: a surface or dye to be seen into |
-| `density` | heat | log | rises with the cube: high densities show through thin gas | gas and dark matter, over decades |
+| `density` | heat | log | rises with the cube from 0: what is dense shows through thin gas | gas and dark matter, over decades |
 | `temperature` | coolwarm | log | rises with the square | hot gas within cold |
 | `velocity` | coolwarm | linear; zero in the middle where signs change | high at both ends, or rising: flows and no rest | components, speeds |
 | `magnetic` | ice | log | rises with the square | field strengths, energies |
@@ -51,7 +51,7 @@ def _rising(power: float, least: float = FAINTEST) -> Ramp:
 
 PRESETS: dict[str, Preset] = {
     "fluid": Preset("viridis", "linear", _rising(STEEPNESS)),
-    "density": Preset("heat", "log", _rising(3)),
+    "density": Preset("heat", "log", _rising(3, 0)),
     "temperature": Preset("coolwarm", "log", _rising(STEEPNESS)),
     "velocity": Preset("coolwarm", "linear", _rising(STEEPNESS, 0), lambda place: np.abs(2 * place - 1) ** 1.5),
     "magnetic": Preset("ice", "log", _rising(STEEPNESS)),
