@@ -75,7 +75,7 @@ class Axis:
         scale, axis = self.scale, getattr(axes, f"{which}axis")
         if scale.name == "even":
             getattr(axes, f"set_{which}scale")("function", functions=(scale.place, scale.value))
-            axis.set_major_locator(ticker.FixedLocator(even_ticks(scale)))
+            axis.set_major_locator(ticker.FixedLocator(even_ticks(scale).tolist()))
             axis.set_minor_locator(ticker.NullLocator())
             axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.3g}"))
         elif scale.name == "log":

@@ -23,7 +23,8 @@ from jaxsph.projected import bounds_of, box_lines, pixels_per_length, round_leng
 DOTS_AN_INCH = 100
 LETTERS = 42  # lines of text that are as high as the image
 SMALLEST, LARGEST = 11, 64  # pixels of a letter
-BAR_ROOM = 8.5  # letters, of a colour bar with its ticks and label
+ROOM = 30  # letters, for a colour bar with its ticks and label, before these are measured
+BAR_SPAN = 0.06, 0.94  # of the figure's height
 LONGEST_BAR = 0.25  # of the image's width
 TALLEST = 0.55  # of a letter: its mean width
 AXES_COLORS = "#ff7b72", "#7ee787", "#79b8ff"
@@ -71,7 +72,7 @@ def image_figure(
         raise ValueError(f"`camera` must be the one of the image, of {size} pixels, got one of {given}")
     labels, bounds = Labels.of(labels), None if scene is None else bounds_of(scene)
     bars = [] if scene is None else _bars(scene, labels)
-    page = _Page(image, len(bars))
+    page = _Page(image)
     if camera is not None and bounds is not None and outline:
         page.draw_outline(camera, *bounds)
     if camera is not None and triad:
@@ -79,8 +80,8 @@ def image_figure(
     if camera is not None:
         page.draw_scale(camera, _anchor(camera, bounds, target), target is not None, labels)
     page.write([line for line in (title, labels.moment) if line])
-    for number, bar in enumerate(bars):
-        page.draw_bar(number, bar)
+    for bar in bars:
+        page.draw_bar(bar)
     return page.figure
 
 
@@ -109,21 +110,29 @@ def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target
 class _Page:
     """A figure with the picture at its left, and room for colour bars."""
 
-    def __init__(self, image: Image, bars: int):
+    def __init__(self, image: Image):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         self.height, self.width = image.shape
         self.letter = float(np.clip(self.height / LETTERS, SMALLEST, LARGEST))
-        self.room = int(round(bars * BAR_ROOM * self.letter))
-        self.image, self.whole = image, self.width + self.room
-        self.figure = Figure(figsize=(self.whole / DOTS_AN_INCH, self.height / DOTS_AN_INCH), dpi=DOTS_AN_INCH, facecolor="white")
-        FigureCanvasAgg(self.figure)
-        self.axes = self.figure.add_axes((0, 0, self.width / self.whole, 1))
+        self.image, self.figure = image, Figure(dpi=DOTS_AN_INCH, facecolor="white")
+        self.canvas = FigureCanvasAgg(self.figure)
+        self.axes = self.figure.add_axes((0, 0, 1, 1))
+        self._places = [(self.axes, 0.0, float(self.width))]
+        self._fit(self.width)
         extent = (0, self.width, self.height, 0)
         self.axes.imshow(image.to_uint8(), extent=extent, interpolation="nearest", aspect="auto")
         self.axes.set(xlim=(0, self.width), ylim=(self.height, 0))
         self.axes.axis("off")
+
+    def _fit(self, whole: int) -> None:
+        """Make the figure so many pixels wide, with axes where they are."""
+        self.whole = whole
+        self.figure.set_size_inches(whole / DOTS_AN_INCH, self.height / DOTS_AN_INCH)
+        for axes, left, width in self._places:
+            lower, high = (0.0, 1.0) if axes is self.axes else BAR_SPAN
+            axes.set_position((left / whole, lower, width / whole, high - lower))
 
     @property
     def points(self) -> float:
@@ -135,7 +144,8 @@ class _Page:
         from matplotlib import patheffects
 
         border = [patheffects.withStroke(linewidth=0.22 * self.points, foreground=DARK)]
-        self.axes.text(x, y, line, **{"color": LIGHT, "fontsize": size * self.points, "path_effects": border} | style)
+        whole: dict[str, Any] = {"color": LIGHT, "fontsize": size * self.points, "path_effects": border}
+        self.axes.text(x, y, line, **whole | style)
 
     def line(self, ends: np.ndarray, width: float, color: str = LIGHT) -> None:
         """A light line with a dark border; a width in letters."""
@@ -158,13 +168,13 @@ class _Page:
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner, those that point away from the eye first."""
         axes = np.asarray(camera.axes, np.float64)
-        start = np.array([3.2 * self.letter, self.height - 3.2 * self.letter])
+        start = np.array([3.8 * self.letter, self.height - 3.8 * self.letter])
         for i in np.argsort(-axes[2]):
             along = np.array([axes[0, i], -axes[1, i]]) * 2.2 * self.letter
             self.line(np.stack([start, start + along]), 0.17, AXES_COLORS[i])
             length = max(float(np.hypot(*along)), 1e-9)
             place = start + along + along / length * 0.7 * self.letter
-            self.text(*place, "xyz"[i], 0.95, ha="center", va="center", color=AXES_COLORS[i])
+            self.text(float(place[0]), float(place[1]), "xyz"[i], 0.95, ha="center", va="center", color=AXES_COLORS[i])
 
     def draw_scale(self, camera: Camera, depth: float, at_target: bool, labels: Labels) -> None:
         """A bar of a round length in the lower right corner."""
@@ -185,22 +195,28 @@ class _Page:
         if lines:
             self.text(0.8 * self.letter, 0.7 * self.letter, "\n".join(lines), 1.05, ha="left", va="top", linespacing=1.3)
 
-    def draw_bar(self, number: int, bar: Axis) -> None:
-        """A colour bar, with ticks and label at its right."""
-        left = (self.width + (number * BAR_ROOM + 1.0) * self.letter) / self.whole
-        axes = self.figure.add_axes((left, 0.06, 1.3 * self.letter / self.whole, 0.88))
+    def draw_bar(self, bar: Axis) -> None:
+        """A colour bar at the right of all, with ticks and label; the figure grows by what these take."""
+        left = self.whole + self.letter
+        axes = self.figure.add_axes((0, 0, 1, 1))
+        self._places.append((axes, left, 1.3 * self.letter))
+        self._fit(round(left + ROOM * self.letter))
         scale = bar.scale
-        place = np.linspace(*scale.place(scale.values[[0, -1]]), STEPS + 1)
+        place = np.linspace(0, 1, STEPS + 1)
         edges, middles = scale.value(place), scale.value((place[1:] + place[:-1]) / 2)
         bar.apply(axes, "y", float(edges[0]), float(edges[-1]))
         axes.pcolormesh([0, 1], edges, bar.colors(middles)[:, None], rasterized=True)
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")
-        axes.tick_params(labelsize=0.85 * self.points, width=0.08 * self.points, length=0.35 * self.points, pad=0.25 * self.points)
+        axes.tick_params(
+            labelsize=0.85 * self.points, width=0.08 * self.points, length=0.35 * self.points, pad=0.25 * self.points
+        )
         axes.yaxis.get_offset_text().set_fontsize(0.85 * self.points)
         fits = len(bar.title) * TALLEST * self.letter < 0.95 * self.height
         axes.set_ylabel(bar.title if fits else bar.title.replace(" (", "\n(", 1), fontsize=self.points)
+        extent = axes.get_tightbbox(self.canvas.get_renderer())
+        self._fit(int(np.ceil((self.whole if extent is None else extent.x1) + 0.6 * self.letter)))
 
 
 Image.drawer = staticmethod(image_figure)

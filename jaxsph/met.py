@@ -2,10 +2,10 @@ r"""What rays really meet: how much light each value of a quantity emits and abs
 
 Flow: scene, camera -> some rays -> portions -> quantity at nodes, light in front of it -> [met] -> histogram, figure.
 
-A value may be that of most particles and never be seen, as it lies behind others. Along rays of random pixels the quantity is taken
-at the nodes of portions of the float64 reference, and what is there is weighted by the transmittance in front:
-$\int T \sigma\,dl$ is absorbed, $\int T c \sigma\,dl$ is emitted, and the path length alone tells what is there at all. The sum of
-what all values absorb is the mean alpha of the image, if nothing else is in the scene.
+A value may be that of most particles and never be seen, as it lies behind others. Along rays of random pixels the quantity is
+taken at the nodes of portions of the float64 reference, and what is there is weighted by the transmittance in front:
+$\int T \sigma\,dl$ is absorbed, $\int T c \sigma\,dl$ is emitted, and the path length alone tells what is there at all. The sum
+of what all values absorb is the mean alpha of the image, if nothing else is in the scene.
 """
 
 from __future__ import annotations

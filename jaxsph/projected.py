@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera import Bounded, Camera
 from jaxsph.model.scene import Scene
 
 PIECES = 128  # of an edge, each of which is hidden or not
@@ -80,7 +80,8 @@ def round_length(most: float) -> float:
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray] | None:
     """Lower and upper corner around particles, volumes and points; `None` where there are none of these."""
-    parts = [*([] if scene.particles is None else [scene.particles]), *(volume for volume, _ in scene.volumes), *scene.point_sets]
+    parts: list[Bounded] = [] if scene.particles is None else [scene.particles]
+    parts += [*(volume for volume, _ in scene.volumes), *scene.point_sets]
     if not parts:
         return None
     corners = [part.bounds() for part in parts]

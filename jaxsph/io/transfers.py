@@ -70,7 +70,9 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
 
 def _fields(found: Any) -> dict[str, Any]:
     if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise ValueError(f'is JSON, but no transfer function: "format" must be "{FORMAT}"; `TransferFunction.save` writes such files')
+        raise ValueError(
+            f'is JSON, but no transfer function: "format" must be "{FORMAT}"; `TransferFunction.save` writes such files'
+        )
     version = found.get("version")
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
@@ -80,8 +82,9 @@ def _fields(found: Any) -> dict[str, Any]:
     missing = [name for name in REQUIRED if name not in found]
     unknown = sorted(set(found) - names - KNOWN)
     if missing or unknown:
+        may = ", ".join(sorted((names | KNOWN) - set(REQUIRED)))
         what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(unknown)}, unknown to this version"
-        raise ValueError(f"{what}; it must hold {', '.join(REQUIRED)}, and may hold {', '.join(sorted((names | KNOWN) - set(REQUIRED)))}")
+        raise ValueError(f"{what}; it must hold {', '.join(REQUIRED)}, and may hold {may}")
     dtype = found.get("dtype", "float32")
     if dtype not in ("float32", "float64"):
         raise ValueError(f'"dtype" must be float32 or float64, got {dtype!r}')

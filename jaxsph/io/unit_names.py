@@ -33,7 +33,7 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     if name.lower().startswith(LOG_PREFIX):
         return unit_of(table, name[len(LOG_PREFIX) :])
     stored = table.named(name)
-    if stored in units.columns:
+    if stored is not None and stored in units.columns:
         return units.columns[stored]
     column, _, component = name.rpartition(".")
     if component and column in units.columns and column in table.vectors:

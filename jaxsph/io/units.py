@@ -4,13 +4,13 @@ Flow: HDF5 attributes -> [units] -> FileUnits of a ParticleTable -> `unit_names`
 
 | file | where units stand |
 |---|---|
-| GADGET-4, AREPO | at each data set: `to_cgs`, `length_scaling`, ..., with powers of the scale factor a and of the Hubble parameter h |
+| GADGET-4, AREPO | at each data set: `to_cgs`, `length_scaling`, ..., and powers of scale factor a and Hubble parameter h |
 | SWIFT | at each data set: `U_L exponent`, ..., `Conversion factor to CGS ...`; those of time in the group `Units` |
 | Phantom | `udist`, `umass`, `utime`, `umagfd` in the header, for xyz, h, vxyz, u, masses, densities, Bxyz |
 
 Numbers are left as stored: where a file states powers of a and h, units carry them, and nothing is multiplied out. Gadget files
-without such attributes state units of length, mass and velocity alone (`UnitLength_in_cm`); what else has h in it they do not say, so
-that these are taken for the time only, of runs that are not comoving.
+without such attributes state units of length, mass and velocity alone (`UnitLength_in_cm`), and not where h is in numbers: these
+are taken for the time only, of runs that are not comoving.
 """
 
 from __future__ import annotations
@@ -102,7 +102,8 @@ def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     time = _dataset(header, "time")
     if any(value is None or not value > 0 for value in found):
         return FileUnits(time=time)
-    length, mass, second = (CodeUnit(float(value or 1), powers) for value, powers in zip(found, (LENGTH, (0, 1, 0, 0), TIME), strict=True))
+    powers = LENGTH, (0, 1, 0, 0), TIME
+    length, mass, second = (CodeUnit(float(value or 1), power) for value, power in zip(found, powers, strict=True))
     velocity = length.over(second)
     known = {"h": length, "vxyz": velocity, "u": velocity.over(velocity, -1), "mass": mass, "density": mass.over(length, 3)}
     field = _dataset(header, "umagfd")

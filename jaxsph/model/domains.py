@@ -13,10 +13,11 @@ are at even places $t_k = k / (K - 1)$, and a domain says which value is at whic
 | `percentile` | as `linear`, between two percentiles of the quantity |
 | `equalised` | the quantile t of the quantity: every colour is that of as many particles |
 
-The other way to a logarithmic picture is another field: the quantity `log10:NAME` is the mean of logarithms, where the domain `log`
-colours the logarithm of the mean. Near dense particles the mean is theirs; the mean of logarithms lies between, as where codes
-interpolate the logarithm. The mean is a float32 number: values below about 1e-5 of the largest among the particles that share a ray
-are lost in its rounding, and a quantity over more decades than that is better shown by its logarithm.
+The other way to a logarithmic picture is another field: the quantity `log10:NAME` is the mean of logarithms, as where a code
+interpolates the logarithm of a grid; the domain `log` colours the logarithm of the mean. Between a dense and a thin particle
+the mean is nearly the dense one's, the mean of logarithms halfway. The mean is rounded by an eps of the largest quantity
+nearby, and means over segments by a few eps of the largest control value: in float32 a domain tells apart what is above about
+1e-6 of its upper end, and a quantity over more decades is to be shown by its logarithm, or in float64.
 
 References: Webber 2012, *A bi-symmetric log transformation for wide-range data*.
 """
@@ -186,7 +187,8 @@ def _percentile(asked: _Asked) -> np.ndarray:
 
 
 def _equalised(asked: _Asked) -> np.ndarray:
-    values, inside = asked.known("equalised"), np.s_[:]
+    values = asked.known("equalised")
+    inside = np.ones(values.shape, bool)
     if asked.low is not None or asked.high is not None:
         low, high = asked.ends()
         inside = (values >= low) & (values <= high)

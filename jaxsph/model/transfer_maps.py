@@ -29,7 +29,7 @@ def from_colormap(colors: Any, values: Any, extinction: Any = 1.0) -> TransferFu
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"`values` must be two ends, or control values (K,), got shape {values.shape}")
     if len(values) == 2:
-        values = np.linspace(*values, POINTS)
+        values = np.linspace(values[0], values[1], POINTS)
     return TransferFunction.from_points(values, _spread(rows, len(values)), _spread(extinction, len(values)))
 
 
@@ -100,7 +100,9 @@ def _inverse(norm: Any, ends: list[float], place: np.ndarray) -> Any:
     if norm is None:
         return ends[0] + (ends[1] - ends[0]) * place
     if not hasattr(norm, "inverse"):
-        raise ValueError(f"`norm` must have an inverse, and {type(norm).__name__} has none; give LogNorm, SymLogNorm or Normalize")
+        raise ValueError(
+            f"`norm` must have an inverse, and {type(norm).__name__} has none; give LogNorm, SymLogNorm or Normalize"
+        )
     import copy
 
     own = copy.copy(norm)

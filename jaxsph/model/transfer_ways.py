@@ -43,7 +43,10 @@ class TransferWays:
 
     @classmethod
     def from_matplotlib(cls, cmap: Any, norm: Any = None, **more: Any) -> TransferFunction:
-        """Of a map and a norm of matplotlib's, and `low`, `high`, `extinction`; see `jaxsph.model.transfer_maps.from_matplotlib`."""
+        """Of a map and a norm of matplotlib's.
+
+        See `jaxsph.model.transfer_maps.from_matplotlib` for `more`: `low`, `high`, `extinction`, `points`.
+        """
         from jaxsph.model import transfer_maps
 
         return transfer_maps.from_matplotlib(cmap, norm, **more)

@@ -7,7 +7,7 @@ Flow: kind of data, Particles or Volume -> [presets] -> TransferFunction.
 | `fluid` | viridis | linear | rises with the square | liquids, concentrations: a surface or dye to be seen into |
 | `density` | heat | log | rises with the cube from 0: what is dense shows through thin gas | gas and dark matter, over decades |
 | `temperature` | coolwarm | log | rises with the square | hot gas within cold |
-| `velocity` | coolwarm | linear; zero in the middle where signs change | high at both ends, or rising: flows and no rest | components, speeds |
+| `velocity` | coolwarm | linear; 0 in the middle where signs change | high at both ends, or rising: flows, no rest | components |
 | `magnetic` | ice | log | rises with the square | field strengths, energies |
 | `scan` | gray | percentile | none below a quarter, then rising | CT and MRI: air and noise are not shown |
 
@@ -114,7 +114,9 @@ def domain_transfer(
     """
     control = control_values(domain, _quantity(shown), **_ends(values), points=points)
     least = 0.0 if isinstance(shown, Volume) else FAINTEST
-    return fitted(from_colormap(colormap_name, control, _rising(STEEPNESS, least)(np.linspace(0, 1, points))), shown, optical_depth)
+    return fitted(
+        from_colormap(colormap_name, control, _rising(STEEPNESS, least)(np.linspace(0, 1, points))), shown, optical_depth
+    )
 
 
 def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth: float = OPTICAL_DEPTH) -> TransferFunction:
@@ -132,7 +134,9 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
         raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
     extinction = np.asarray(transfer.extinction, np.float64)
     depth = typical_depth(shown, np.asarray(transfer.values, np.float64), extinction)
-    return dataclasses.replace(transfer, extinction=transfer.extinction * np.asarray(optical_depth / depth, transfer.extinction.dtype))
+    return dataclasses.replace(
+        transfer, extinction=transfer.extinction * np.asarray(optical_depth / depth, transfer.extinction.dtype)
+    )
 
 
 def _quantity(shown: Particles | Volume) -> np.ndarray:
