@@ -1,12 +1,14 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
-from jaxsph import io, reference, scenes
+from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.frames import FrameFile, render_frames
+from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.domains import control_values
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -25,6 +27,7 @@ __all__ = [
     "FrameFile",
     "Image",
     "IsoSurface",
+    "Met",
     "Particles",
     "Plan",
     "Points",
@@ -37,8 +40,11 @@ __all__ = [
     "__version__",
     "coarse_bound",
     "coarsened",
+    "control_values",
+    "image_figure",
     "in_octree",
     "io",
+    "met",
     "octree_plans",
     "plan",
     "prepare",
@@ -50,4 +56,5 @@ __all__ = [
     "scenes",
     "splat_bound",
     "sweep",
+    "transfer_figure",
 ]

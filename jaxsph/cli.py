@@ -18,7 +18,19 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxsph
-from jaxsph import cli_cache, cli_movie, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
+from jaxsph import (
+    cli_annotate,
+    cli_cache,
+    cli_movie,
+    cli_options,
+    cli_particles,
+    cli_points,
+    cli_sweep,
+    cli_transfer,
+    cli_volume,
+    io,
+    scenes,
+)
 from jaxsph.cli_progressive import render_in_stages
 from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
@@ -106,6 +118,13 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     cli_options.add_picture(render)
     cli_options.add_control(render)
+    cli_transfer.add_looks(render)
+    cli_annotate.add_options(render)
+    transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
+    cli_options.add_source(transfer)
+    cli_options.add_picture(transfer)
+    cli_transfer.add_looks(transfer)
+    cli_transfer.add_command(transfer)
     info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
     cli_options.add_source(info, optional=True)
     _add_parts(info)
@@ -120,6 +139,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(movie, several=True)
     _add_parts(movie)
     cli_movie.add_options(movie)
+    cli_transfer.add_looks(movie)
     cli_options.add_picture(movie)
     cli_options.add_control(movie)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
@@ -142,6 +162,7 @@ def _render(options: argparse.Namespace) -> None:
     first = options.source or (options.volume or options.points)[0]
     output = options.output or Path(Path(first.removeprefix(SCENE)).stem + ".png")
     _require_writable(output)
+    cli_annotate.check(options, output)
     scene, camera = _scene(options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
@@ -151,7 +172,10 @@ def _render(options: argparse.Namespace) -> None:
         with progress("render") as show:
             image = jaxsph.render(scene, camera, settings, progress=show)
     elapsed = time.perf_counter() - started
-    image.save(output)
+    if options.annotate:
+        cli_annotate.save(image, scene, camera, options, output)
+    else:
+        image.save(output)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
     if settings.tolerance is not None:
         say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
@@ -160,6 +184,16 @@ def _render(options: argparse.Namespace) -> None:
 
 def _movie(options: argparse.Namespace) -> None:
     cli_movie.run(options, _settings(options), _scene)
+
+
+def _transfer(options: argparse.Namespace) -> None:
+    output = cli_transfer.check_figure(options)
+    if Path(options.source).suffix.lower() == ".json":
+        _refuse(options, ("quantity", "save", *cli_transfer.LOOKS), "is for FILE or scene:NAME, and this is a saved function")
+        cli_transfer.draw_file(options, output)
+        return
+    scene, shown, camera = _source(options)
+    cli_transfer.draw(scene, camera or _camera(shown, options), options.labels, options, output)
 
 
 def _sweep(options: argparse.Namespace) -> None:
@@ -214,8 +248,8 @@ def _scene(options: argparse.Namespace) -> tuple[Scene, Camera]:
 def _source(options: argparse.Namespace) -> tuple[Any, Any, Camera | None]:
     """Scene of the source, what there is to frame, and the camera where it has one."""
     if options.source is None:
-        of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame", "colormap", "range", "opacity")
-        _refuse(options, of_source, "is for FILE or scene:NAME, and there is none")
+        of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame")
+        _refuse(options, (*of_source, *cli_transfer.LOOKS), "is for FILE or scene:NAME, and there is none")
         return None, None, None
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
@@ -240,8 +274,9 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
     particles = scene.particle_set
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     if options.command != "info":
-        if any(value is not None for value in (options.colormap, options.range, options.opacity)):
-            scene = dataclasses.replace(scene, transfer=cli_particles.transfer(particles, options, "concentration"))
+        if cli_transfer.asked(options):
+            scene = dataclasses.replace(scene, transfer=cli_transfer.look(particles, options, "concentration"))
+        cli_annotate.label("concentration", options, "a built-in scene")
         if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):
             camera = _camera(particles, options)
     return scene, camera

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph import cli_particles, io, scenes
+from jaxsph import cli_transfer, io, scenes
 from jaxsph.cli_points import Together
 from jaxsph.console import UsageError, camera_line, progress, say, span
 from jaxsph.frames import FrameFile, Source, Still, render_frames
@@ -125,8 +125,9 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
         survey = _surveyed(options, reading, show)
     _say_survey(survey)
     asked = options.range
-    options.range = options.range or survey.span
-    transfer = cli_particles.transfer(survey.middle, options, survey.quantity)
+    if options.transfer is None:
+        options.range = options.range or survey.span
+    transfer = cli_transfer.look(survey.middle, options, survey.quantity)
     of_range = "as asked for" if asked else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     return Snapshots(survey, transfer)

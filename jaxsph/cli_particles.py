@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
 
 import numpy as np
 
-from jaxsph import io, scenes
+from jaxsph import cli_annotate, cli_transfer, io
 from jaxsph.console import UsageError, attributes, say, span
 from jaxsph.model import Particles, Scene
 
@@ -29,20 +28,8 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
     say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
     for note in report.notes:
         say("note", note)
-    return Scene(particles=particles, transfer=transfer(particles, options, report.quantity)), particles
-
-
-def transfer(particles: Particles, options: argparse.Namespace, quantity: str) -> Any:
-    """What particles look like: a colour map over a quantity."""
-    name = options.colormap or "viridis"
-    depth = scenes.appearance.OPTICAL_DEPTH if options.opacity is None else options.opacity
-    try:
-        made = scenes.default_transfer(particles, name, options.range, depth)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    colors, extinction = f"{name} over {quantity} = {span(made.values)}", span(made.extinction)
-    say("colours", f"{colors}, extinction {extinction} per unit length")
-    return made
+    cli_annotate.label_file(table, report.quantity, columns["quantity"], options)
+    return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity)), particles
 
 
 def describe(options: argparse.Namespace) -> Particles:
@@ -50,6 +37,7 @@ def describe(options: argparse.Namespace) -> Particles:
     table = _table(options)
     print(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
+    cli_annotate.describe(table)
     print("\n`jaxsph render` would show")
     particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
     columns = particles.to_numpy()

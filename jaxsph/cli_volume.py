@@ -6,11 +6,10 @@ Flow: file, options -> [cli_volume] -> Scene -> cli.
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 import numpy as np
 
-from jaxsph import io, scenes
+from jaxsph import cli_annotate, cli_transfer, io, scenes
 from jaxsph.console import ranges, say, span
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Scene, TransferFunction, Volume
@@ -29,29 +28,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def scene_of(options: argparse.Namespace) -> tuple[Scene, Volume]:
     """The volume of the source under a colour map, or its iso-surface; and what there is to frame."""
-    volume = _volume_of_file(options.source, options.quantity)
+    volume, name = _volume_of_file(options.source, options.quantity)
+    cli_annotate.label(name, options, "a volume")
     if options.iso is not None:
         color = ISO_COLOR if options.colormap is None else tuple(scenes.colormap(options.colormap)[-1])
         say("surface", f"where the values are {options.iso:g}")
         return Scene(media=(IsoSurface.from_volume(volume, options.iso, color),)), volume
-    return Scene(volume=volume, volume_transfer=_transfer(volume, options.colormap, options.range, options.opacity)), volume
+    return Scene(volume=volume, volume_transfer=cli_transfer.look(volume, options, name)), volume
 
 
 def beside(options: argparse.Namespace) -> list[tuple[Volume, TransferFunction]]:
     """Volumes besides the source, each with what it looks like."""
-    volumes = [_volume_of_file(path, options.volume_quantity) for path in options.volume or ()]
-    return [(volume, _transfer(volume, options.volume_colormap, None, None)) for volume in volumes]
+    volumes = [_volume_of_file(path, options.volume_quantity)[0] for path in options.volume or ()]
+    return [(volume, _transfer(volume, options.volume_colormap or "viridis")) for volume in volumes]
 
 
-def _transfer(volume: Volume, colormap: str | None, span_asked: Any, depth: float | None) -> TransferFunction:
-    name = colormap or "viridis"
-    depth = scenes.appearance.OPTICAL_DEPTH if depth is None else depth
-    transfer = scenes.default_volume_transfer(volume, name, span_asked, depth)
+def _transfer(volume: Volume, name: str) -> TransferFunction:
+    transfer = scenes.default_volume_transfer(volume, name)
     say("colours", f"{name} over {span(transfer.values)}, extinction {span(transfer.extinction)} per unit length")
     return transfer
 
 
-def _volume_of_file(path: str, quantity: str | None) -> Volume:
+def _volume_of_file(path: str, quantity: str | None) -> tuple[Volume, str]:
+    """A volume, and the name of its values."""
     table = io.read_volume_table(path)
     say("file", f"{path}: {table.source}, {' x '.join(map(str, table.shape))} points")
     try:
@@ -61,7 +60,7 @@ def _volume_of_file(path: str, quantity: str | None) -> Volume:
     say("quantity", f"{name}, {volume.values.dtype}, {span(np.asarray(volume.values))}")
     for note in table.conventions:
         say("note", note)
-    return volume
+    return volume, name
 
 
 def describe(path: str, quantity: str | None) -> Volume:

@@ -20,11 +20,13 @@ from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.camera_paths import read_camera_path, write_camera_path
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
+from jaxsph.io.labels import Labels, labels_of
 from jaxsph.io.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.transfers import read_transfer, write_transfer
 from jaxsph.io.volume_table import VolumeTable
 from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.image import Image
@@ -35,6 +37,7 @@ __all__ = [
     "FORMATS",
     "DataError",
     "Format",
+    "Labels",
     "MovieInfo",
     "ParticleTable",
     "PointsReport",
@@ -43,6 +46,7 @@ __all__ = [
     "available_quantities",
     "is_volume",
     "kernel_sum",
+    "labels_of",
     "movie_info",
     "nearest_neighbour_supports",
     "particles_from_table",
@@ -52,12 +56,14 @@ __all__ = [
     "read_particles",
     "read_points",
     "read_table",
+    "read_transfer",
     "read_volume",
     "read_volume_table",
     "volume_from_table",
     "write_camera_path",
     "write_image",
     "write_movie",
+    "write_transfer",
     "write_volume",
 ]
 

@@ -22,6 +22,7 @@ import numpy as np
 from .damage import DataError
 from .datasets import read_dataset, read_positions
 from .table import ParticleTable, plain, time_of
+from .units import of_gadget
 
 SOURCE = "Gadget HDF5"
 SWIFT_SOURCE = "SWIFT HDF5"
@@ -80,8 +81,9 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     box_size = _box(header)
     if box_size is not None:
         said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
-    source, time = SWIFT_SOURCE if swift else SOURCE, time_of(header.get("Time", ()))
-    return ParticleTable(position, columns, support, None, box_size, source, conventions=tuple(said), time=time)
+    source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
+    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
+    return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from .damage import DataError
 from .datasets import numeric_datasets, read_dataset, read_positions
 from .table import ParticleTable, scalar_of_width_one, time_of
+from .units import of_phantom
 
 SOURCE = "Phantom HDF5"
 GAS = 1
@@ -66,8 +67,8 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
     volume, time = (h / hfact) ** 3, time_of(read_dataset(header["time"])) if "time" in header else None
-    said_and_when: dict[str, Any] = {"conventions": tuple(said), "time": time}
-    return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, volume, source=SOURCE, **said_and_when)
+    more: dict[str, Any] = {"conventions": tuple(said), "units": of_phantom(header, columns), "time": time}
+    return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, volume, source=SOURCE, **more)
 
 
 def _choose(kinds: np.ndarray, part_type: int | None) -> int:

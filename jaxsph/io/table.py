@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .damage import DataError
+from .units import NO_UNITS, FileUnits
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
@@ -42,6 +43,7 @@ class ParticleTable:
         source: name of the file format.
         path: the file, for messages; empty when the table was made in memory.
         conventions: sentences which say how supports and volumes were got, and what was left out.
+        units: of positions and columns, and the moment, as far as the file states them.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -57,6 +59,7 @@ class ParticleTable:
     source: str = "memory"
     path: str = ""
     conventions: tuple[str, ...] = ()
+    units: FileUnits = NO_UNITS
 
     def __post_init__(self) -> None:
         position = native(np.asarray(self.position))

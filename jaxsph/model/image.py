@@ -49,6 +49,8 @@ class Image:
 
     writer: ClassVar[Callable[[str | os.PathLike[str], Image], None]]
     """How images become files: given by `jaxsph.io`, which knows the formats."""
+    drawer: ClassVar[Callable[..., Any]]
+    """How images become figures: given by `jaxsph.image_figure`."""
 
     @property
     def alpha(self) -> Float[Array, "height width"]:
@@ -63,6 +65,10 @@ class Image:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`: `.exr` (all layers) or `.png` (colour over black). See `jaxsph.io.write_image`."""
         type(self).writer(path, self)
+
+    def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
+        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time. See `jaxsph.image_figure`."""
+        return type(self).drawer(self, scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""

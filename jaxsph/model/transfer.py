@@ -14,11 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.model.transfer_ways import TransferWays
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
 
 @dataclasses.dataclass(frozen=True)
-class TransferFunction:
+class TransferFunction(TransferWays):
     """Piecewise linear map of a quantity Q to colour and extinction, clamped at its ends.
 
     Two equal neighbours in `values` make a jump; the later point holds at the jump itself.

@@ -25,6 +25,7 @@ from jaxsph.scenes.dam_break import dam_break
 from jaxsph.scenes.flubber import flubber
 from jaxsph.scenes.letters import letters
 from jaxsph.scenes.mixer import mixer
+from jaxsph.scenes.presets import domain_transfer, fitted, preset
 from jaxsph.scenes.radial import radial
 
 __all__ = [
@@ -35,12 +36,15 @@ __all__ = [
     "dam_break",
     "default_transfer",
     "default_volume_transfer",
+    "domain_transfer",
     "fields",
+    "fitted",
     "flubber",
     "letters",
     "load",
     "mixer",
     "names",
+    "preset",
     "radial",
 ]
 

@@ -82,15 +82,35 @@ def default_volume_transfer(
     Raises:
         ValueError: as `default_transfer`.
     """
-    colors, steps = colormap(colormap_name), [max(1, points // MAX_COLUMNS) for points in volume.shape]
-    coarse = np.asarray(volume.values)[tuple(slice(None, None, step) for step in steps)].astype(np.float64)
-    low, high = _span(coarse, values, optical_depth)
+    colors = colormap(colormap_name)
+    low, high = _span(coarse(volume)[0], values, optical_depth)
     share = np.linspace(0, 1, len(colors))
-    shown = np.interp(coarse, low + (high - low) * share, share**STEEPNESS)
-    cell = np.asarray(volume.spacing, np.float64) * steps
-    columns = np.concatenate([(shown.sum(axis) * cell[axis]).ravel() for axis in range(3)])
-    depth = float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
+    depth = _columns_of_volume(volume, low + (high - low) * share, share**STEEPNESS)
     return TransferFunction.from_points(low + (high - low) * share, colors, optical_depth / depth * share**STEEPNESS)
+
+
+def typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
+    """Optical depth of typical columns of what has these extinctions at control values; 1 where there is nothing."""
+    if isinstance(shown, Volume):
+        return _columns_of_volume(shown, values, extinction)
+    valid = np.asarray(shown.valid)
+    quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantity, shown.support))
+    return _typical_column(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
+
+
+def coarse(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
+    """Some of the values of a volume, float64, and the distances between them along the axes."""
+    steps = [max(1, points // MAX_COLUMNS) for points in volume.shape]
+    values = np.asarray(volume.values)[tuple(slice(None, None, step) for step in steps)].astype(np.float64)
+    return values, np.asarray(volume.spacing, np.float64) * steps
+
+
+def _columns_of_volume(volume: Volume, values: np.ndarray, extinction: np.ndarray) -> float:
+    """See `typical_depth`."""
+    quantity, cell = coarse(volume)
+    shown = np.interp(quantity, values, extinction)
+    columns = np.concatenate([(shown.sum(axis) * cell[axis]).ravel() for axis in range(3)])
+    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
 
 
 def _span(quantity: np.ndarray, values: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
@@ -119,4 +139,4 @@ def _typical_column(position: np.ndarray, support: np.ndarray, extinction: np.nd
     mean = np.bincount(flat, sphere * extinction, int(shape.prod())) / np.where(covered > 0, covered, 1)
     cells = (mean * np.minimum(covered / cell**3, 1)).reshape(shape)
     columns = np.concatenate([cells.sum(axis).ravel() for axis in range(3)]) * cell
-    return float((columns**2).sum() / columns.sum())
+    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
