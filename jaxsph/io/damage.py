@@ -17,6 +17,10 @@ class DataError(ValueError):
     """A refusal whose message is already a sentence for the user: what is wrong, and what to do."""
 
 
+class NoParticlesError(DataError):
+    """A file, of several of a snapshot perhaps, has no particles of the type that is asked for."""
+
+
 @contextlib.contextmanager
 def explained(path: str | Path, source: str) -> Iterator[None]:
     """Re-raise every failure inside the block as a `ValueError` that begins with `path`.
@@ -33,7 +37,7 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
     except MemoryError as error:
         raise MemoryError(f"{path}: needs more memory than there is ({error})") from error
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise type(error)(f"{path}: {error}") from error
     except Exception as error:
         reason = " ".join(str(error).split()) or "no further reason given"
         raise ValueError(

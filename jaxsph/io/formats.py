@@ -7,16 +7,22 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.metadata
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from . import tipsy
 from .damage import DataError
 from .gadget_binary import looks_like
+from .snapshot_files import joined
 from .table import ParticleTable
 
 SNIFFED_BYTES = 1024
+READERS = "jaxsph.readers"
+"""The group of entry points by which packages bring formats of their own."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +32,8 @@ class Format:
     Attributes:
         name: what users call it.
         suffixes: file name endings, in lower case.
-        module: the module of this package with its `read`.
+        module: with its `read(path)`, or `read(path, part_type=...)` where `typed`, which gives a `ParticleTable`: of this
+            package, or a whole name with a dot in it.
         sniff: whether a file with these first bytes is of this format; `None` where content does not tell.
         typed: whether its `read` takes `part_type`.
     """
@@ -60,9 +67,29 @@ FORMATS = (
     Format("VTK XML", (".vtu", ".vtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
+    Format("Tipsy", (".tipsy", ".std", ".tip"), "tipsy", tipsy.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
     Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
 )  # fmt: skip
+
+
+def added_formats() -> tuple[Format, ...]:
+    """Formats that installed packages bring, as entry points `jaxsph.readers`; asked before those of this package.
+
+    One that cannot be loaded is left out with a `UserWarning` that names it.
+    """
+    found = []
+    for point in importlib.metadata.entry_points(group=READERS):
+        try:
+            form = point.load()
+        except Exception as error:
+            warnings.warn(f"reader {point.name!r} ({point.value}) cannot be loaded and is left out: {error}", stacklevel=2)
+            continue
+        if isinstance(form, Format):
+            found.append(form)
+        else:
+            warnings.warn(f"reader {point.name!r} ({point.value}) is no `jaxsph.io.Format` and is left out", stacklevel=2)
+    return tuple(found)
 
 
 def find_format(path: Path) -> Format:
@@ -78,8 +105,9 @@ def find_format(path: Path) -> Format:
         raise FileNotFoundError(f"{path}: there is no such file")
     with path.open("rb") as file:
         start = file.read(SNIFFED_BYTES)
-    by_content = next((form for form in FORMATS if form.sniff is not None and form.sniff(start)), None)
-    by_name = next((form for form in FORMATS if path.name.lower().endswith(form.suffixes)), None)
+    formats = (*added_formats(), *FORMATS)
+    by_content = next((form for form in formats if form.sniff is not None and form.sniff(start)), None)
+    by_name = next((form for form in formats if path.name.lower().endswith(form.suffixes)), None)
     found = by_content or by_name
     if found is None:
         raise DataError(
@@ -90,16 +118,17 @@ def find_format(path: Path) -> Format:
 
 def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
     """Read `path` as `form`; `ValueError` when a format without particle types is asked for one."""
-    reader: Any = importlib.import_module(f".{form.module}", __package__)
-    if form.typed:
-        table = reader.read(path, part_type=part_type)
-    elif part_type is not None:
+    if not form.typed and part_type is not None:
         raise DataError(f"{path}: {form.name} files have no particle types; leave out `part_type` (got {part_type})")
-    else:
-        table = reader.read(path)
-    return dataclasses.replace(table, path=str(path))
+    reader: Any = importlib.import_module(form.module if "." in form.module else f".{form.module}", __package__)
+
+    def read(file: Path, part_type: int | None) -> ParticleTable:
+        table: ParticleTable = reader.read(file, part_type=part_type) if form.typed else reader.read(file)
+        return table
+
+    return dataclasses.replace(joined(read(path, part_type), path, part_type, read), path=str(path))
 
 
 def known_suffixes() -> str:
     """All suffixes with their formats, for messages."""
-    return "; ".join(f"{' '.join(form.suffixes)} ({form.name})" for form in FORMATS)
+    return "; ".join(f"{' '.join(form.suffixes)} ({form.name})" for form in (*added_formats(), *FORMATS))

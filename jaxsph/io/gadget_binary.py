@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .damage import DataError, explained
+from .damage import DataError, NoParticlesError, explained
 from .gadget_hdf5 import PERIODIC_NOTE
 from .table import ParticleTable, time_of
 
@@ -59,8 +59,6 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if "mass" not in columns and header["mass"][chosen] > 0:
             columns["mass"] = np.full(counts[chosen], header["mass"][chosen])
             said.append(f"mass = {header['mass'][chosen]:g} for all (mass table in the header)")
-        if header["files"] > 1:
-            said.append(f"this is one of {header['files']} files of the snapshot; only its particles are read")
         support = columns.pop("HSML", None)
         if support is not None:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
@@ -69,6 +67,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if box_size:
             said.append(f"periodic box of {edge:g}: {PERIODIC_NOTE}")
         more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
+        more |= {"part_type": chosen, "num_files": max(int(header["files"]), 1)}
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
 
@@ -136,7 +135,7 @@ def _choose(counts: np.ndarray, part_type: int | None) -> int:
     if part_type is None:
         return present[0] if present else 0
     if part_type not in present:
-        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, present))}")
+        raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, present))}")
     return part_type
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .damage import DataError
+from .damage import DataError, NoParticlesError
 from .datasets import read_dataset, read_positions
 from .table import ParticleTable, plain, time_of
 from .units import of_gadget
@@ -70,9 +70,6 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         if mass:
             columns["Masses"] = np.full(count, mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
-    files = _num_files(header)
-    if files > 1:
-        said.append(f"this is one of {files} files of the snapshot; only its particles are read")
     smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
     support = None
     if smoothing is not None:
@@ -83,6 +80,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
+    more |= {"part_type": chosen, "num_files": max(_num_files(header), 1)}
     return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 
@@ -90,11 +88,11 @@ def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:
     found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
     usable = sorted(number for number, group in found.items() if "Coordinates" in group)
     if not usable:
-        raise DataError("has particle types, but none with Coordinates; write the snapshot again with positions")
+        raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
     if part_type is None:
         part_type = usable[0]
     if part_type not in usable:
-        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, usable))}")
+        raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, usable))}")
     return part_type, found[part_type]
 
 

@@ -44,6 +44,8 @@ class ParticleTable:
         path: the file, for messages; empty when the table was made in memory.
         conventions: sentences which say how supports and volumes were got, and what was left out.
         units: of positions and columns, and the moment, as far as the file states them.
+        part_type: number of the type of particles that was read, where the format has types.
+        num_files: how many files the snapshot has, of which this may be one.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -60,6 +62,8 @@ class ParticleTable:
     path: str = ""
     conventions: tuple[str, ...] = ()
     units: FileUnits = NO_UNITS
+    part_type: int | None = dataclasses.field(default=None, kw_only=True)
+    num_files: int = dataclasses.field(default=1, kw_only=True)
 
     def __post_init__(self) -> None:
         position = native(np.asarray(self.position))

@@ -5,6 +5,7 @@ Flow: cast -> [image] -> files, notebooks.
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import io
 import os
@@ -74,6 +75,40 @@ class Image:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""
         color = np.nan_to_num(np.asarray(self.color, np.float64), nan=0.0)
         return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+    def to_xarray(self) -> Any:
+        """All layers as an `xarray.Dataset` over `row`, `column` and, for colours, `channel`; metadata are its attributes.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError('`to_xarray` needs the library `xarray`: pip install "jaxsph[xarray]"') from error
+        plane = "row", "column"
+        layers: dict[str, Any] = {"color": ((*plane, "channel"), np.asarray(self.color), {"long_name": "premultiplied colour"})}
+        for name in ("transmittance", "depth", "error_bound", "evaluations"):
+            layers[name] = plane, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
+        noted = {str(name): value if isinstance(value, int | float | str) else str(value) for name, value in self.metadata}
+        attributes = {**noted, "certified": str(bool(self.certified)).lower(), "faults": int(self.faults)}
+        return xarray.Dataset(layers, coords={"channel": ["red", "green", "blue"]}, attrs=attributes)
+
+    def _repr_html_(self) -> str:
+        """The picture, and below it a line with size, time and error."""
+        height, width = self.shape
+        told = [f"{width} &times; {height}"]
+        seconds = self.stats.get("seconds")
+        if isinstance(seconds, dict):
+            told.append(f"{sum(float(value) for value in seconds.values()):.2g} s")
+        worst = float(np.max(np.nan_to_num(np.asarray(self.error_bound, np.float64)), initial=0))
+        if worst > 0:
+            told.append(f"error at most {worst:.2g}, {'certified' if bool(self.certified) else 'estimated'}")
+        if int(self.faults):
+            told.append(f"faults {int(self.faults)}")
+        picture = base64.b64encode(self._repr_png_()).decode()
+        shown = f'<img src="data:image/png;base64,{picture}" width="{width}" height="{height}" alt="rendered image">'
+        return f"<figure>{shown}<figcaption>{', '.join(told)}</figcaption></figure>"
 
     def _repr_png_(self) -> bytes:
         from PIL import Image as Pillow

@@ -1,0 +1,74 @@
+"""Snapshots in several files are read as one."""
+
+import h5py
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.io.snapshot_files import files_of
+
+
+def write(path, nth, total, gas, dark=2):
+    rng = np.random.default_rng(nth)
+    with h5py.File(path, "w") as file:
+        header = file.create_group("Header").attrs
+        header["NumFilesPerSnapshot"], header["Time"], header["BoxSize"] = total, 0.5, 1.0
+        for kind, count in ((0, gas), (1, dark)):
+            if count:
+                group = file.create_group(f"PartType{kind}")
+                group["Coordinates"] = rng.random((count, 3))
+                group["Masses"] = np.full(count, 1.0 + nth)
+                if kind == 0:
+                    group["Density"], group["SmoothingLength"] = rng.random(count) + 1, np.full(count, 0.1)
+
+
+def snapshot(folder, counts=(5, 0, 7)):
+    for nth, gas in enumerate(counts):
+        write(folder / f"snap_002.{nth}.hdf5", nth, len(counts), gas)
+    return [folder / f"snap_002.{nth}.hdf5" for nth in range(len(counts))]
+
+
+@pytest.mark.parametrize("given", range(3))
+def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, given):
+    table = js.io.read_table(snapshot(tmp_path)[given])
+    assert len(table) == 12 and table.part_type == 0
+    np.testing.assert_array_equal(table.columns["Masses"], [1.0] * 5 + [3.0] * 7)
+    assert "of 3 files" in " ".join(table.conventions)
+
+
+def test_a_type_can_be_asked_for_of_all_files(tmp_path):
+    assert len(js.io.read_table(snapshot(tmp_path)[0], part_type=1)) == 6
+
+
+def test_a_missing_file_is_named(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].unlink()
+    with pytest.raises(ValueError, match=r"one of 3 files.*beside it snap_002\.2\.hdf5 cannot be found"):
+        js.io.read_table(files[0])
+
+
+def test_a_half_written_file_among_many_is_named(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].write_bytes(files[2].read_bytes()[:600])
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: cannot be read"):
+        js.io.read_table(files[0])
+
+
+def test_columns_that_some_files_lack_are_named(tmp_path):
+    files = snapshot(tmp_path)
+    with h5py.File(files[2], "a") as file:
+        del file["PartType0/Density"]
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: Density"):
+        js.io.read_table(files[0])
+
+
+def test_a_name_without_its_number_is_read_alone_and_says_so(tmp_path):
+    write(tmp_path / "alone.hdf5", 0, 4, 5)
+    table = js.io.read_table(tmp_path / "alone.hdf5")
+    assert len(table) == 5 and "only its particles are read" in " ".join(table.conventions)
+
+
+def test_names_of_files_of_a_snapshot_keep_their_suffix(tmp_path):
+    assert [file.name for file in files_of(tmp_path / "snap.1", 2)] == ["snap.0", "snap.1"]
+    assert files_of(tmp_path / "snap.hdf5", 2) is None
+    assert files_of(tmp_path / "snap.7.hdf5", 2) is None
