@@ -106,7 +106,7 @@ def _integrated(extinction: np.ndarray, emission: np.ndarray, half_path: np.ndar
 
 
 class Look:
-    """A transfer function in float64, as a medium's nodes are looked up in it: by one quantity, or colour and extinction each by one.
+    """A transfer function in float64, as a medium's nodes are looked up in it: by one quantity, or colour and extinction apart.
 
     Light bends at control points of either. Extinction of two quantities is at most the largest there is, and colours at most 1.
     """
@@ -121,9 +121,7 @@ class Look:
             of_extinction = _Table(transfer.extinction_values, extinction, extinction, most)
             self._tables = [_Table(transfer.values, colors, most * colors, most), of_extinction]
 
-    def add(
-        self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray
-    ) -> None:
+    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
         """Add what portions number `which` show for their `quantities` (nodes, which) each; nothing where those are NaN."""
         there = ~np.isnan(quantities[0][0])
         which, given = which[there], [quantity[:, there] for quantity in quantities]
@@ -156,7 +154,7 @@ class _Table:
     def add(
         self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, path: np.ndarray
     ) -> list[np.ndarray]:
-        """Its channels for a `quantity` (nodes, which); what may lie unseen between nodes, and where it bends, is put into `seen`.
+        """Its channels for a `quantity` (nodes, which); what may lie unseen between nodes, and where light bends, go to `seen`.
 
         Args:
             path: of gaps between nodes.

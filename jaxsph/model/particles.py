@@ -238,5 +238,5 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
 
 
 jax.tree_util.register_dataclass(
-    Particles, data_fields=["position", "support", "quantity", "volume", "valid", "position_rest", "extinction_quantity"], meta_fields=["kernel"]
+    Particles, data_fields=[f.name for f in dataclasses.fields(Particles) if f.name != "kernel"], meta_fields=["kernel"]
 )

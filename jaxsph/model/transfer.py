@@ -222,6 +222,16 @@ def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Arra
     return segment, jnp.clip((quantity - start) * inverse, 0, 1)
 
 
+def slope_in_middle(
+    segments: Segments, near: Float[Array, "*any"], far: Float[Array, "*any"], channel: int
+) -> Float[Array, "*any"]:
+    """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
+    middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
+    slopes, place = jnp.clip(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
+    slope = _at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
+    return jnp.where(middle >= segments.start[0], slope, 0)
+
+
 def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
     """Of each of `rows`, the entry of the segment that holds `quantity`."""
     found = [row[0] for row in rows]
@@ -283,5 +293,5 @@ def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) 
     return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
 
 
-jax.tree_util.register_dataclass(Segments, data_fields=[f.name for f in dataclasses.fields(Segments)], meta_fields=[])
-jax.tree_util.register_dataclass(TransferFunction, data_fields=["values", "colors", "extinction", "extinction_values"], meta_fields=[])
+for _kind in (Segments, TransferFunction):
+    jax.tree_util.register_dataclass(_kind, data_fields=[f.name for f in dataclasses.fields(_kind)], meta_fields=[])
