@@ -60,7 +60,7 @@ class Frame:
     def full(self) -> SlabSchedule:
         """Every slab at full rate, of the shape that the pilot's has."""
         method = jnp.full(self.grid.windows.count.shape, DENSE, jnp.int32)
-        reference = jnp.broadcast_to(self.lattice.reference_quantity, method.shape)
+        reference = (jnp.broadcast_to(self.lattice.references[0], method.shape),)
         return dataclasses.replace(full_rate(self.grid.windows, reference), method=method)
 
     @property
@@ -106,7 +106,7 @@ def _judged(
     nodes, slab_samples = plan.control.nodes, plan.cast.slab_samples
     amid = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
     region = region_of(grid, *(plan.control.room or plan.lists.bundles), nodes)
-    lattice = sum_at_nodes(grid, camera, kernel, slab_samples, region, amid, plan.cast.tuning.cells_of_nodes)
+    lattice = sum_at_nodes(grid, camera, kernel, slab_samples, region, (amid,), plan.cast.tuning.cells_of_nodes)
     return lattice, interpolation_error(grid, lattice, camera, transfer, slab_samples)
 
 
@@ -169,7 +169,7 @@ def _compared(
     grid: Grid, lattice: Lattice, camera: js.Camera, slab: Array, bundle: Array, *, kernel: str, slab_samples: int
 ) -> dict[str, Array]:
     """Mean squares of errors of the quantity, its true range, and whether samples were taken out of or put into nothing."""
-    entries = full_rate(grid.windows, jnp.broadcast_to(lattice.reference_quantity, grid.windows.count.shape))
+    entries = full_rate(grid.windows, (jnp.broadcast_to(lattice.references[0], grid.windows.count.shape),))
     entry = jax.tree.map(lambda leaf: leaf[..., slab, bundle], entries)
     u, v = (rays.T for rays in grid.rays(camera, bundle))
     steps = grid.half_steps[2 * slab[:, None] * slab_samples + jnp.arange(2 * slab_samples + 1)]

@@ -129,7 +129,7 @@ def light_of_candidates(grid: Grid, beside: SlabWindows, scene: js.Scene, camera
     u, v = (rays.T for rays in grid.rays(camera, bundle))
     half = jnp.minimum(2 * CELL_SAMPLES * cell[:, None] + jnp.arange(2 * CELL_SAMPLES + 1), grid.half_steps.shape[0] - 1)
     depth = grid.half_steps[half]
-    schedule = full_rate(beside, reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity))
+    schedule = full_rate(beside, (reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity),))
     entry = jax.tree.map(lambda leaf: leaf[..., cell, bundle], schedule)
     border = 0.5 * (depth[:, 1:] + depth[:, :-1])
     task = SlabTask(entry, cell, bundle, u, v, depth[:, 1:-1], border, camera.is_perspective)
@@ -138,7 +138,7 @@ def light_of_candidates(grid: Grid, beside: SlabWindows, scene: js.Scene, camera
     slant = jnp.ones((at.shape[0], 1, 64), depth.dtype)
     if camera.is_perspective:
         slant = jnp.sqrt(1 + u[:, None, :] ** 2 + v[:, :, None] ** 2).reshape(-1, 1, 64)
-    segments, reference = scene.transfer.segments(), entry.reference_quantity[:, None, None]
+    segments, reference = scene.transfer.segments(), entry.references[0][:, None, None]
 
     def light_of(candidate: Candidate) -> Array:
         step = 1 << candidate.level

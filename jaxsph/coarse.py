@@ -234,7 +234,9 @@ def _merged_particles(particles: Particles, camera: Camera, nodes: _Nodes) -> Co
     weight = jnp.where(particles.valid, particles.volume, 0)
     centroid = _Centroid.of(particles, nodes, weight)
     support = nodes.max(jnp.linalg.norm(centroid.offset, axis=1) + particles.support)
-    new = {"support": support, "volume": nodes.sum(weight), "quantity": nodes.mean(particles.quantity, weight)}
+    new = {"support": support, "volume": nodes.sum(weight)}
+    names = [name for name in particles.columns if name.endswith("quantity")]
+    new |= {name: nodes.mean(getattr(particles, name), weight) for name in names}
     merged: dict[str, Any] = {name: nodes.put(value, getattr(particles, name)) for name, value in new.items()}
     moved = _moved(particles, nodes, centroid.shift)
     return Coarsened(dataclasses.replace(particles, **moved, **merged, valid=particles.valid & ~nodes.gone), nodes.merged, None)

@@ -55,11 +55,11 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     scene.check()
     if scene.media:
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
-    numerator, denominator, evaluations = field(scene, camera, settings.samples, cull=cull, every=every)
+    numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
-    quantity = np.where(inside, numerator / np.where(inside, denominator, 1), 0)
+    quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
     edges, lengths = _depth(camera, np.arange(settings.samples + 1), settings.samples), _ray_lengths(camera, every)
-    parts = [] if scene.transfer is None else [_in_medium(quantity, inside, scene.transfer, edges, lengths)]
+    parts = [] if scene.transfer is None else [_in_medium(quantities, inside, scene.transfer, edges, lengths)]
     for volume, look in scene.volumes:
         parts.append(_in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths))
     parts += [_of_points(points, camera, every, edges) for points in scene.point_sets]
@@ -83,37 +83,46 @@ def field(
     """Sums of the CSPH field at every sample, of all pixels or of `every` so many as in `render`.
 
     Returns:
-        `sum q_j V_j W_j`, `sum V_j W_j` (each up to one common factor) and the number of particles evaluated, all
-        (height, width, samples).
+        `sum q_j V_j W_j` (of two quantities, the first), `sum V_j W_j` (each up to one common factor) and the number of particles
+        evaluated, all (height, width, samples).
     """
+    (numerator, *_), denominator, evaluations = _fields(scene, camera, samples, cull, every)
+    return numerator, denominator, evaluations
+
+
+def _fields(
+    scene: Scene, camera: Camera, samples: int, cull: bool, every: int
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """The same of all quantities."""
     u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
     kernel = kernels.by_name(scene.particle_set.kernel)
-    position, support, quantity, volume = _particles(scene, camera)
+    position, support, quantities, volume = _particles(scene, camera)
     strength = volume / support**3
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
     shape = (len(v), len(u), samples)
-    numerator, denominator, evaluations = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int32)
-    for (x, y, z), h, q, m in zip(position, support, quantity, strength, strict=True):
+    numerators, denominator, evaluations = [np.zeros(shape) for _ in quantities], np.zeros(shape), np.zeros(shape, np.int32)
+    for (x, y, z), h, m, *carried in zip(position, support, strength, *quantities, strict=True):
         rows, columns, depths = _box(x, y, z, h, u, v, s, camera.is_perspective) if cull else (slice(None),) * 3
         dx = (spread[depths] * u[columns, None] - x) / h
         dy = (spread[depths] * v[rows, None] - y) / h
         dz = (s[depths] - z) / h
         weight = m * kernel.of_square(dx[None] ** 2 + dy[:, None] ** 2 + dz**2, np)
-        numerator[rows, columns, depths] += q * weight
+        for numerator, q in zip(numerators, carried, strict=True):
+            numerator[rows, columns, depths] += q * weight
         denominator[rows, columns, depths] += weight
         evaluations[rows, columns, depths] += 1
-    return numerator, denominator, evaluations
+    return numerators, denominator, evaluations
 
 
-def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, ...]:
+def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
     particles = scene.particle_set
     valid = np.asarray(particles.valid)
-    arrays = (particles.exact_position(), particles.support, particles.quantity, particles.volume)
-    position, support, quantity, volume = (np.asarray(a, np.float64)[valid] for a in arrays)
+    arrays = (particles.exact_position(), particles.support, particles.volume, *particles.quantities)
+    position, support, volume, *quantities = (np.asarray(a, np.float64)[valid] for a in arrays)
     view = (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    return view, support, quantity, volume
+    return view, support, quantities, volume
 
 
 def _ray_coordinates(camera: Camera, every: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +160,7 @@ def _box(
     return rows, columns, slice(first, last)
 
 
-def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[list[np.ndarray], np.ndarray]:
     """The trilinear quantity at every sample, and whether it is inside the grid; (height, width, samples) each."""
     u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
@@ -168,14 +177,14 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
     for corner in np.ndindex(2, 2, 2):
         share = np.where(corner, part, 1 - part).prod(-1)
         quantity += share * values[tuple(np.moveaxis(whole + corner, -1, 0))]
-    return quantity, inside
+    return [quantity], inside
 
 
 def _in_medium(
-    quantity: np.ndarray, inside: np.ndarray, transfer: TransferFunction, edges: np.ndarray, lengths: np.ndarray
+    quantities: list[np.ndarray], inside: np.ndarray, transfer: TransferFunction, edges: np.ndarray, lengths: np.ndarray
 ) -> Part:
     def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
-        color, extinction = _look_up(transfer, quantity[..., i])
+        color, extinction = _look_up(transfer, [quantity[..., i] for quantity in quantities])
         own = np.where(inside[..., i], extinction, 0) * (edges[i + 1] - edges[i]) * lengths
         return own, own[..., None] * color
 
@@ -209,13 +218,20 @@ def _composite(parts: list[Part], edges: np.ndarray, shape: tuple[int, ...], mix
     return color, transmittance, depth
 
 
-def _look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    values: Any = np.asarray(transfer.values, np.float64)
-    table = np.concatenate([np.asarray(transfer.colors, np.float64), np.asarray(transfer.extinction, np.float64)[:, None]], 1)
+def _look_up(transfer: TransferFunction, quantities: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Colour by the first quantity, extinction by the last."""
+    of_extinction = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+    colors = _interpolated(transfer.values, transfer.colors, quantities[0])
+    return colors, _interpolated(of_extinction, transfer.extinction[:, None], quantities[-1])[..., 0]
+
+
+def _interpolated(points: Any, given: Any, quantity: np.ndarray) -> np.ndarray:
+    """A table (points, channels), piecewise linear between its control points; at a jump, the later of them."""
+    values, table = np.asarray(points, np.float64), np.asarray(given, np.float64)
     right = np.clip(np.searchsorted(values, quantity, "right"), min(1, len(values) - 1), len(values) - 1)
     left = np.maximum(right - 1, 0)
     width = values[right] - values[left]
     jump = (quantity >= values[left]).astype(float)
     where = np.where(width > 0, np.clip((quantity - values[left]) / np.where(width > 0, width, 1), 0, 1), jump)[..., None]
-    result = table[left] * (1 - where) + table[right] * where
-    return result[..., :3], result[..., 3]
+    result: np.ndarray = table[left] * (1 - where) + table[right] * where
+    return result

@@ -9,6 +9,7 @@ second of them says how good that is.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -105,44 +106,72 @@ def _integrated(extinction: np.ndarray, emission: np.ndarray, half_path: np.ndar
 
 
 class Look:
-    """A transfer function in float64, as a medium's nodes are looked up in it.
+    """A transfer function in float64, as a medium's nodes are looked up in it: by one quantity, or colour and extinction apart.
+
+    Light bends at control points of either. Extinction of two quantities is at most the largest there is, and colours at most 1.
+    """
+
+    def __init__(self, transfer: TransferFunction):
+        colors, extinction = np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinction, np.float64)[None]
+        most = float(extinction.max())
+        if transfer.extinction_values is None:
+            table, light = np.concatenate([colors, extinction]), np.concatenate([extinction, colors * extinction])
+            self._tables = [_Table(transfer.values, table, light, most)]
+        else:
+            of_extinction = _Table(transfer.extinction_values, extinction, extinction, most)
+            self._tables = [_Table(transfer.values, colors, most * colors, most), of_extinction]
+
+    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
+        """Add what portions number `which` show for their `quantities` (nodes, which) each; nothing where those are NaN."""
+        there = ~np.isnan(quantities[0][0])
+        which, given = which[there], [quantity[:, there] for quantity in quantities]
+        half = (portions.end[which] - portions.start[which]) / 2
+        path = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
+        looks = zip(self._tables, given if len(given) == len(self._tables) else given * len(self._tables), strict=True)
+        channels = [channel for table, quantity in looks for channel in table.add(seen, which, quantity, portions, path)]
+        red, green, blue, extinction = channels
+        seen.extinction[:, which] += extinction
+        seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
+
+
+class _Table:
+    """Some channels of a transfer function, by one quantity.
 
     At a jump the end of a portion is on the side that the portion is on, so that a portion that ends there is as smooth as any.
     """
 
-    def __init__(self, transfer: TransferFunction):
-        values = np.asarray(transfer.values, np.float64)
-        table = np.concatenate([np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinction, np.float64)[None]])
+    def __init__(self, points: Any, table: np.ndarray, light: np.ndarray, most: float):
+        values = np.asarray(points, np.float64)
         width = np.append(np.diff(values), 0)
         inverse = np.divide(1, width, out=np.zeros_like(width), where=width > 0)
-        change = np.append(np.diff(table), np.zeros((4, 1)), 1)
-        self._values, self._most = values, table[3].max()
+        change = np.append(np.diff(table), np.zeros((len(table), 1)), 1)
+        self._values, self._most = values, most
         self._start, self._inverse = np.append(values[:1], values), np.append(0, inverse)
-        self._base, self._change = np.append(table[:, :1], table, 1), np.append(np.zeros((4, 1)), change, 1)
+        self._base, self._change = np.append(table[:, :1], table, 1), np.append(0 * table[:, :1], change, 1)
         self._rank = np.append(0, np.cumsum(np.append(True, width[:-1] > 0)))  # distinct control values up to each
-        light = np.concatenate([table[3:], table[:3] * table[3]])
         self._jump, self._turn, self._bend = _bends(light, width)
 
-    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, slant: np.ndarray) -> None:
-        """Add what portions number `which` show for their `quantity` (nodes, which); nothing where that is NaN."""
-        there = ~np.isnan(quantity[0])
-        which, quantity = which[there], quantity[:, there]
+    def add(
+        self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, path: np.ndarray
+    ) -> list[np.ndarray]:
+        """Its channels for a `quantity` (nodes, which); what may lie unseen between nodes, and where light bends, go to `seen`.
+
+        Args:
+            path: of gaps between nodes.
+        """
         inwards = quantity.copy()
         inwards[0] += NUDGE * (quantity[1] - quantity[0])
         inwards[-1] += NUDGE * (quantity[-2] - quantity[-1])
         segment = np.searchsorted(self._values, inwards, "right")
         part = np.clip((quantity - self._start[segment]) * self._inverse[segment], 0, 1)
-        pairs = zip(self._base, self._change, strict=True)
-        red, green, blue, extinction = (base[segment] + part * change[segment] for base, change in pairs)
-        seen.extinction[:, which] += extinction
-        seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
-        half = (portions.end[which] - portions.start[which]) / 2
-        upper, path = np.maximum(segment[1:], segment[:-1]), np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
+        upper = np.maximum(segment[1:], segment[:-1])
         bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
         skips = (np.abs(np.diff(self._rank[segment], axis=0)) > 1) | self._hidden(quantity, segment)
         unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
         seen.doubt[which] += np.minimum(unseen.sum(0), 1)
         self._cross(seen, which, quantity, segment, portions)
+        pairs = zip(self._base, self._change, strict=True)
+        return [base[segment] + part * change[segment] for base, change in pairs]
 
     def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
         """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
@@ -169,11 +198,11 @@ class Look:
 
 
 def _bends(light: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How much light (4, points) jumps at control points, how much its slope changes, and both by the lesser width beside.
+    """How much light (channels, points) jumps at control points, how much its slope changes, and both by the lesser width beside.
 
     Entry k is of point k - 1, as segments are numbered; a jump's is with its later point.
     """
-    none = np.zeros((4, 1))
+    none = np.zeros((len(light), 1))
     rise = np.diff(light)
     slope = np.divide(rise, width[:-1], out=np.zeros_like(rise), where=width[:-1] > 0)
     before, after = np.append(0, width[:-1]), width

@@ -81,8 +81,8 @@ class AllParticles(Whole):
 
     def __init__(self, particles: Particles, transfer: TransferFunction, camera: Camera):
         there = np.asarray(particles.valid) & (np.asarray(particles.volume) > 0)
-        columns = particles.support, particles.quantity, particles.volume
-        self.support, self.quantity, volume = (np.asarray(column, np.float64)[there] for column in columns)
+        columns = particles.support, particles.volume, *particles.quantities
+        self.support, volume, *self.quantities = (np.asarray(column, np.float64)[there] for column in columns)
         center = to_view(particles.exact_position()[there], camera)
         strength = volume / self.support**3
         self.strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
@@ -101,7 +101,8 @@ class ParticlesMet(Part):
         self._whole, self._rays = whole, rays
         self.chords = whole.spheres.chords(rays)
         self._scale = rays.slant[self.chords.ray] / whole.support[self.chords.sphere]
-        self._strength, self._quantity = whole.strength[self.chords.sphere], whole.quantity[self.chords.sphere]
+        self._strength = whole.strength[self.chords.sphere]
+        self._quantities = [quantity[self.chords.sphere] for quantity in whole.quantities]
 
     def cuts(self) -> Cuts:
         """See `Part`."""
@@ -121,13 +122,13 @@ class ParticlesMet(Part):
         count = self._lists.length[portions.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
-        quantity = np.empty((NODES, len(which)))
+        means = np.empty((len(self._quantities), NODES, len(which)))
         for some in self._lists.batches(portions.root[which]):
-            quantity[:, some] = self._mean(portions.some(which[some]))
-        self._whole.look.add(seen, which, _filled(quantity), portions, self._rays.slant)
+            means[:, :, some] = self._means(portions.some(which[some]))
+        self._whole.look.add(seen, which, [_filled(quantity) for quantity in means], portions, self._rays.slant)
 
-    def _mean(self, portions: Portions) -> np.ndarray:
-        """Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs.
+    def _means(self, portions: Portions) -> list[np.ndarray]:
+        """All Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs.
 
         With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
         """
@@ -141,11 +142,12 @@ class ParticlesMet(Part):
         into, left = (at - self.chords.entry[chord]) * scale, (self.chords.exit[chord] - at) * scale
         inside = np.clip((into + along) * (left - along), 0, 1)
         weight = self._strength[chord] * self._whole.kernel.of_square(1 - inside, np)
-        base = self._quantity[chord[first]]
-        rest = self._quantity[chord] - base[which]
-        total = np.add.reduceat(weight, first, axis=1)
-        moved = np.add.reduceat(weight * rest, first, axis=1)
-        return base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0)
+        total, found = np.add.reduceat(weight, first, axis=1), []
+        for quantity in self._quantities:
+            base = quantity[chord[first]]
+            moved = np.add.reduceat(weight * (quantity[chord] - base[which]), first, axis=1)
+            found.append(base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0))
+        return found
 
     def border_by(self, portions: Portions) -> np.ndarray:
         """See `Part`."""
@@ -227,7 +229,7 @@ class VolumeMet(Part):
         for corner in np.ndindex(2, 2, 2):
             share = np.where(corner, part, 1 - part).prod(-1)
             quantity += share * self._whole.values[tuple((cell + corner).T)]
-        self._whole.look.add(seen, which, quantity, portions, self._rays.slant)
+        self._whole.look.add(seen, which, [quantity], portions, self._rays.slant)
 
     def _at(self, ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
         return self._start[ray] + depth[..., None] * self._direction[ray]

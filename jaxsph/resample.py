@@ -30,7 +30,7 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
     r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid (host side, float64 sums).
 
     Args:
-        particles: whose quantity is resampled.
+        particles: whose quantity is resampled; of two, that of colours.
         lower: (3,) position of the point (0, 0, 0), length units.
         spacing: between neighbouring points, length units: a number, or (3,); > 0.
         shape: points along x, y and z, at least 2 each.

@@ -191,11 +191,11 @@ def sum_shard(
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
     slab_samples, room = cast.slab_samples, control.room or lists.bundles
     wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
-    reference = jnp.clip(grid.ordered.quantity[jnp.argmax(grid.ordered.live)], transfer.values[0], transfer.values[-1])
-    reference = reference.astype(grid.half_steps.dtype)
+    seen = jnp.argmax(grid.ordered.live)
+    references = _among(transfer, [quantity[seen] for quantity in grid.ordered.quantities], grid.half_steps.dtype)
     region = region_of(grid, *room, control.nodes)
     of_shard = shard_of_grid(grid, nth, shards)
-    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, reference, tuning.cells_of_nodes, wanted)
+    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, references, tuning.cells_of_nodes, wanted)
 
 
 @stage(quickly=True)
@@ -264,7 +264,7 @@ def decide_by_pilot(
     schedule, full = _at_full_rate(grid, transfer, cast)
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
-    schedule, bound = pilot(grid, lattice, found, camera, schedule.reference_quantity, limits.tolerance, cast.slab_samples)
+    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples)
     return Decided(schedule, Verdict(bound, full, None))
 
 
@@ -287,8 +287,8 @@ def decide_by_bounds(
     dtype, grid = grid.half_steps.dtype, shard_of_grid(grid, nth, shards)
     schedule, full = _at_full_rate(grid, transfer, cast)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
-    reference = schedule.reference_quantity
-    schedule, bound, levels = adapt(grid, camera, transfer, reference, wanted, *limits, cast.slab_samples, control, tuning)
+    references = schedule.references
+    schedule, bound, levels = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
     return Decided(schedule, Verdict(bound, full, levels))
 
 
@@ -296,11 +296,17 @@ def _at_full_rate(
     grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """The schedule of the reference image, and its evaluations."""
-    reference = reference_quantities(grid.windows, grid.lists.rank, grid.ordered.quantity)
-    if transfer is not None:  # a reference far beyond what is shown would cost the digits of what is
-        reference = jnp.clip(reference, transfer.values[0], transfer.values[-1])
-    schedule = full_rate(grid.windows, reference)
+    references = [reference_quantities(grid.windows, grid.lists.rank, one) for one in grid.ordered.quantities]
+    schedule = full_rate(grid.windows, _among(transfer, references))
     return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
+
+
+def _among(transfer: TransferFunction | None, references: list[Array], dtype: Any = None) -> tuple[Array, ...]:
+    """References among the control points: one far beyond what is shown would cost the digits of what is."""
+    if transfer is not None:
+        parts = zip(references, transfer.parts(), strict=True)
+        references = [jnp.clip(reference, part.values[0], part.values[-1]) for reference, part in parts]
+    return tuple(reference if dtype is None else reference.astype(dtype) for reference in references)
 
 
 class Cast(NamedTuple):

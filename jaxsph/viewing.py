@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.quantities import rescaled, too_small
+from jaxsph.access.quantities import in_units_of, too_small
 from jaxsph.access.resolution import too_fine
 from jaxsph.access.view import Viewed, view_particles
 from jaxsph.field.points import PointsMedium
@@ -54,8 +54,7 @@ def view_scene(
     dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     if transfer is not None:
-        quantity, transfer = rescaled(particles.quantity.astype(dtype), transfer)
-        particles = dataclasses.replace(particles, quantity=quantity)
+        particles, transfer = in_units_of(particles, transfer)
     depths = sphere_depths(camera, dtype, samples, between_samples)
     viewed = view_particles(particles, camera, depths, num_classes)
     media = _media(scene, camera)
@@ -100,6 +99,8 @@ def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
 
 def _shows(transfer: TransferFunction) -> Bool[Array, ""]:
     """Whether a transfer function is usable."""
-    shown = (transfer.values[1:] >= transfer.values[:-1]).all() & jnp.isfinite(transfer.values).all()
-    shown &= ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
-    return shown & ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all() & ~too_small(transfer.values)
+    shown = ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
+    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all()
+    for part in transfer.parts():
+        shown &= (part.values[1:] >= part.values[:-1]).all() & jnp.isfinite(part.values).all() & ~too_small(part.values)
+    return shown

@@ -198,7 +198,7 @@ def grid_of(particles, camera, *, plan):
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
     sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
     grid = make_grid(ordered, camera, 0, **sizes).of(ordered)
-    return grid, reference_quantities(grid.windows, grid.lists.rank, ordered.quantity)
+    return grid, tuple(reference_quantities(grid.windows, grid.lists.rank, quantity) for quantity in ordered.quantities)
 
 
 @pytest.fixture(scope="session")

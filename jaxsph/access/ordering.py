@@ -49,7 +49,7 @@ def rank_particles(viewed: Viewed, camera: Camera, depths: Float[Array, " sample
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, which `KEY_MARGIN` covers.
 
     Differentiation:
-        The columns x, y, z, scale, size and quantity have derivatives; all else is held fixed.
+        The columns x, y, z, scale, size and quantities have derivatives; all else is held fixed.
     """
     return in_order(viewed, *_sort_by(viewed.key), camera, depths, slab_samples)
 
@@ -63,7 +63,8 @@ def in_order(
     slab_samples: int,
 ) -> Ordered:
     """The same, given the sorted keys and the order that sorts them."""
-    ranked = {name: getattr(viewed, name)[order] for name in COLUMNS}
+    columns = {name: getattr(viewed, name) for name in COLUMNS}
+    ranked = {name: column[order] for name, column in columns.items() if column is not None}
     begin, end = _windows(key, viewed.widest, camera, depths, slab_samples)
     windows = {"first_rank": begin[0], "last_rank": end[0], "first_beside": begin[1], "last_beside": end[1]}
     return Ordered(**ranked, **windows, index=order)

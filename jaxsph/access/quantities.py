@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxsph.model.particles import Particles
 from jaxsph.model.transfer import MIN_NORMALS, TransferFunction
+from jaxsph.model.transfer_joined import joined
 from jaxsph.numerics import exponents
 
 MAX_QUANTITY = (
@@ -25,14 +27,29 @@ MAX_QUANTITY = (
 )  # in units of the largest control point: quantities beyond it are clipped to it, as a mean that holds one is
 
 
+def in_units_of(particles: Particles, transfer: TransferFunction) -> tuple[Particles, TransferFunction]:
+    """Both in units of the control points, of each of two quantities in those of its own.
+
+    Of particles that carry one quantity the transfer function then has one set of control points.
+    """
+    if particles.extinction_quantity is None or transfer.extinction_values is None:
+        transfer = joined(transfer)
+        quantity, values = rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values)
+        return dataclasses.replace(particles, quantity=quantity), dataclasses.replace(transfer, values=values)
+    first, second = (quantity.astype(transfer.values.dtype) for quantity in particles.quantities)
+    quantity, values = rescaled(first, transfer.values)
+    other, extinction_values = rescaled(second, transfer.extinction_values)
+    particles = dataclasses.replace(particles, quantity=quantity, extinction_quantity=other)
+    return particles, dataclasses.replace(transfer, values=values, extinction_values=extinction_values)
+
+
 def rescaled(
-    quantity: Float[Array, " particles"], transfer: TransferFunction
-) -> tuple[Float[Array, " particles"], TransferFunction]:
-    """`quantity` and the control points of `transfer`, both in the same units, in which the largest control point is about 1.
+    quantity: Float[Array, " particles"], values: Float[Array, " points"]
+) -> tuple[Float[Array, " particles"], Float[Array, " points"]]:
+    """A quantity and control points, both in the same units, in which the largest control point is about 1.
 
     Differentiation: the units are constants.
     """
-    values = transfer.values
     largest = jnp.abs(values).max()
     unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
     unit = lax.stop_gradient(jnp.where(largest > 0, jnp.maximum(unit, jnp.finfo(unit.dtype).tiny), 1))
@@ -41,7 +58,7 @@ def rescaled(
     first, last = values[0], values[-1]
     narrow = (first * last > 0) & (last - first <= jnp.minimum(jnp.abs(first), jnp.abs(last)))
     least = lax.stop_gradient(jnp.where(narrow, first, 0))
-    return quantity - least, dataclasses.replace(transfer, values=values - least)
+    return quantity - least, values - least
 
 
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:

@@ -8,6 +8,7 @@ All that is asked of a single particle, whatever the others are: capacities are 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -34,10 +35,11 @@ class Columns:
         reach: the support widened by the rounding of coordinates: what lies outside has weight zero in floating point.
         scale, size: the particle's strength m = V / H^3, of which the largest is 2^LIFT, folded into its lengths:
             `size = m^(1/n)` and `scale = size / H`, with n the degree of its kernel.
-        quantity: that is carried.
+        quantity: that is carried; of two, that of colours.
         live: whether any sample can meet the particle.
         left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
             `left > right` or `top > bottom`.
+        extinction_quantity: the second that is carried; None where there is one alone.
     """
 
     x: Float[Array, " particles"]
@@ -52,6 +54,12 @@ class Columns:
     right: Int[Array, " particles"]
     top: Int[Array, " particles"]
     bottom: Int[Array, " particles"]
+    extinction_quantity: Float[Array, " particles"] | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def quantities(self) -> tuple[Float[Array, " particles"], ...]:
+        """One or two."""
+        return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,12 +81,12 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
     """See `particles` from `camera`, with samples at `depths` (ascending).
 
     Differentiation:
-        The columns x, y, z, scale, size and quantity have derivatives; all else is held fixed.
+        The columns x, y, z, scale, size and quantities have derivatives; all else is held fixed.
     """
     offset = camera.offset(particles.position, particles.position_rest)
     view = camera.rotate(offset)
     x, y, z = view[:, 0], view[:, 1], view[:, 2]
-    finite = jnp.isfinite(view).all(1) & jnp.isfinite(particles.quantity)
+    finite = functools.reduce(jnp.logical_and, map(jnp.isfinite, particles.quantities), jnp.isfinite(view).all(1))
     usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
     usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
     eps = jnp.finfo(view.dtype).eps * ROUNDING
@@ -88,7 +96,8 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
 
     octave, widest = _classes(reach, live, num_classes)
     scale, size, vanishes = _folded(particles, live)
-    columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size, "quantity": particles.quantity}
+    columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size}
+    columns |= dict(zip(("quantity", "extinction_quantity"), particles.quantities, strict=False))
     columns = {name: jnp.where(live, column, 0) for name, column in columns.items()}
     blurred = unresolved(view, distance, particles.support, camera, depths)
     word = faults.raised(faults.BAD_PARTICLES, particles.valid & ~usable)

@@ -108,7 +108,8 @@ def cast(
         NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
             elsewhere; when differentiated twice; and in reverse mode, of integrators that are `forward_only`.
     """
-    columns = {name: getattr(grid.ordered, name) for name in COLUMNS}
+    given = {name: getattr(grid.ordered, name) for name in COLUMNS}
+    columns = {name: column for name, column in given.items() if column is not None}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
     fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance))
     return _cast(method, inputs, fixed)
@@ -141,8 +142,8 @@ def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted:
     media = tuple(medium.in_band(grid).for_means() if between else medium.in_band(grid) for medium in inputs.media)
     if inputs.transfer is None:
         return media
-    segments = inputs.transfer.segments()
-    tables = MeanTables.of(segments) if between else None
+    segments = tuple(part.segments() for part in inputs.transfer.parts())
+    tables = tuple(map(MeanTables.of, segments)) if between else None
     return ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), *media
 
 
@@ -246,7 +247,8 @@ def _pull(
     columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, of_media
     if inputs.transfer is not None:
         particles, *others = of_media
-        columns, transfer = particles.columns(), particles.of_transfer()
+        found_columns, transfer = particles.columns(), particles.of_transfer()
+        columns = {name: found_columns[name] for name in columns}
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)

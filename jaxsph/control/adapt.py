@@ -17,7 +17,7 @@ from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_schedule, evaluations_of_levels, merged_levels, uncoarsened
 from jaxsph.control.probe import Probe, probe
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import tables_of_parts
 from jaxsph.field.schedule import SlabSchedule
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
@@ -54,14 +54,14 @@ def screen_cells(
 ) -> Probe:
     """Which cells are worth an analysis, of a band or of a shard of it."""
     lateral = 1 - relax if plan.allocation == "paper" else 0.0
-    return probe(grid, range_tables(transfer), tolerance, lateral, slab_samples, tuning.cells_probed)
+    return probe(grid, tables_of_parts(transfer), tolerance, lateral, slab_samples, tuning.cells_probed)
 
 
 def adapt(
     grid: Grid,
     camera: Camera,
     transfer: TransferFunction,
-    reference_quantity: Float[Array, "slabs bundles"],
+    references: tuple[Float[Array, "slabs bundles"], ...],
     wanted: Bool[Array, "cells bundles"],
     tolerance: Float[Array, ""],
     relax: Float[Array, ""],
@@ -84,7 +84,7 @@ def adapt(
     cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
-    tables = range_tables(transfer)
+    tables = tables_of_parts(transfer)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 
@@ -98,17 +98,17 @@ def adapt(
         offer = Offer(saving, on_offer & ~empty & whole, rounding)
         beside = slab_windows_with_borders(grid.ordered, grid.lists)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
-        analysis = analyse(grid, beside, camera, reference_quantity, wanted, tables, relax, *sizes)
+        analysis = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
         free = _nowhere(beside, num_cells, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
         largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
         paint = analysis.paint if plan.super_pixels else None
-        return coarse_schedule(windows, final, reference_quantity, paint, slab_samples), largest, final
+        return coarse_schedule(windows, final, references, paint, slab_samples), largest, final
 
     def leave() -> tuple[SlabSchedule, Array, Array]:
         return (
-            uncoarsened(cells, reference_quantity, plan.super_pixels),
+            uncoarsened(cells, references, plan.super_pixels),
             jnp.zeros(bundles, dtype),
             untouched(cells, slab_samples),
         )

@@ -46,9 +46,9 @@ def analyse(
     grid: Grid,
     beside: SlabWindows,
     camera: Camera,
-    reference_quantity: Float[Array, "slabs bundles"],
+    references: tuple[Float[Array, "slabs bundles"], ...],
     wanted: Bool[Array, "cells bundles"],
-    tables: RangeTables,
+    tables: tuple[RangeTables, ...],
     relax: Float[Array, ""],
     slab_samples: int,
     coverage_subdivisions: int,
@@ -58,8 +58,8 @@ def analyse(
 
     Args:
         beside: windows of the slabs with their borders, as coarse samples lie on those.
-        reference_quantity: quantity that each slab's sums are taken relative to.
-        tables: of the transfer function.
+        references: quantities that each slab's sums are taken relative to.
+        tables: of the parts of the transfer function.
         relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
         slab_samples: samples of each slab of the grid's cells.
         coverage_subdivisions: sub-rectangles on each side of a footprint, for the test of coverage.
@@ -67,7 +67,7 @@ def analyse(
     slabs, bundles = grid.windows.count.shape
     num_cells = -(-slabs * slab_samples // CELL_SAMPLES)
     chunk = min(cells_at_once, -(-num_cells * bundles // 16) * 16)
-    band = _band(grid, beside, camera, reference_quantity, tables, slab_samples)
+    band = _band(grid, beside, camera, references, tables, slab_samples)
     order, number = fullest_first(wanted.ravel(), band.fullest.ravel(), chunk)
 
     def analyse_chunk(step: Array, table: Array) -> Array:
@@ -93,22 +93,22 @@ class _Band:
     Attributes:
         begin, length: windows of slabs with their borders.
         count, fullest: particles of a cell's slabs in all, and of the fullest.
-        filled, reference_quantity: of slabs.
-        quantities: least and greatest of all particles.
+        filled, references: of slabs.
+        quantities: least and greatest of all particles, of each quantity.
         borders: of samples.
     """
 
     grid: Grid
     camera: Camera
     balls: Spheres
-    tables: RangeTables
+    tables: tuple[RangeTables, ...]
     begin: Int[Array, "classes slabs bundles"]
     length: Int[Array, "classes slabs bundles"]
     count: Int[Array, "cells bundles"]
     fullest: Int[Array, "cells bundles"]
     filled: Bool[Array, "slabs bundles"]
-    reference_quantity: Float[Array, "slabs bundles"]
-    quantities: tuple[Array, Array]
+    references: tuple[Float[Array, "slabs bundles"], ...]
+    quantities: list[tuple[Array, Array]]
     borders: Float[Array, " samples_and_one"]
     slab_samples: int
 
@@ -139,9 +139,9 @@ class _Band:
         window = self.begin[:, slab, across], jnp.where(alive, self.length[:, slab, across], 0)
         edges = self.borders[slab * self.slab_samples + jnp.arange(self.slab_samples + 1, dtype=jnp.int32)[:, None]]
         footprint = Footprint(jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell))
-        of_slabs = (value[slab, across].reshape(per_cell, -1) for value in (self.reference_quantity, self.filled))
-        references = _extremes(*of_slabs)
-        references = jnp.tile(references[0], per_cell), jnp.tile(references[1], per_cell)
+        filled, *of_slabs = (value[slab, across].reshape(per_cell, -1) for value in (self.filled, *self.references))
+        ends = [_extremes(one, filled) for one in of_slabs]
+        references = tuple((jnp.tile(least, per_cell), jnp.tile(greatest, per_cell)) for least, greatest in ends)
         look = functools.partial(sample_bounds, perspective=self.camera.is_perspective, subdivisions=subdivisions)
         found = look(self.balls, self.grid.lists.rank, window, footprint, edges, references, self.tables)
         return jax.tree.map(functools.partial(_by_cell, per_cell=per_cell), found)
@@ -151,14 +151,20 @@ class _Band:
 
         A look-up changes by no more than its channel has, even at a jump, and by nothing where all quantities are one.
         """
-        tables, dtype = self.tables, self.borders.dtype
-        misplaced = sum_rounding(self.count.ravel()[at], dtype) * (self.quantities[1] - self.quantities[0])
-        merging = jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0)
-        return merging[:3].max(0), merging[3]
+        rounding, found = sum_rounding(self.count.ravel()[at], self.borders.dtype), []
+        for tables, (least, greatest) in zip(self.tables, self.quantities, strict=True):
+            misplaced = rounding * (greatest - least)
+            found.append(jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0))
+        return found[0][:3].max(0), found[-1][3]
 
 
 def _band(
-    grid: Grid, beside: SlabWindows, camera: Camera, reference_quantity: Array, tables: RangeTables, slab_samples: int
+    grid: Grid,
+    beside: SlabWindows,
+    camera: Camera,
+    references: tuple[Array, ...],
+    tables: tuple[RangeTables, ...],
+    slab_samples: int,
 ) -> _Band:
     slabs, bundles = grid.windows.count.shape
     per_cell = CELL_SAMPLES // slab_samples
@@ -166,8 +172,9 @@ def _band(
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     count = jnp.pad(beside.count, missing).reshape(num_cells, per_cell, bundles)
-    filled, reference = jnp.pad(grid.windows.count > 0, missing), jnp.pad(reference_quantity, missing)
-    quantities, borders = _extremes(grid.ordered.quantity, grid.ordered.live), grid.borders(num_cells * CELL_SAMPLES)
+    filled, reference = jnp.pad(grid.windows.count > 0, missing), tuple(jnp.pad(one, missing) for one in references)
+    quantities = [_extremes(one, grid.ordered.live) for one in grid.ordered.quantities]
+    borders = grid.borders(num_cells * CELL_SAMPLES)
     of_cells, balls = (count.sum(1), count.max(1)), spheres(grid.ordered)
     return _Band(grid, camera, balls, tables, begin, length, *of_cells, filled, reference, quantities, borders, slab_samples)
 

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.ordering import Ordered
-from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.control.ranges import RangeTables, ranges_of_parts
 from jaxsph.field.fetch import particle_at
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -64,14 +64,17 @@ class SampleBounds:
 
 @dataclasses.dataclass(frozen=True)
 class Spheres:
-    """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities."""
+    """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities.
+
+    The latter are one array or two, see `access.view.Columns`.
+    """
 
     x: Float[Array, " particles"]
     y: Float[Array, " particles"]
     z: Float[Array, " particles"]
     outer: Float[Array, " particles"]
     inner: Float[Array, " particles"]
-    quantity: Float[Array, " particles"]
+    quantities: tuple[Float[Array, " particles"], ...]
 
 
 def spheres(ordered: Ordered) -> Spheres:
@@ -80,7 +83,7 @@ def spheres(ordered: Ordered) -> Spheres:
     inner = 2 * ordered.size / jnp.where(ordered.scale > 0, ordered.scale, 1) - ordered.reach
     solid = (ordered.size > SOLID * ordered.size.max(initial=0)) & (inner > 0)
     inner = jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
-    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantity)
+    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantities)
 
 
 def sample_bounds(
@@ -89,15 +92,16 @@ def sample_bounds(
     window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
     footprint: Footprint,
     borders: Float[Array, "samples_and_one bundles"],
-    reference_quantity: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
-    tables: RangeTables,
+    references: tuple[tuple[Float[Array, " bundles"], Float[Array, " bundles"]], ...],
+    tables: tuple[RangeTables, ...],
     perspective: bool,
     subdivisions: int,
 ) -> SampleBounds:
     """Bounds for the samples between `borders`, from the particles of a window.
 
     Args:
-        reference_quantity: least and greatest quantity that the sums of these samples may be taken relative to.
+        references: of each quantity, the least and the greatest that the sums of these samples may be taken relative to.
+        tables: of the parts of the transfer function.
         subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
     """
     lateral_scales = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
@@ -109,12 +113,13 @@ def sample_bounds(
     sides = jnp.asarray([-1, 1], dtype)[:, None, None]
     one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
-    def add_nearest(block: Array, outermost: Array) -> Array:
+    def add_nearest(block: Array, outermost: tuple[Array, ...]) -> tuple[Array, ...]:
         ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
         near, near_depth = fusion_barrier(block >= 0, _nearest, ball, box, borders)
         for k in range(PARTICLES):
             meets = near[k] + near_depth[k] <= 1
-            outermost = jnp.maximum(outermost, jnp.where(meets, sides * ball.quantity[k], -jnp.inf))
+            ends = [jnp.where(meets, sides * quantity[k], -jnp.inf) for quantity in ball.quantities]
+            outermost = tuple(map(jnp.maximum, outermost, ends))
         return outermost
 
     def add_farthest(block: Array, farthest: Array) -> Array:
@@ -126,18 +131,24 @@ def sample_bounds(
         return farthest
 
     fullest = total.max()
-    outermost = jnp.full((2, samples, bundles), -jnp.inf, dtype)
+    outermost = (jnp.full((2, samples, bundles), -jnp.inf, dtype),) * len(balls.quantities)
     outermost = lax.fori_loop(0, (fullest + PARTICLES - 1) // PARTICLES, add_nearest, outermost)
     farthest = jnp.full((samples, subdivisions, subdivisions, bundles), jnp.inf, dtype)
     enough = jnp.minimum(fullest, COVERERS)
     farthest = lax.fori_loop(0, (enough + PARTICLES - 1) // PARTICLES, add_farthest, farthest)
-    touched = outermost[1] > -jnp.inf
-    lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
-    eps = jnp.finfo(dtype).eps
-    farthest_off = jnp.maximum(jnp.maximum(hi - reference_quantity[0], reference_quantity[1] - lo), 0)
-    rounding = sum_rounding(total, dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
-    least, greatest = transfer_ranges(tables, lo - rounding, hi + rounding)
+    touched = outermost[0][1] > -jnp.inf
+    quantities = [_rounded_range(touched, *both, total) for both in zip(outermost, references, strict=True)]
+    least, greatest = ranges_of_parts(tables, quantities)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
+
+
+def _rounded_range(touched: Array, outermost: Array, reference: tuple[Array, Array], terms: Array) -> tuple[Array, Array]:
+    """Least and greatest value that a computed mean can have, of minus the least and of the greatest quantity."""
+    lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
+    eps = jnp.finfo(lo.dtype).eps
+    farthest_off = jnp.maximum(jnp.maximum(hi - reference[0], reference[1] - lo), 0)
+    rounding = sum_rounding(terms, lo.dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
+    return lo - rounding, hi + rounding
 
 
 def sum_rounding(terms: Array, dtype: Any) -> Array:

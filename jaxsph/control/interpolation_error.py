@@ -14,6 +14,9 @@ A slab that is marched at `schedule.SUBSAMPLE` of its rays errs across only, and
 rays are up to three pixels apart, and where a kernel's third derivative jumps, errors fall with the third power of the distance.
 The share was measured, not derived (`benchmarks/calibrate.py`).
 
+Of two quantities each has errors of its own, by its own sums: those of the first change colours, those of the second extinction,
+and as noise their variances add up.
+
 The a-posteriori error of Kratz et al. 2011 (section 4) takes the same view of a finite element: the residual of the next order,
 weighted.
 """
@@ -63,14 +66,14 @@ class InterpolationError:
 
 
 class AtNodes(NamedTuple):
-    """What the nodes of some layers tell; of one, without the first axis.
+    """What the nodes of some layers tell of one quantity; of one layer, without the first axis.
 
     Attributes:
         variance: of Q between nodes: that of one sample, times how many in a row err as one. Infinite where the sum of weights
             is not clear of zero.
         across: the part of it that is across.
         quantity: Q.
-        red, green, blue, extinction: its optics.
+        red, green, blue, extinction: its optics; of two quantities, the first tells colours, the last extinction.
     """
 
     variance: Float[Array, "layers nodes"]
@@ -88,12 +91,12 @@ class Sweep(NamedTuple):
     Attributes:
         tau: optical thickness in front.
         light: what reaches the eye from a unit of length, one layer before, see `spacing.second_differences`.
-        first: the slab's first layer.
+        first: the slab's first layer, of each quantity.
     """
 
     tau: Float[Array, " nodes"]
     light: Float[Array, "4 nodes"]
-    first: AtNodes
+    first: tuple[AtNodes, ...]
 
 
 class OfBundles(NamedTuple):
@@ -135,6 +138,7 @@ class _Nodes:
     """The lattice in memory, and what all slabs of a band are judged by.
 
     Attributes:
+        segments, squares: of the parts of the transfer function.
         path: path length of the nodes' rays a unit of depth, longest of each bundle as `longest`.
         edges: depths of layers.
         within: layers of a slab.
@@ -142,10 +146,10 @@ class _Nodes:
     """
 
     weight: Float[Array, " nodes"]
-    weighted: Float[Array, " nodes"]
+    weighted: tuple[Float[Array, " nodes"], ...]
     lattice: Lattice
-    segments: Segments
-    squares: SquaredSlopes
+    segments: tuple[Segments, ...]
+    squares: tuple[SquaredSlopes, ...]
     path: Float[Array, " nodes"]
     longest: Float[Array, "rows columns"]
     edges: Float[Array, " layers"]
@@ -174,7 +178,7 @@ class _Nodes:
         """Variance, share and bend of a slab, (rows, columns); and what the next takes over."""
         spacing, within, always = self.lattice.region.spacing, self.within, slab >= 0
         begin, number = (slab * within + 1) * self.layer, (within + 2 * REACH) * self.layer
-        near = [lax.dynamic_slice_in_dim(value, begin, number) for value in (self.weight, self.weighted)]
+        weight, *weighted = (lax.dynamic_slice_in_dim(value, begin, number) for value in (self.weight, *self.weighted))
         border = lax.dynamic_slice(self.edges, (slab * within,), (within + 1,))
         slab_samples = within * spacing.samples
         node_distance = spacing.pixels * self.pixel * (border[-1] if self.perspective else 1)
@@ -182,27 +186,40 @@ class _Nodes:
         at_nodes = functools.partial(
             _at_nodes, columns=self.lattice.weight.shape[2], layer=self.layer, node_samples=spacing.samples
         )
-        new: AtNodes = fusion_barrier(always, at_nodes, *near, self.lattice.reference_quantity, self.segments, correlated)
-        layers = AtNodes(*([a, *b] for a, b in zip(sweep.first, new, strict=True)))  # type: ignore[arg-type]
-        absorbed = sum(layers.extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * self.path
-        pieces = list(layers.variance), list(layers.across), list(layers.quantity), sweep.tau, absorbed
+        looks = zip(weighted, self.lattice.references, self.segments, strict=True)
+        new: list[AtNodes] = [fusion_barrier(always, at_nodes, weight, *one, correlated) for one in looks]
+        layers = [
+            AtNodes(*([a, *b] for a, b in zip(*both, strict=True)))  # type: ignore[arg-type]
+            for both in zip(sweep.first, new, strict=True)
+        ]
+        extinction = list(layers[-1].extinction)
+        absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * self.path
         pool = functools.partial(_of_bundles, self.pooled, (within + 1) * (spacing.across + 1) ** 2)
-        bundle: OfBundles = fusion_barrier(always, pool, *pieces)
-        variance = self._variance(bundle, correlated, (border[-1] - border[0]) * self.longest) / slab_samples
-        colors, step = [list(layers.red), list(layers.green), list(layers.blue)], (border[1:] - border[:-1])[:, None] * self.path
-        bends = fusion_barrier(always, second_differences, colors, list(layers.extinction), step, sweep.tau, sweep.light)
+        bundles: list[OfBundles] = [
+            fusion_barrier(always, pool, list(one.variance), list(one.across), list(one.quantity), sweep.tau, absorbed)
+            for one in layers
+        ]
+        length = (border[-1] - border[0]) * self.longest
+        errors = (self._variance(*one, correlated, length) for one in zip(bundles, self.squares, strict=True))
+        variance = functools.reduce(jnp.add, errors) / slab_samples
+        colors = [list(layers[0].red), list(layers[0].green), list(layers[0].blue)]
+        step = (border[1:] - border[:-1])[:, None] * self.path
+        bends = fusion_barrier(always, second_differences, colors, extinction, step, sweep.tau, sweep.light)
         bend = jnp.sqrt(self.pooled(bends[0] ** 2, jnp.add)) / (spacing.across + 1)
-        after = Sweep(sweep.tau + absorbed, bends[1], AtNodes(*(value[-1] for value in new)))
-        return after, (variance, bundle.share, bend)
+        last = tuple(AtNodes(*(value[-1] for value in one)) for one in new)
+        share = functools.reduce(jnp.maximum, (bundle.share for bundle in bundles))
+        return Sweep(sweep.tau + absorbed, bends[1], last), (variance, share, bend)
 
-    def _variance(self, bundle: OfBundles, correlated: Array, length: Array) -> Float[Array, "rows columns"]:
-        """Of a slab's light, times its samples.
+    def _variance(
+        self, bundle: OfBundles, squares: SquaredSlopes, correlated: Array, length: Array
+    ) -> Float[Array, "rows columns"]:
+        """Of a slab's light by one quantity, times its samples.
 
         Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
         falls so.
         """
         around = DEVIATIONS_AROUND * bundle.deviation / jnp.sqrt(correlated)
-        *of_colors, of_extinction = mean_square_slope(self.squares, bundle.low - around, bundle.high + around)
+        *of_colors, of_extinction = mean_square_slope(squares, bundle.low - around, bundle.high + around)
         light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * bundle.taken**2
         return bundle.front**2 * bundle.deviation**2 * light
 
@@ -219,7 +236,8 @@ def _swept(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunct
     slabs, path = grid.windows.count.shape[0], nodes.path
     # the first layer counts as empty: its slab is not interpolated anyway
     nothing = jnp.zeros_like(path)
-    start = Sweep(nothing, jnp.zeros((4, *path.shape), path.dtype), AtNodes(*[nothing] * len(AtNodes._fields)))
+    empty = (AtNodes(*[nothing] * len(AtNodes._fields)),) * len(nodes.segments)
+    start = Sweep(nothing, jnp.zeros((4, *path.shape), path.dtype), empty)
     filled = jnp.append((grid.windows.count > 0).any(1), False)
     judged = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
     each = jnp.arange(slabs, dtype=jnp.int32), judged
@@ -233,15 +251,16 @@ def _nodes(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunct
     spacing, slabs = lattice.region.spacing, grid.windows.count.shape[0]
     rows, columns = lattice.weight.shape[1:]
     within = slab_samples // spacing.samples
-    weight, weighted = (value.ravel() for value in (lattice.weight, *lattice.weighted))
+    weight, *weighted = (value.ravel() for value in (lattice.weight, *lattice.weighted))
     path = _slant(lattice, camera, rows, columns).ravel()
     longest = _pooled(path, jnp.maximum, down=rows - GAP, across=columns - GAP, of_bundle=spacing.across)
     # one more border than there are samples, and layers past the last
     last = grid.half_steps.shape[0] - 1
     edges = grid.half_steps[jnp.minimum(2 * spacing.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
     pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
-    tables = transfer.segments(), squared_slopes(transfer)
-    return _Nodes(weight, weighted, lattice, *tables, path, longest, edges, pixel, within, camera.is_perspective)
+    parts = transfer.parts()
+    tables = tuple(part.segments() for part in parts), tuple(map(squared_slopes, parts))
+    return _Nodes(weight, tuple(weighted), lattice, *tables, path, longest, edges, pixel, within, camera.is_perspective)
 
 
 def _spared(grid: Grid, lattice: Lattice, within: int) -> Array:
@@ -286,7 +305,7 @@ def _of_bundles(
 def _at_nodes(
     weight: Array,
     weighted: Array,
-    reference_quantity: Array,
+    reference: Array,
     segments: Segments,
     correlated: Array,
     *,
@@ -323,7 +342,7 @@ def _at_nodes(
         variance += (node_samples if stride == layer else correlated) * error
     clear = inside & (here > MIN_CLEARANCE * unsure)
     variance, across = jnp.where(clear, variance * inverse**2, jnp.inf), across * inverse**2
-    quantity = reference_quantity + ratio
+    quantity = reference + ratio
     place = fusion_barrier(correlated > 0, find, segments, quantity)
     *colors, extinction = read(segments, place)
     found = variance, across, quantity, *colors, jnp.where(inside, extinction, 0)

@@ -60,14 +60,14 @@ def merged_levels(
 def coarse_schedule(
     windows: list[Window],
     levels: Int[Array, "cells bundles"],
-    reference_quantity: Float[Array, "slabs bundles"],
+    references: tuple[Float[Array, "slabs bundles"], ...],
     paint: Array | None,
     slab_samples: int,
 ) -> SlabSchedule:
     """The schedule for the `levels` of cells, as `merged_levels` gives them.
 
     Args:
-        reference_quantity: of the slabs at full rate; coarser ones take that of the first filled slab they span.
+        references: of the slabs at full rate; coarser ones take those of the first filled slab they span.
         paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
     """
     per_cell = CELL_SAMPLES // slab_samples
@@ -83,26 +83,26 @@ def coarse_schedule(
             for union, value in ((window.begin, begin), (window.length, length))
         )
     count = length.sum(0).astype(jnp.int32)
-    reference_quantity = _shared_references(reference_quantity, windows, level)
+    references = tuple(_shared_references(reference, windows, level) for reference in references)
     level = jnp.where(level == SUPER_PIXEL, MAX_LEVEL, level)
     if paint is None:
-        return SlabSchedule(count > 0, level, begin, length, count, reference_quantity)
+        return SlabSchedule(count > 0, level, begin, length, count, references)
     colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
-    return SlabSchedule((count > 0) | painted, level, begin, length, count, reference_quantity, painted, colors)
+    return SlabSchedule((count > 0) | painted, level, begin, length, count, references, painted, colors)
 
 
-def uncoarsened(cells: SlabWindows, reference_quantity: Float[Array, "slabs bundles"], super_pixels: bool) -> SlabSchedule:
+def uncoarsened(cells: SlabWindows, references: tuple[Float[Array, "slabs bundles"], ...], super_pixels: bool) -> SlabSchedule:
     """The reference image's schedule, in the shape of `coarse_schedule`."""
-    schedule = jax.tree.map(lambda leaf: pad_slabs(leaf, cells), full_rate(cells, reference_quantity))
+    schedule = jax.tree.map(lambda leaf: pad_slabs(leaf, cells), full_rate(cells, references))
     if not super_pixels:
         return schedule
-    paint = jnp.zeros((4, *schedule.count.shape), reference_quantity.dtype)
+    paint = jnp.zeros((4, *schedule.count.shape), references[0].dtype)
     return dataclasses.replace(schedule, painted=jnp.zeros_like(schedule.filled), paint=paint)
 
 
-def _shared_references(reference_quantity: Array, windows: list[Window], level: Array) -> Array:
+def _shared_references(reference: Array, windows: list[Window], level: Array) -> Array:
     """Of every item, that of the first filled slab that it spans."""
-    first = shared = jnp.pad(reference_quantity, ((0, level.shape[0] - reference_quantity.shape[0]), (0, 0)))
+    first = shared = jnp.pad(reference, ((0, level.shape[0] - reference.shape[0]), (0, 0)))
     for step in range(1, LEVELS):
         filled = windows[step - 1].length.sum(0) > 0
         first = jnp.where(filled[::2], first[::2], first[1::2])

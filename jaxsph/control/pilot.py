@@ -46,7 +46,7 @@ def pilot(
     lattice: Lattice,
     found: InterpolationError,
     camera: Camera,
-    reference_quantity: Float[Array, "slabs bundles"],
+    references: tuple[Float[Array, "slabs bundles"], ...],
     tolerance: Float[Array, ""],
     slab_samples: int,
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
@@ -70,7 +70,8 @@ def pilot(
     fewer, taken = chosen[: count.shape[0]], chosen[count.shape[0] :]
     level, more = choose_spacing(taken, found.bend, budget - total, lattice.region.spacing.samples)
     estimate = jnp.where(chosen.any(0), jnp.minimum(DEVIATIONS * jnp.sqrt(total + more), tolerance), 0)
-    schedule = full_rate(grid.windows, jnp.where(taken, lattice.reference_quantity, reference_quantity))
+    both = zip(lattice.references, references, strict=True)
+    schedule = full_rate(grid.windows, tuple(jnp.where(taken, of_nodes, own) for of_nodes, own in both))
     begins = jnp.arange(count.shape[0], dtype=jnp.int32)[:, None] & ((1 << level) - 1) == 0
     length, number = (jnp.where(taken, 0, value) for value in (schedule.length, schedule.count))
     method = jnp.where(taken, INTERPOLATED + level, jnp.where(fewer, SUBSAMPLED, DENSE))

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.access.compaction import compact
 from jaxsph.access.grid import Grid
 from jaxsph.access.slab_windows import CELL_SAMPLES
-from jaxsph.control.ranges import RangeTables, transfer_ranges
+from jaxsph.control.ranges import RangeTables, ranges_of_parts
 from jaxsph.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -53,7 +53,7 @@ def worthwhile(shares: Sequence[tuple[Array, Array]]) -> Bool[Array, ""]:
 
 def probe(
     grid: Grid,
-    tables: RangeTables,
+    tables: tuple[RangeTables, ...],
     tolerance: Float[Array, ""],
     lateral: Float[Array, ""] | float,
     slab_samples: int,
@@ -65,11 +65,11 @@ def probe(
     What is promising grows with `tolerance`.
 
     Args:
-        tables: of the transfer function.
+        tables: of the parts of the transfer function.
         lateral: share of the variation between neighbouring rays, of all cells of a bundle together, that is to be taken from
             the tolerance before anything is saved.
     """
-    quantity, rank, cells = grid.ordered.quantity, grid.lists.rank, grid.windows
+    quantities, rank, cells = grid.ordered.quantities, grid.lists.rank, grid.windows
     slabs, bundles = cells.count.shape
     per_cell = CELL_SAMPLES // slab_samples
     num_cells = -(-slabs // per_cell)
@@ -87,11 +87,11 @@ def probe(
         cell, bundle = at // bundles, at % bundles
         slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
         window = begin[:, slab, bundle], length[:, slab, bundle]
-        lo, hi = fusion_barrier(step >= 0, _extremes, quantity, rank, window)
-        entry = fusion_barrier(step >= 0, _varies, lo, hi, steps[slab], tables)
+        ends = [fusion_barrier(step >= 0, _extremes, quantity, rank, window) for quantity in quantities]
+        entry = fusion_barrier(step >= 0, _varies, ends, steps[slab], tables)
         return table.at[:, at].set(entry)
 
-    table = jnp.zeros((2, num_cells * bundles + 1), quantity.dtype)
+    table = jnp.zeros((2, num_cells * bundles + 1), quantities[0].dtype)
     table = lax.fori_loop(0, (compacted.start[-1] + chunk - 1) // chunk, probe_chunk, table)
     change, depth = table[:, :-1].reshape(2, num_cells, bundles)
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
@@ -113,10 +113,10 @@ def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tupl
     return jnp.where(total > 0, lo, jnp.inf), jnp.where(total > 0, hi, -jnp.inf)
 
 
-def _varies(lo: Array, hi: Array, steps: Array, tables: RangeTables) -> Array:
+def _varies(ends: list[tuple[Array, Array]], steps: Array, tables: tuple[RangeTables, ...]) -> Array:
     """How much cells could change under a super-pixel, and their least optical thickness, as far as probes can tell."""
-    filled = hi >= lo
-    least, greatest = transfer_ranges(tables, jnp.where(filled, lo, 0), jnp.where(filled, hi, 0))
+    filled = ends[0][1] >= ends[0][0]
+    least, greatest = ranges_of_parts(tables, [(jnp.where(filled, lo, 0), jnp.where(filled, hi, 0)) for lo, hi in ends])
     thin, thick = least[3] * steps, greatest[3] * steps
     off = jnp.stack([high - low for low, high in zip(least[:3], greatest[:3], strict=True)]).max(0)
     middle = 0.5 * (thin + thick)

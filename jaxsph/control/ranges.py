@@ -9,7 +9,7 @@ every run of $2^k$ control points) gives the latter from two overlapping runs: O
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.transfer import SELECT_ALL, Segments, TransferFunction, look_up
 
+EXTINCTION = 3  # channel, after those of colours
 ROUNDING = 8  # eps: a looked up value is a sum and a product away from its control points
 ROUNDING_OF_PLACE = 16  # eps of the largest value: where evenly spaced points are taken to lie
 
@@ -44,8 +45,13 @@ class RangeTables:
     steepest: Float[Array, " 4"]
 
 
+def tables_of_parts(transfer: TransferFunction) -> tuple[RangeTables, ...]:
+    """Of the parts of a transfer function, by the quantities that they are looked up by."""
+    return tuple(map(range_tables, transfer.parts()))
+
+
 def range_tables(transfer: TransferFunction) -> RangeTables:
-    """Sparse tables of `transfer`: made once a frame."""
+    """Sparse tables of a transfer function, or part of one, of one quantity: made once a frame."""
     table = jnp.concatenate([transfer.colors, transfer.extinction[:, None]], 1).T
     fuzz = ROUNDING_OF_PLACE * jnp.finfo(table.dtype).eps * jnp.maximum(jnp.abs(transfer.values[0]), jnp.abs(transfer.values[-1]))
     lo, hi = _sparse(table, jnp.minimum), _sparse(table, jnp.maximum)
@@ -62,6 +68,20 @@ def _sparse(row: Float[Array, "4 points"], extreme: Callable[[Array, Array], Arr
         runs.append(jnp.concatenate([extreme(last[:, :-length], last[:, length:]), last[:, -length:]], 1))
         length *= 2
     return jnp.concatenate(runs, 1)
+
+
+def ranges_of_parts(
+    tables: tuple[RangeTables, ...], quantities: Sequence[tuple[Float[Array, "*any"], Float[Array, "*any"]]]
+) -> tuple[list[Float[Array, "*any"]], list[Float[Array, "*any"]]]:
+    r"""`transfer_ranges` of each part, over the range of its own quantity: of colours by the first, extinction by the last.
+
+    **Theorem.** Where the quantities lie in their ranges, whatever they have to do with each other, look-ups lie in what is
+    returned. *Argument.* A colour is looked up by the first quantity alone, extinction by the last alone: each is bounded by
+    `transfer_ranges`. That both ranges are met at once is not said, so the bounds are those of the box of both. $\square$
+    """
+    found = [transfer_ranges(part, *ends) for part, ends in zip(tables, quantities, strict=True)]
+    least, greatest = ([*found[0][side][:EXTINCTION], found[-1][side][EXTINCTION]] for side in range(2))
+    return least, greatest
 
 
 def transfer_ranges(

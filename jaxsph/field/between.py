@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.ordering import Ordered
 from jaxsph.field.cover import Cover, Ends, ends_of, over_groups
 from jaxsph.field.fetch import particle_at
-from jaxsph.field.intervals import Intervals, intervals_of, means_of
+from jaxsph.field.intervals import Intervals, intervals_of, looked_up, means_by
 from jaxsph.field.sums import Sums, by_rays, least_weight
 from jaxsph.field.tasks import SlabTask
 from jaxsph.field.transposed import COLUMNS, WIDTH
@@ -36,38 +36,42 @@ class SumsBetween(NamedTuple):
 
 
 class MeanCotangents(NamedTuple):
-    """Of sums and depths of samples, of borders, and of the transfer function."""
+    """Of sums and depths of samples, of borders, and of the parts of the transfer function."""
 
-    weight: Float[Array, "tasks samples rays"]
-    weighted: Float[Array, "tasks samples rays"]
+    sums: list[Float[Array, "tasks samples rays"]]
     cover: Cover
     depth: Float[Array, "tasks samples"]
-    transfer: TransferFunction
+    transfers: list[TransferFunction]
 
 
-def intervals_between(gathered: SumsBetween, task: SlabTask) -> Intervals:
-    """Ends of the intervals between samples, in units of the quantity."""
-    weight, weighted = by_rays(gathered.sums)
-    return _intervals(weight, weighted, gathered.cover, task.depth, task)
+def intervals_between(gathered: SumsBetween, task: SlabTask) -> list[Intervals]:
+    """Ends of the intervals between samples, in units of the quantity; of each quantity."""
+    return _intervals(by_rays(gathered.sums), gathered.cover, task.depth, task)
 
 
-def _intervals(weight: Array, weighted: Array, cover: Cover, depth: Array, task: SlabTask) -> Intervals:
+def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) -> list[Intervals]:
+    weight, *several = sums
+    covers = [cover, cover._replace(of_front=cover.others[0], of_back=cover.others[1])] if cover.others else [cover]
     inside, solid = weight > 0, weight > least_weight(weight.dtype)
-    still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
-    ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
-    near, far, share = intervals_of(ratio, inside, cover, depth)
-    reference = task.entry.reference_quantity[:, None, None]
-    return Intervals(reference + near, reference + far, share)
+    found = []
+    for weighted, own, of_entry in zip(several, covers, task.entry.references, strict=True):
+        still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
+        ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
+        near, far, share = intervals_of(ratio, inside, own, depth)
+        reference = of_entry[:, None, None]
+        found.append(Intervals(reference + near, reference + far, share))
+    return found
 
 
-def pull_means(gathered: SumsBetween, segments: Segments, task: SlabTask, cotangents: list[Array]) -> MeanCotangents:
+def pull_means(gathered: SumsBetween, parts: tuple[Segments, ...], task: SlabTask, cotangents: list[Array]) -> MeanCotangents:
     """From cotangents of means of emission and extinction to those of what they were made of."""
 
-    def means(weight: Array, weighted: Array, cover: Cover, depth: Array, transfer: TransferFunction) -> list[Array]:
-        return means_of(MeanTables.of(transfer.segments()), _intervals(weight, weighted, cover, depth, task), slice(0, 4))
+    def means(sums: list[Array], cover: Cover, depth: Array, transfers: list[TransferFunction]) -> list[Array]:
+        tables = tuple(MeanTables.of(transfer.segments()) for transfer in transfers)
+        return means_by(tables, looked_up(tables, _intervals(sums, cover, depth, task)), slice(0, 4))
 
-    transfer = TransferFunction(segments.start, segments.base[:3].T, segments.base[3])
-    given = *by_rays(gathered.sums), gathered.cover, task.depth, transfer
+    transfers = [TransferFunction(segments.start, segments.base[:3].T, segments.base[3]) for segments in parts]
+    given = by_rays(gathered.sums), gathered.cover, task.depth, transfers
     return MeanCotangents(*jax.vjp(means, *given)[1](cotangents))
 
 
@@ -89,12 +93,12 @@ def pull_cover(
         for piece in range(2):
             mine = Ends(*(value[piece] for value in places))
             cotangent = Ends(*(value[piece, here] for value in of_cover[:4]))
-            for sign, end, place, of_end, of_quantity in (
-                (-1, mine.front, mine.of_front, cotangent.front, cotangent.of_front),
-                (1, mine.back, mine.of_back, cotangent.back, cotangent.of_back),
-            ):
+            others = [value[piece, here] for value in of_cover.others]
+            of_front = [cotangent.front, cotangent.of_front, *others[:1]]
+            of_back = [cotangent.back, cotangent.of_back, *others[1:]]
+            for sign, end, place, of_end in ((-1, mine.front, mine.of_front, of_front), (1, mine.back, mine.of_back, of_back)):
                 found = (jnp.abs(end) < jnp.finfo(end.dtype).max) & (items < inside.shape[0])[:, None]
-                given = jnp.where(found, of_end, 0), jnp.where(found, of_quantity, 0)
+                given = tuple(jnp.where(found, value, 0) for value in of_end)
                 table, more = _pull_end(table, ordered, rank, some, place.astype(jnp.int32), sign, given)
                 factor = factor + more
         return table, factor
@@ -103,7 +107,7 @@ def pull_cover(
 
 
 def _pull_end(
-    table: Array, ordered: Ordered, rank: Array, task: SlabTask, place: Array, sign: int, cotangents: tuple[Array, Array]
+    table: Array, ordered: Ordered, rank: Array, task: SlabTask, place: Array, sign: int, cotangents: tuple[Array, ...]
 ) -> tuple[Array, Array]:
     """The same of one end of a piece of each ray, made by the particle at a `place` in the windows."""
     entry = task.entry
@@ -113,9 +117,10 @@ def _pull_end(
     def end(columns: tuple[Array, ...], factor: Array) -> Array:
         return chord_end(columns, dataclasses.replace(task, u=task.u * factor, v=task.v * factor), sign)
 
-    of_end, of_quantity = cotangents
+    of_end, *of_quantities = cotangents
     of_columns, factor = jax.vjp(end, columns, jnp.ones((), table.dtype))[1](of_end)
-    row = jnp.stack([*of_columns, of_quantity, *[jnp.zeros_like(of_quantity)] * (WIDTH - len(COLUMNS))], -1)
+    found = [*of_columns, *of_quantities]
+    row = jnp.stack([*found, *[jnp.zeros_like(of_end)] * (WIDTH - len(found))], -1)
     return table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds"), factor
 
 

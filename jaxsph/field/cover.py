@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.ordering import Ordered
-from jaxsph.field.fetch import Block, fetch
+from jaxsph.field.fetch import Block, fetch, particle_at, quantities_of
 from jaxsph.field.sums import apart_of, together_of
 from jaxsph.field.tasks import SlabTask
 from jaxsph.numerics.fusion import fusion_barrier
@@ -43,6 +43,7 @@ class Cover(NamedTuple):
         front, back: depths between which supports cover rays, cut off at no border of the slab.
         of_front, of_back: quantities of the particles that make them, relative to the slab's reference.
         pivot: depth of an outer sample; infinite where there is none.
+        others: of two quantities, what `of_front` and `of_back` are of the second; nothing of one.
     """
 
     front: Float[Array, "2 tasks rays"]
@@ -50,6 +51,7 @@ class Cover(NamedTuple):
     of_front: Float[Array, "2 tasks rays"]
     of_back: Float[Array, "2 tasks rays"]
     pivot: Float[Array, "tasks rays"]
+    others: tuple[Float[Array, "2 tasks rays"], ...] = ()
 
 
 class Ends(NamedTuple):
@@ -120,15 +122,30 @@ def cover_of(
     pivot = outer_pivot(inside, task.depth)
     tasks, rays = pivot.shape
     far = jnp.finfo(pivot.dtype).max
-    nothing = jnp.asarray([far, far, -far, -far, 0, 0, 0, 0], pivot.dtype)[None, :, None]  # one array: to put rows takes long
+    several = label == "quantity" and len(task.entry.references) > 1
+    labels = 2 * len(task.entry.references) if several else 2
+    nothing = jnp.asarray([far, far, -far, -far, *[0] * 2 * labels], pivot.dtype)[None, :, None]  # to put rows takes long
 
     def find(items: Array, some: SlabTask, found: Array) -> Array:
-        ends = ends_of(ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], label)
+        ends: tuple[Array, ...] = ends_of(
+            ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], "place" if several else label
+        )
+        ends = (*ends[:2], *_quantities_at(ordered, rank, some, ends[2:])) if several else ends
         return found.at[items].set(jnp.moveaxis(jnp.concatenate(ends), 0, 1), mode="drop")
 
     found = over_groups(find, jnp.broadcast_to(nothing, (tasks, nothing.size, rays)), task, inside)
-    front, back, of_front, of_back = (jnp.moveaxis(found[:, first : first + 2], 1, 0) for first in (0, 2, 4, 6))
-    return Cover(front, back, of_front, of_back, pivot)
+    front, back, of_front, of_back, *others = (jnp.moveaxis(found[:, k : k + 2], 1, 0) for k in range(0, nothing.size, 2))
+    return Cover(front, back, of_front, of_back, pivot, tuple(others))
+
+
+def _quantities_at(
+    ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, places: tuple[Array, ...]
+) -> list[Float[Array, "2 tasks rays"]]:
+    """Of particles at places in the windows of slabs, all quantities one after the other, relative to the slabs' references."""
+    entry = task.entry
+    particles = [particle_at(rank, entry.begin[..., None], entry.length[..., None], at.astype(jnp.int32))[0] for at in places]
+    both = list(zip(quantities_of(ordered), entry.references, strict=True))
+    return [quantity[particle] - reference[:, None] for quantity, reference in both for particle in particles]
 
 
 def over_groups(
@@ -163,13 +180,13 @@ def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]
 def ends_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"], label: str) -> Ends:
     """The ends (2, tasks, rays) of all chords in front of the pivot, and behind it, as depths."""
     entry, lines = task.entry, Lines.of(task)
-    windows, reference = (entry.begin[..., None], entry.length[..., None]), (entry.reference_quantity[:, None],)
+    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     shape = jnp.broadcast_shapes(lines.u.shape, lines.v.shape)
     apart = (pivot.reshape(shape) - lines.middle)[:, None]
     far = jnp.asarray(jnp.finfo(pivot.dtype).max, pivot.dtype)
 
     def fetched(index: Array) -> tuple[Block, Array]:
-        _, block = fetch(ordered, rank, windows, index, reference)
+        _, block = fetch(ordered, rank, windows, index, references)
         labels = block.quantities[0] if label == "quantity" else jnp.broadcast_to(index, block.x.shape).astype(pivot.dtype)
         return block, labels
 

@@ -51,7 +51,7 @@ def particle_at(
 
 def quantities_of(ordered: Ordered) -> tuple[Float[Array, " particles"], ...]:
     """All that is summed up of particles besides their weights."""
-    return (ordered.quantity,)
+    return ordered.quantities
 
 
 def fetch(

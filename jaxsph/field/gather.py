@@ -21,7 +21,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.access.ordering import Ordered
 from jaxsph.field.fetch import fetch, quantities_of
-from jaxsph.field.sums import Sums, sums_of
+from jaxsph.field.sums import Sums, sums_of, with_block
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
@@ -45,21 +45,21 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
     entry, s, perspective = task.entry, task.depth, task.perspective
     lateral_scale = s if perspective else jnp.ones_like(s)
     su, sv = task.u[:, None, :] * lateral_scale[:, :, None], task.v[:, None, :] * lateral_scale[:, :, None]
-    windows, reference = (entry.begin[..., None], entry.length[..., None]), (entry.reference_quantity[:, None],)
+    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     smooth = kernels.by_name(kernel)
 
     def separate(index: Array) -> tuple[Array, Array, Array, tuple[Array, ...]]:
         """The two parts of the squared distance, sizes and quantities of a block of particles; size 0 past the last."""
-        _, block = fetch(ordered, rank, windows, index, reference)
+        _, block = fetch(ordered, rank, windows, index, references)
         x, y, z, scale = (value[:, :, None, None] for value in (block.x, block.y, block.z, block.scale))
         across = ((su[:, None] - x) * scale) ** 2
         along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
         return across, smooth.prepare(along, block.size[:, :, None, None]), block.size, block.quantities
 
     across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-    channels = list(sums.all)
-    for k in range(BLOCK):
+
+    def weighed(k: int) -> tuple[Array, list[Array]]:
         w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
-        factors = (quantity[:, k, None, None, None] for quantity in quantities)
-        channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], factors, strict=True))]
-    return sums_of(channels)
+        return w, [quantity[:, k, None, None, None] for quantity in quantities]
+
+    return with_block(sums, (weighed(k) for k in range(BLOCK)))

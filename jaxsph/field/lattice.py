@@ -82,14 +82,14 @@ class Lattice:
     Attributes:
         weight: of V W.
         weighted: of (q - reference) V W, for each quantity q.
-        reference_quantity: one amid the particles'.
+        references: of each quantity, one amid the particles'.
         region: where the nodes are.
         evaluations: kernel evaluations that the nodes took, for each ray of a bundle of the band.
     """
 
     weight: Float[Array, "layers rows columns"]
     weighted: tuple[Float[Array, "layers rows columns"], ...]
-    reference_quantity: Float[Array, ""]
+    references: tuple[Float[Array, ""], ...]
     region: Region
     evaluations: Float[Array, " bundles"]
 

@@ -24,7 +24,7 @@ from jaxsph.field.fetch import Block, fetch, quantities_of
 from jaxsph.field.interpolation import spread_subsamples
 from jaxsph.field.lattice import GAP, REACH, Lattice, Region, node_at
 from jaxsph.field.schedule import SUBSAMPLE
-from jaxsph.field.sums import Sums, sums_of
+from jaxsph.field.sums import Sums, sums_of, with_block
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
@@ -49,7 +49,7 @@ def sum_at_nodes(
     kernel: str,
     slab_samples: int,
     region: Region,
-    reference_quantity: Float[Array, ""],
+    references: tuple[Float[Array, ""], ...],
     cells_at_once: int,
     wanted: Bool[Array, ""] | bool = True,
 ) -> Lattice:
@@ -58,7 +58,7 @@ def sum_at_nodes(
     Args:
         grid: of a band, or of a shard of it.
         region: of the band.
-        reference_quantity: what sums are taken relative to.
+        references: what sums of each quantity are taken relative to.
     """
     spacing, (row, column, has_nodes) = region.spacing, region.place(grid)
     across = spacing.across
@@ -82,7 +82,7 @@ def sum_at_nodes(
         u, v = (rays[:: spacing.pixels] for rays in grid.rays(camera, bundle))
         s = grid.half_steps[jnp.minimum(2 * (cell * depth + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
-        rays, references = NodeRays(u, v, s), (reference_quantity,)
+        rays = NodeRays(u, v, s)
         found = gather_nodes(grid.ordered, grid.lists.rank, window, rays, references, camera.is_perspective, kernel)
         first = row[bundle] * across, column[bundle] * across
         place = cell * layers + deep[:, None, None, None], first[0] + down[:, None, None], first[1] + right[:, None]
@@ -93,7 +93,7 @@ def sum_at_nodes(
     start = (nothing,) * (1 + len(quantities_of(grid.ordered)))
     weight, *weighted = (value.reshape(shape) for value in lax.fori_loop(0, (number + chunk - 1) // chunk, march, start))
     spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
-    return Lattice(weight, tuple(weighted), reference_quantity, region, spent)
+    return Lattice(weight, tuple(weighted), references, region, spent)
 
 
 def gather_nodes(
@@ -134,13 +134,13 @@ def gather_nodes(
         block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[:, None])
         columns = block.x, block.y, block.z, block.scale, block.size
         parts = fusion_barrier(nth >= 0, separate, *columns) if several else ()
-        channels = list(sums.all)
-        for k in range(BLOCK):
+
+        def weighed(k: int) -> tuple[Array, list[Array]]:
             across, along = (part[k] for part in parts) if several else separate(*(column[k] for column in columns))
             w = smooth.weigh(along[:, :, None], across[:, None], block.size[k], jnp)
-            factors = (quantity[k] for quantity in block.quantities)
-            channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], factors, strict=True))]
-        return sums_of(channels)
+            return w, [quantity[k] for quantity in block.quantities]
+
+        return with_block(sums, (weighed(k) for k in range(BLOCK)))
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)
     start = sums_of([zero] * (1 + len(quantities_of(ordered))))
@@ -151,6 +151,5 @@ def gather_subsampled(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTa
     """What `field.gather` sums up at every ray of a bundle, from its `SUBSAMPLE` rays; see `interpolation`."""
     few, entry = np.asarray(SUBSAMPLE), task.entry
     rays = NodeRays(task.u.T[few], task.v.T[few], task.depth.T)
-    windows, reference = (entry.begin, entry.length), (entry.reference_quantity,)
-    sums = gather_nodes(ordered, rank, windows, rays, reference, task.perspective, kernel)
+    sums = gather_nodes(ordered, rank, (entry.begin, entry.length), rays, entry.references, task.perspective, kernel)
     return sums_of(list(spread_subsamples(jnp.stack(sums.all), entry.count[0] >= 0)))

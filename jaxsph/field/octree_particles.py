@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.access.octree_build import OctreePlan
-from jaxsph.access.quantities import rescaled
+from jaxsph.access.quantities import in_units_of
 from jaxsph.access.view import view_particles
 from jaxsph.field.octree_sums import Columns, LeafSums, OctreeMedium, Place, SeenSpheres, octree_over
 from jaxsph.field.tasks import SlabTask
@@ -60,7 +60,15 @@ class OctreeParticles(OctreeMedium):
 
         Differentiation:
             By particles and transfer function; which leaf has which particles is held fixed.
+
+        Raises:
+            ValueError: of particles that carry two quantities.
         """
+        if particles.extinction_quantity is not None:
+            raise ValueError(
+                "`particles` in an octree carry one quantity, and these carry two (`quantity=(A, B)`); give "
+                "`integrator='samples'` or `'segments'`, which take those as they are, or particles with a single `quantity`"
+            )
         return cls(octree_over(particles, plan), None, particles, transfer, particles.kernel)
 
     def seen_by(self, camera: Camera) -> OctreeParticles:
@@ -69,8 +77,7 @@ class OctreeParticles(OctreeMedium):
             return self
         dtype = jnp.promote_types(self.particles.dtype, camera.dtype)
         transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), self.transfer)
-        quantity, transfer = rescaled(self.particles.quantity.astype(dtype), transfer)
-        particles = dataclasses.replace(self.particles, quantity=quantity)
+        particles, transfer = in_units_of(self.particles, transfer)
         viewed = view_particles(particles, camera, jnp.stack([camera.near, camera.far]).astype(dtype), 1)
         columns = jnp.stack([getattr(viewed, name) for name in COLUMNS], 1)
         seen = SeenSpheres.of(columns, self.octree, camera, viewed.faults, look=transfer.segments())

@@ -19,7 +19,7 @@ from jaxtyping import Array, Int
 from jaxsph.access.ordering import Ordered
 from jaxsph.field.fetch import Block, fetch, quantities_of
 from jaxsph.field.gather import BLOCK, PARTS
-from jaxsph.field.sums import Sums, sums_of
+from jaxsph.field.sums import Sums, sums_of, with_block
 from jaxsph.field.tasks import SlabTask
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
@@ -39,18 +39,18 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
     entry, s = task.entry, task.depth[..., None]
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
-    windows, reference = (entry.begin[..., None], entry.length[..., None]), (entry.reference_quantity[:, None],)
+    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     smooth, largest = kernels.by_name(kernel), jnp.finfo(s.dtype).max
 
     def fetched(index: Array) -> Block:
-        return fetch(ordered, rank, windows, index, reference)[1]
+        return fetch(ordered, rank, windows, index, references)[1]
 
     block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-    channels = list(sums.all)
-    for k in range(BLOCK):
-        one = jax.tree.map(lambda column, k=k: column[:, k, None, None], block)
+
+    def weighed(k: int) -> tuple[Array, tuple[Array, ...]]:
+        one = jax.tree.map(lambda column: column[:, k, None, None], block)
         across = jnp.minimum(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
         along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
-        w = smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp)
-        channels = [channels[0] + w, *(old + w * q for old, q in zip(channels[1:], one.quantities, strict=True))]
-    return sums_of(channels)
+        return smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp), one.quantities
+
+    return with_block(sums, (weighed(k) for k in range(BLOCK)))

@@ -34,8 +34,8 @@ class SlabSchedule:
         level: its samples are `2**level` fine samples apart; a super-pixel is one sample of the coarsest level.
         begin, length: windows of the bundle's list, for each class of supports.
         count: sum of `length` over classes; 0 for super-pixels and interpolated slabs.
-        reference_quantity: what the entry's sums are taken relative to, the quantity of a particle near by: so that their
-            rounding is a share of how much quantities differ, and a constant is rendered as that constant.
+        references: what the entry's sums are taken relative to, each quantity of a particle near by: so that their rounding is
+            a share of how much quantities differ, and a constant is rendered as that constant.
         painted: super-pixels; None where there can be none.
         paint: their red, green, blue and extinction.
         method: how sums are found (`DENSE`, ...); None where all are found from all particles at all rays.
@@ -46,17 +46,17 @@ class SlabSchedule:
     begin: Int[Array, "classes slabs bundles"]
     length: Int[Array, "classes slabs bundles"]
     count: Int[Array, "slabs bundles"]
-    reference_quantity: Float[Array, "slabs bundles"]
+    references: tuple[Float[Array, "slabs bundles"], ...]
     painted: Bool[Array, "slabs bundles"] | None = None
     paint: Float[Array, "4 slabs bundles"] | None = None
     method: Int[Array, "slabs bundles"] | None = None
 
 
-def full_rate(windows: SlabWindows, reference_quantity: Float[Array, "slabs bundles"]) -> SlabSchedule:
+def full_rate(windows: SlabWindows, references: tuple[Float[Array, "slabs bundles"], ...]) -> SlabSchedule:
     """Every filled slab at level 0: the reference image."""
     filled = windows.count > 0
     level = jnp.zeros_like(windows.count)
-    return SlabSchedule(filled, level, windows.begin, windows.length, windows.count, reference_quantity)
+    return SlabSchedule(filled, level, windows.begin, windows.length, windows.count, references)
 
 
 def reference_quantities(

@@ -23,6 +23,7 @@ from jaxsph.field.volume_grid import VolumeGrid
 from jaxsph.model.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer import Segments, TransferFunction, find, read
+from jaxsph.model.transfer_joined import joined
 from jaxsph.model.transfer_means import MeanTables
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
@@ -73,7 +74,7 @@ class VolumeMedium(Medium):
             held fixed.
         """
         grid, ranges = VolumeGrid.seen(volume, camera), MacrocellRanges.of(volume.values)
-        transfer = jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer)
+        transfer = joined(jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer))
         still = jax.tree.map(jax.lax.stop_gradient, transfer)
         placed = jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all()
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))

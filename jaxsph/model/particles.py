@@ -20,6 +20,7 @@ NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, befo
 
 
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
+SECOND = "extinction_quantity"  # a column that there may be or not
 
 
 def capacity_class(count: int) -> int:
@@ -38,12 +39,13 @@ class Particles:
     Attributes:
         position: view-independent (world) coordinates, length units.
         support: support radius H > 0 (the kernel is 0 at distance H), length units.
-        quantity: the carried quantity q, the input of the transfer function.
+        quantity: the carried quantity q, the input of the transfer function; of two, that of colours.
         volume: V >= 0, any unit: only ratios between particles matter.
         valid: which entries are particles; the rest is padding and contributes nothing.
         kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
         position_rest: what rounding float64 positions to `position` has left, length units; None where that is a negligible
             part of every support.
+        extinction_quantity: the second carried quantity, by which extinction is looked up; None where there is one alone.
     """
 
     position: Float[Array, "particles 3"]
@@ -53,6 +55,7 @@ class Particles:
     valid: Bool[Array, " particles"]
     kernel: str = "poly6"
     position_rest: Float[Array, "particles 3"] | None = None
+    extinction_quantity: Float[Array, " particles"] | None = None
 
     @classmethod
     def from_arrays(
@@ -70,7 +73,8 @@ class Particles:
         Args:
             position: (N, 3), length units; N = 0 is an empty scene.
             support: (N,) or a number: support radius H > 0, length units.
-            quantity: (N,) or a number.
+            quantity: (N,) or a number; or a pair of such, (N,) at least one: colour is then looked up by the first, extinction
+                by the second, with a transfer function that has `extinction_values`.
             volume: (N,) or a number, >= 0.
             kernel: name of the smoothing kernel.
             capacity: pad to this many entries; default the class of N, see `capacity_class`, so that sets of similar size
@@ -86,7 +90,7 @@ class Particles:
                 the dtype cannot hold.
         """
         kernels.by_name(kernel)
-        arrays = {"position": position, "support": support, "quantity": quantity, "volume": volume}
+        arrays = {"position": position, "support": support, **_quantities(quantity), "volume": volume}
         arrays = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in arrays.items()}
         for name, value in arrays.items():
             require_real(name, value)
@@ -94,7 +98,7 @@ class Particles:
             arrays["position"] = arrays["position"].reshape(0, 3)
         require_shape("position", arrays["position"], (None, 3), "one row (x, y, z) a particle")
         count = arrays["position"].shape[0]
-        for name in ("support", "quantity", "volume"):
+        for name in list(arrays)[1:]:
             if arrays[name].ndim == 0:
                 arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
             require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
@@ -122,15 +126,26 @@ class Particles:
         """
         if capacity < self.capacity:
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
-        padded = {name: _repeated(name, getattr(self, name), capacity, jnp) for name in NOTHING}
+        padded = {name: _repeated(name, column, capacity, jnp) for name, column in self.columns.items()}
         valid = jnp.pad(self.valid, (0, capacity - self.capacity))
         rest = None if self.position_rest is None else _repeated("position", self.position_rest, capacity, jnp)
         return dataclasses.replace(self, **padded, valid=valid, position_rest=rest)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
-        """The particles that exist, without padding (host side): `position`, `support`, `quantity` and `volume`."""
+        """The particles that exist, without padding (host side): all `columns`."""
         valid = np.asarray(self.valid)
-        return {name: np.asarray(getattr(self, name))[valid] for name in NOTHING}
+        return {name: np.asarray(column)[valid] for name, column in self.columns.items()}
+
+    @property
+    def columns(self) -> dict[str, Float[Array, "particles ..."]]:
+        """`position`, `support`, `quantity` and `volume`; and `extinction_quantity`, where there is one."""
+        names = NOTHING if self.extinction_quantity is None else (*NOTHING, SECOND)
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def quantities(self) -> tuple[Float[Array, " particles"], ...]:
+        """That by which colour and extinction are looked up; or two, one for each."""
+        return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
 
     @property
     def capacity(self) -> int:
@@ -165,6 +180,19 @@ class Particles:
         return (position - support).min(0), (position + support).max(0)
 
 
+def _quantities(given: Any) -> dict[str, Any]:
+    """One quantity or a pair, by name. A sequence of numbers alone is one quantity, as it is where there are two particles."""
+    pair = isinstance(given, tuple | list) and any(np.ndim(part) > 0 for part in given)
+    if not pair:
+        return {"quantity": given}
+    if len(given) != 2:
+        raise ValueError(
+            f"`quantity` must be one array, or a pair (by which to colour, by which to absorb), got {len(given)}; "
+            "colour is looked up by the first, extinction by the second"
+        )
+    return {"quantity": given[0], SECOND: given[1]}
+
+
 def _padded(name: str, value: Any, dtype: Any, capacity: int) -> Array:
     xp = jnp if is_traced(value) else np
     with np.errstate(over="ignore"):  # what overflows is refused by name, later
@@ -175,7 +203,7 @@ def _repeated(name: str, value: Any, capacity: int, xp: Any) -> Any:
     """A column up to its capacity with its first entry: whoever forgets what is `valid` meets no number of our own making."""
     missing = (capacity - value.shape[0], *value.shape[1:])
     if name == "volume" or not value.shape[0]:
-        return xp.concatenate([value, xp.full(missing, NOTHING[name], value.dtype)])
+        return xp.concatenate([value, xp.full(missing, NOTHING.get(name, 0.0), value.dtype)])
     return xp.concatenate([value, xp.broadcast_to(value[:1], missing)])
 
 
@@ -210,5 +238,5 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
 
 
 jax.tree_util.register_dataclass(
-    Particles, data_fields=["position", "support", "quantity", "volume", "valid", "position_rest"], meta_fields=["kernel"]
+    Particles, data_fields=[f.name for f in dataclasses.fields(Particles) if f.name != "kernel"], meta_fields=["kernel"]
 )

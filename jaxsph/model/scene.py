@@ -73,6 +73,8 @@ class Scene:
         volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")
+        if self.particles is not None and self.transfer is not None:
+            _require_looks(self.particles, self.transfer)
         if self.particles is None and not volumes and not self.point_sets and not self.media:
             absent = "`particles`, `volume`, `points` and `media` are all absent"
             raise ValueError(f"{absent}; give `jaxsph.Scene` something to look at")
@@ -105,6 +107,15 @@ class Scene:
             return self.particles
         entry: dict[str, Any] = {name: jnp.full(1, value, self.dtype) for name, value in NOTHING.items()}
         return Particles(**entry | {"position": jnp.zeros((1, 3), self.dtype)}, valid=jnp.zeros(1, bool))
+
+
+def _require_looks(particles: Particles, transfer: TransferFunction) -> None:
+    if particles.extinction_quantity is not None and transfer.extinction_values is None:
+        raise ValueError(
+            "`particles` carry two quantities, but `transfer` looks up colour and extinction by one: give "
+            "`jaxsph.TransferFunction.from_points(..., extinction_values=...)`, control points in units of the second, or "
+            "`jaxsph.Particles.from_arrays` a single `quantity`"
+        )
 
 
 def _all_of(part: Any) -> tuple[Any, ...]:

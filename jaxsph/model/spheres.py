@@ -27,8 +27,7 @@ def spheres_of(scene: Scene) -> Particles:
         return sets[0]
     dtype = scene.dtype
     columns = {
-        name: jnp.concatenate([getattr(one, name).astype(dtype) for one in sets])
-        for name in ("position", "support", "quantity", "volume")
+        name: jnp.concatenate([one.columns.get(name, one.quantity).astype(dtype) for one in sets]) for name in sets[0].columns
     }
     rest = None
     if any(one.position_rest is not None for one in sets):

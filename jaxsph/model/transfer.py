@@ -28,63 +28,90 @@ class TransferFunction(TransferWays):
         values: ascending control points, in units of the quantity.
         colors: RGB in [0, 1] at the control points.
         extinction: >= 0 at the control points, per length unit.
+        extinction_values: ascending control points of extinction, where those are others; None where both have the same. Of
+            particles that carry two quantities, these are in units of the second.
     """
 
     values: Float[Array, " points"]
     colors: Float[Array, "points 3"]
-    extinction: Float[Array, " points"]
+    extinction: Float[Array, " points_of_extinction"]
+    extinction_values: Float[Array, " points_of_extinction"] | None = None
 
     @classmethod
-    def from_points(cls, values: Any, colors: Any, extinction: Any) -> TransferFunction:
+    def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
         """Check and pack control points.
 
         Args:
             values: (K,) ascending (equal neighbours allowed), K >= 1, units of the quantity.
             colors: (K, 3) in [0, 1].
-            extinction: (K,) >= 0, per length unit.
+            extinction: (K,) >= 0, per length unit; (M,) where `extinction_values` are given.
+            extinction_values: (M,) ascending, M >= 1: control points of extinction alone. Of particles with two quantities
+                (`Particles.from_arrays(..., quantity=(A, B))`) colour is then a function of A, extinction one of B; of what
+                carries one quantity, both are functions of that, each with its own control points.
 
         Raises:
             ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0, values
                 that the dtype cannot hold apart.
         """
-        given = {"values": values, "colors": colors, "extinction": extinction}
+        given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
+        given = {name: value for name, value in given.items() if value is not None}
         given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
         for name, value in given.items():
             require_real(name, value)
-        require_shape("values", given["values"], (None,), "one number a control point")
-        points = given["values"].shape[0]
-        if points < 1:
-            raise ValueError("`values` must hold at least one control point, got none")
+        control = [name for name in ("values", "extinction_values") if name in given]
+        for name in control:
+            require_shape(name, given[name], (None,), "one number a control point")
+            if given[name].shape[0] < 1:
+                raise ValueError(f"`{name}` must hold at least one control point, got none")
+        points, of_extinction = (given[name].shape[0] for name in (control[0], control[-1]))
         require_shape("colors", given["colors"], (points, 3), f"one RGB row for each of the {points} values")
-        require_shape("extinction", given["extinction"], (points,), f"one number for each of the {points} values")
+        require_shape(
+            "extinction", given["extinction"], (of_extinction,), f"one number for each of the {of_extinction} {control[-1]}"
+        )
         if not is_traced(*given.values()):
             for name, value in given.items():
                 require_finite(name, value)
             require_positive("extinction", given["extinction"], "extinction is a loss of light, never a gain", strict=False)
             require_positive("colors", given["colors"], "colours lie in [0, 1]", strict=False)
             require_positive("1 - colors", 1 - np.asarray(given["colors"], np.float64), "colours lie in [0, 1]", strict=False)
-            descents = np.flatnonzero(np.diff(np.asarray(given["values"])) < 0)
-            if descents.size:
-                i = int(descents[0])
-                before, after = given["values"][i], given["values"][i + 1]
-                raise ValueError(
-                    f"`values` must ascend, but values[{i}] = {before} > values[{i + 1}] = {after}; sort the control points"
-                )
+            for name in control:
+                _require_ascending(name, given[name])
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
         packed = {name: jnp.asarray(value, dtype) for name, value in given.items()}
         if not is_traced(*given.values()):
             for name, value in packed.items():
                 require_finite(name, value, f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
-            _require_apart(np.asarray(given["values"], np.float64), packed["values"])
+            for name in control:
+                _require_apart(name, np.asarray(given[name], np.float64), packed[name])
         return cls(**packed)
 
-    def __call__(self, quantity: Float[Array, "..."]) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
-        """Colour and extinction of `quantity` (any shape): `colour(Q)` (..., 3), `extinction(Q)` (...) per length unit."""
-        channels = look_up(self.segments(), jnp.asarray(quantity, self.values.dtype))
-        return jnp.stack(channels[:3], -1), channels[3]
+    def __call__(
+        self, quantity: Float[Array, "..."], extinction_quantity: Float[Array, "..."] | None = None
+    ) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
+        """Colour and extinction of `quantity` (any shape): `colour(Q)` (..., 3), `extinction(Q)` (...) per length unit.
+
+        Args:
+            quantity: that of colours.
+            extinction_quantity: that of extinction; by default, the same.
+        """
+        other = quantity if extinction_quantity is None else extinction_quantity
+        parts, quantities = self.parts(), [jnp.asarray(value, self.values.dtype) for value in (quantity, other)]
+        channels = look_up(parts[0].segments(), quantities[0])
+        of_other = channels if len(parts) == 1 and other is quantity else look_up(parts[-1].segments(), quantities[1])
+        return jnp.stack(channels[:3], -1), of_other[3]
+
+    def parts(self) -> tuple[TransferFunction, ...]:
+        """By the quantities that they are looked up by: itself; or colours, where extinction is 1, and extinction in black."""
+        if self.extinction_values is None:
+            return (self,)
+        black = jnp.zeros((*self.extinction.shape, 3), self.colors.dtype)
+        return (
+            TransferFunction(self.values, self.colors, jnp.ones_like(self.values)),
+            TransferFunction(self.extinction_values, black, self.extinction),
+        )
 
     def segments(self) -> Segments:
-        """The tables that `look_up` reads: made once, outside of loops."""
+        """The tables that `look_up` reads, of what has no `extinction_values`: made once, outside of loops."""
         table = jnp.concatenate([self.colors, self.extinction[:, None]], 1).T
         change = jnp.append(table[:, 1:] - table[:, :-1], jnp.zeros((4, 1), table.dtype), 1)
         width = jnp.append(self.values[1:] - self.values[:-1], 0)
@@ -101,18 +128,27 @@ class TransferFunction(TransferWays):
         return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
 
 
-def _require_apart(given: np.ndarray, packed: Array) -> None:
+def _require_ascending(name: str, given: Any) -> None:
+    descents = np.flatnonzero(np.diff(np.asarray(given)) < 0)
+    if descents.size:
+        i = int(descents[0])
+        raise ValueError(
+            f"`{name}` must ascend, but {name}[{i}] = {given[i]} > {name}[{i + 1}] = {given[i + 1]}; sort the control points"
+        )
+
+
+def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:
     """Refuse values that rounding moves by a share of what they span, or takes for (nearly) nothing."""
     span, largest = given[-1] - given[0], np.abs(given).max()
     moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), MIN_NORMALS * np.finfo(packed.dtype).tiny
     if moved > MOVED * span:
         raise ValueError(
-            f"`values` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
+            f"`{name}` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
             "subtract an offset from values and quantity, or use float64 under jax.enable_x64"
         )
     if 0 < largest < smallest:
         raise ValueError(
-            f"`values` must reach at least {smallest:.3g} in {packed.dtype} unless all are 0, but the largest is {largest:.3g}; "
+            f"`{name}` must reach at least {smallest:.3g} in {packed.dtype} unless all are 0, but the largest is {largest:.3g}; "
             "multiply values and quantity by the same number"
         )
 
@@ -187,6 +223,16 @@ def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Arra
     return segment, jnp.clip((quantity - start) * inverse, 0, 1)
 
 
+def slope_in_middle(
+    segments: Segments, near: Float[Array, "*any"], far: Float[Array, "*any"], channel: int
+) -> Float[Array, "*any"]:
+    """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
+    middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
+    slopes, place = jnp.clip(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
+    slope = _at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
+    return jnp.where(middle >= segments.start[0], slope, 0)
+
+
 def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
     """Of each of `rows`, the entry of the segment that holds `quantity`."""
     found = [row[0] for row in rows]
@@ -248,5 +294,5 @@ def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) 
     return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
 
 
-jax.tree_util.register_dataclass(Segments, data_fields=[f.name for f in dataclasses.fields(Segments)], meta_fields=[])
-jax.tree_util.register_dataclass(TransferFunction, data_fields=["values", "colors", "extinction"], meta_fields=[])
+for _kind in (Segments, TransferFunction):
+    jax.tree_util.register_dataclass(_kind, data_fields=[f.name for f in dataclasses.fields(_kind)], meta_fields=[])

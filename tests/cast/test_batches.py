@@ -20,10 +20,11 @@ def schedule_of(rng, level=None, painted=None):
     filled = rng.uniform(size=(SLABS, BUNDLES)) < 0.6
     count = np.where(filled, rng.integers(1, 200, filled.shape), 0)
     level = np.zeros_like(count) if level is None else np.full_like(count, level)
-    columns = (filled, level, count[None] * 0, count[None], count, np.zeros(filled.shape, np.float32))
+    columns = filled, level, count[None] * 0, count[None], count
     painted = None if painted is None else jnp.full(filled.shape, painted)
     paint = None if painted is None else jnp.zeros((4, *filled.shape))
-    return SlabSchedule(*(jnp.asarray(column) for column in columns), painted, paint)
+    reference = jnp.zeros(filled.shape, jnp.float32)
+    return SlabSchedule(*(jnp.asarray(column) for column in columns), (reference,), painted, paint)
 
 
 def batches(schedule, samples=SLABS * 4 - 1, list_id=None, on_borders=False):

@@ -20,7 +20,7 @@ from jaxsph.control.analysis import analyse
 from jaxsph.control.errors import SUPER_PIXEL
 from jaxsph.control.levels import bound
 from jaxsph.control.merge import coarse_schedule, merged_levels
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import tables_of_parts
 from jaxsph.model import registry
 
 CANDIDATES = range(SUPER_PIXEL + 1)
@@ -51,7 +51,7 @@ def look(scene, camera, frame, wished, *, plan, kernel, form):
     filled, free = (filled_cells(slabs, slab_samples, number) for slabs in (grid.windows, beside))
     whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
     levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)
-    tables, unrelaxed = range_tables(scene.transfer), jnp.zeros((), reference.dtype)
+    tables, unrelaxed = tables_of_parts(scene.transfer), jnp.zeros((), reference[0].dtype)
     sizes = slab_samples, 2, plan.cast.tuning.cells_bounded
     analysis = analyse(grid, beside, camera, reference, filled, tables, unrelaxed, *sizes)
     method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), registry.screen(plan.screen).packets)
@@ -64,7 +64,7 @@ def look(scene, camera, frame, wished, *, plan, kernel, form):
     exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))
     # a super-pixel is a sample as long as a cell, of colours within all ranges: as one of the coarsest level
     bounds = bundle_bounds(grid, camera, scene.transfer, jnp.minimum(levels, MAX_LEVEL), slab_samples, form=form)
-    rounding = 2 * jnp.finfo(reference.dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
+    rounding = 2 * jnp.finfo(reference[0].dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
     off = bound(analysis.error, jnp.where(filled, levels, 0), rounding)
     return Looked(exact, found, bounds.lo, bounds.hi, off, levels, filled)
 

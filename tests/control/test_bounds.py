@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.control.bounds import Footprint, Spheres, sample_bounds
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import tables_of_parts
 
 RAYS = np.linspace(-0.1, 0.1, 8, dtype=np.float32)[:, None]
 BORDERS = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0], np.float32)[:, None]
@@ -17,14 +17,14 @@ BORDERS = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0], np.float32)[:, None]
 def bounds(*balls, subdivisions=2):
     """Bounds of the four samples of one bundle of parallel rays, by balls (x, y, z, radius, quantity)."""
     x, y, z, radius, quantity = (jnp.asarray(column, jnp.float32) for column in zip(*balls, strict=True))
-    spheres = Spheres(x, y, z, 1 / radius, 1 / radius, quantity)
+    spheres = Spheres(x, y, z, 1 / radius, 1 / radius, (quantity,))
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 0.5, 0]], [1.0, 3.0])
     window = jnp.zeros((1, 1), jnp.int32), jnp.full((1, 1), len(balls), jnp.int32)
     rank, footprint = jnp.arange(len(balls), dtype=jnp.int32), Footprint(jnp.asarray(RAYS), jnp.asarray(RAYS))
     reference = jnp.full(1, 0.5, jnp.float32)
     find = jax.jit(sample_bounds, static_argnames=("perspective", "subdivisions"))
-    tables, how = range_tables(transfer), {"perspective": False, "subdivisions": subdivisions}
-    return find(spheres, rank, window, footprint, jnp.asarray(BORDERS), (reference, reference), tables, **how)
+    tables, how = tables_of_parts(transfer), {"perspective": False, "subdivisions": subdivisions}
+    return find(spheres, rank, window, footprint, jnp.asarray(BORDERS), ((reference, reference),), tables, **how)
 
 
 def test_a_slab_is_touched_where_a_sphere_reaches_it_and_covered_where_one_holds_it():

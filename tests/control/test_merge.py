@@ -26,7 +26,7 @@ unions = jax.jit(coarser_windows, static_argnums=1)
 @functools.partial(jax.jit, static_argnums=2)
 def evaluated(windows, levels, slab_samples):
     shape = windows[0].length.shape[1:]
-    schedule = coarse_schedule(windows, levels, jnp.zeros(shape), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
+    schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
     return evaluations(schedule, CELLS * CELL_SAMPLES, slab_samples)
 
 
@@ -47,7 +47,7 @@ def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
 
 def test_samples_past_the_last_are_not_evaluated_at_full_rate():
     windows, levels = windows_of(4), jnp.zeros((CELLS, BUNDLES), jnp.int32)
-    schedule = coarse_schedule(unions(windows, 4), levels, jnp.zeros(windows.count.shape), None, 4)
+    schedule = coarse_schedule(unions(windows, 4), levels, (jnp.zeros(windows.count.shape),), None, 4)
     all_of_them, fewer = (np.asarray(evaluations(schedule, CELLS * CELL_SAMPLES - past, 4)) for past in (0, 3))
     np.testing.assert_allclose(all_of_them - fewer, 3 * np.asarray(windows.count)[-1])
 

@@ -11,7 +11,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.control.probe import WORTHWHILE, probe, worthwhile
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import tables_of_parts
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def probed(frames, stages):
         particles = js.Particles(**{**vars(scene.particles), "quantity": jnp.asarray(quantity, jnp.float32)})
         transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [extinction, extinction])
         grid, _ = stages(particles, camera, plan=plan)
-        found = run(grid, range_tables(transfer), jnp.float32(tolerance), jnp.float32(lateral))
+        found = run(grid, tables_of_parts(transfer), jnp.float32(tolerance), jnp.float32(lateral))
         count = np.pad(np.asarray(grid.windows.count), ((0, -grid.windows.count.shape[0] % 4), (0, 0)))
         return found, count.reshape(-1, 4, count.shape[1]).sum(1)
 

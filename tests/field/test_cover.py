@@ -36,7 +36,7 @@ def drawn(rng, form):
     length = np.stack([rng.integers(0, 10, TASKS), rng.integers(0, 10, TASKS)]).astype(np.int32)
     reference = rng.uniform(0, 1, TASKS)
     zero = jnp.zeros(TASKS, jnp.int32)
-    given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), jnp.asarray(reference)
+    given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), (jnp.asarray(reference),)
     entry = SlabSchedule(zero == 0, zero, *given)
     first = rng.uniform(NEAR, FAR, (TASKS, 1))
     depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
@@ -84,7 +84,7 @@ def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form
             jax.tree.map(np.asarray, covered(ordered, rank, task, jnp.asarray(inside), label)) for label in ("quantity", "place")
         )
         for item, (begin, end, some) in enumerate(found):
-            quantity = np.asarray(ordered.quantity)[some] - float(task.entry.reference_quantity[item])
+            quantity = np.asarray(ordered.quantity)[some] - float(task.entry.references[0][item])
             for ray in np.flatnonzero(~inside[item].all(0)) if len(some) else ():
                 pivot = cover.pivot[item, ray]
                 assert pivot in depth[item][~inside[item, :, ray]]

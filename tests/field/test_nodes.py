@@ -34,7 +34,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
         scene.particles.kernel,
         plan.cast.slab_samples,
         Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, spacing),
-        jnp.float64(0.4),
+        (jnp.float64(0.4),),
         plan.cast.tuning.cells_of_nodes,
     )
 
@@ -53,7 +53,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
     for k in range(len(x)):
         square = ((u * spread - x[k]) ** 2 + (v * spread - y[k]) ** 2 + (depth - z[k]) ** 2) * scale[k] ** 2
         w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
-        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.reference_quantity))
+        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.references[0]))
     # nodes beyond the image lie in bundles that it has no list for
     rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
     for found, wanted in ((lattice.weight, weight), (*lattice.weighted, weighted)):
@@ -70,7 +70,7 @@ def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     grid, _ = stages(scene.particles, camera, plan=plan)
     every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
     kept = slice(None), slice(-GAP), slice(-GAP)
-    sizes = jnp.float32(0.4), plan.cast.tuning.cells_of_nodes
+    sizes = (jnp.float32(0.4),), plan.cast.tuning.cells_of_nodes
     whole, part = (
         sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, *sizes).weight[kept]
         for region in (every, some)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.field.particles import SampleCotangents, pull_control_points
+from jaxsph.field.particles import LookUpCotangents, pull_control_points
 from jaxsph.model.transfer import SELECT_ALL
 
 
@@ -19,7 +19,7 @@ def test_control_points_have_the_cotangents_of_the_samples_between_them(points, 
     values = {"even": np.linspace(-1, 2, points), "uneven": np.sort(rng.uniform(-1, 2, points))}[spacing]
     segments = js.TransferFunction.from_points(values, np.zeros((points, 3)), np.zeros(points)).segments()
     found, *optics, quantity = rng.normal(0.5, 1, (6, 3, 4, 64))
-    samples = SampleCotangents(None, None, [jnp.asarray(value) for value in optics], jnp.asarray(quantity), jnp.asarray(found))
+    samples = LookUpCotangents([jnp.asarray(value) for value in optics], jnp.asarray(quantity), jnp.asarray(found))
     wanted = np.zeros((5, points))
     at = np.clip(np.searchsorted(values, found, side="right") - 1, 0, points - 2)
     part = np.clip((found - values[at]) / (values[at + 1] - values[at]), 0, 1)

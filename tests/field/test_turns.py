@@ -15,7 +15,7 @@ TASKS = 256
 def task_of(length):
     count = jnp.asarray(length, jnp.int32)
     entry = SlabSchedule(
-        count > 0, 0 * count, jnp.zeros((2, TASKS), jnp.int32), jnp.stack([count // 3, count - count // 3]), count, 0.0 * count
+        count > 0, 0 * count, jnp.zeros((2, TASKS), jnp.int32), jnp.stack([count // 3, count - count // 3]), count, (0.0 * count,)
     )
     nothing = jnp.zeros((TASKS, 1))
     return SlabTask(entry, count, count, nothing, nothing, nothing, nothing, True)

@@ -23,7 +23,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
 from jaxsph.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
 from jaxsph.control.errors import DEPTH_ROUNDING, EXPONENTIAL
-from jaxsph.control.ranges import range_tables
+from jaxsph.control.ranges import tables_of_parts
 from jaxsph.model.camera import Camera
 from jaxsph.model.transfer import TransferFunction
 
@@ -61,13 +61,15 @@ def bundle_bounds(
     dtype = ordered.x.dtype
     per_cell = CELL_SAMPLES // slab_samples
     num_cells = -(-slabs // per_cell)
-    tables, balls = range_tables(transfer), spheres(ordered)
+    tables, balls = tables_of_parts(transfer), spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
     borders = grid.borders(num_cells * CELL_SAMPLES)
     beside = slab_windows_with_borders(ordered, lists)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
-    least = jnp.where(ordered.live, ordered.quantity, jnp.inf).min()
-    greatest = jnp.where(ordered.live, ordered.quantity, -jnp.inf).max()
+    extremes = [
+        (jnp.where(ordered.live, quantity, jnp.inf).min(), jnp.where(ordered.live, quantity, -jnp.inf).max())
+        for quantity in ordered.quantities
+    ]
     u, v = grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))
     paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2) if camera.is_perspective else jnp.ones((1, 1, bundles), dtype)
     path = paths.min((0, 1)), paths.max((0, 1))
@@ -79,7 +81,7 @@ def bundle_bounds(
             edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1)]
             edges = jnp.broadcast_to(edges[:, None], (slab_samples + 1, bundles))
             window = begin[:, slab], length[:, slab]
-            places = jnp.broadcast_to(least, (bundles,)), jnp.broadcast_to(greatest, (bundles,))
+            places = tuple(tuple(jnp.broadcast_to(end, (bundles,)) for end in ends) for ends in extremes)
             footprint = Footprint(u, v[::-1])
             settings = tables, camera.is_perspective, subdivisions
             found.append(sample_bounds(balls, lists.rank, window, footprint, edges, places, *settings))
