@@ -11,6 +11,7 @@ import dataclasses
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
     position = np.concatenate([table.position for table in filled])
     support, volume = whole([table.support for table in filled]), whole([table.volume for table in filled])
     said = (*first.conventions, f"of {number} files")
-    more = {"support": support, "volume": volume, "conventions": said, "num_files": 1}
+    more: dict[str, Any] = {"support": support, "volume": volume, "conventions": said, "num_files": 1}
     return dataclasses.replace(first, position=position, columns=columns, **more)
 
 
