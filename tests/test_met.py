@@ -40,7 +40,9 @@ def test_what_lies_behind_is_there_but_absorbs_only_what_gets_through():
 @pytest.mark.parametrize("perspective", [True, False])
 def test_sums_over_all_values_are_the_mean_light_of_the_rays(perspective):
     rng = np.random.default_rng(5)
-    particles = js.Particles.from_arrays(rng.normal(size=(80, 3)).astype(np.float32), 0.9, rng.uniform(size=80), rng.uniform(1, 2, 80))
+    particles = js.Particles.from_arrays(
+        rng.normal(size=(80, 3)).astype(np.float32), 0.9, rng.uniform(size=80), rng.uniform(1, 2, 80)
+    )
     camera = js.Camera.framing(particles, width=12, height=10)
     if not perspective:
         camera = js.Camera.orthographic((0, 0, -6), (0, 0, 0), view_height=7, width=12, height=10, near=1, far=11)

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph import io
 
-SIMPLE = {"format": "jaxsph transfer function", "version": 1, "values": [0, 1], "colors": [[0, 0, 0], [1, 1, 1]], "extinction": [0, 2]}
+SIMPLE = {
+    "format": "jaxsph transfer function",
+    "version": 1,
+    "values": [0, 1],
+    "colors": [[0, 0, 0], [1, 1, 1]],
+    "extinction": [0, 2],
+}
 
 
 def written(path, **changes):

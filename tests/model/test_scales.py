@@ -10,7 +10,8 @@ QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
 
 
 @pytest.mark.parametrize(
-    ("domain", "name"), [("linear", "linear"), ("percentile", "linear"), ("log", "log"), ("symlog", "even"), ("equalised", "even")]
+    ("domain", "name"),
+    [("linear", "linear"), ("percentile", "linear"), ("log", "log"), ("symlog", "even"), ("equalised", "even")],
 )
 @pytest.mark.parametrize("points", [16, 64])
 def test_control_values_of_every_domain_are_even_on_their_scale_also_in_float32(domain, name, points):
