@@ -213,7 +213,7 @@ class _Page:
             labelsize=0.85 * self.points, width=0.08 * self.points, length=0.35 * self.points, pad=0.25 * self.points
         )
         axes.yaxis.get_offset_text().set_fontsize(0.85 * self.points)
-        fits = len(bar.title) * TALLEST * self.letter < 0.95 * self.height
+        fits = (len(bar.label) + len(bar.unit) + 3) * TALLEST * self.letter < 0.95 * self.height
         axes.set_ylabel(bar.title if fits else bar.title.replace(" (", "\n(", 1), fontsize=self.points)
         extent = axes.get_tightbbox(self.canvas.get_renderer())
         self._fit(int(np.ceil((self.whole if extent is None else extent.x1) + 0.6 * self.letter)))

@@ -98,9 +98,9 @@ def _powers(unit: CodeUnit, times: str, power: str, exact: bool = False) -> str:
 
 
 def _product(factors: list[tuple[str, float]], times: str, power: str, exact: bool = False) -> str:
-    """Names to their powers; `exact` as fractions."""
+    """Names to their powers, positive ones first; `exact` as fractions."""
     parts = []
-    for name, exponent in factors:
+    for name, exponent in sorted(factors, key=lambda factor: factor[1] < 0):
         if exponent == 1:
             parts.append(name)
         elif exponent:
