@@ -258,18 +258,19 @@ def _moments(snapshots: Snapshots, frames: int) -> Sequence[Source]:
 def _render(rendered: Iterator[FrameFile], frames: int, folder: Path) -> list[Path]:
     """The files of all frames; on the way, said how far it is."""
     files: list[Path] = []
-    made, started, last = 0, time.perf_counter(), 0.0
+    made, started = 0, time.perf_counter()
+    since = last = started  # the end of the first that was rendered, for which programs are compiled
     try:
         with progress("render", " frames") as show:
             for frame in rendered:
                 files.append(frame.path)
-                made += frame.rendered
-                now = time.perf_counter() - started
+                made, now = made + frame.rendered, time.perf_counter()
+                since = now if made <= 1 else since
                 if show is not None:
                     show(len(files), frames)
-                elif made and (now - last > EVERY or len(files) == frames):
-                    last = now
-                    say("frame", f"{len(files)} of {frames}, {now / made:.2f} s each, {_left(now, made, frames - len(files))}")
+                elif made > 1 and (now - last > EVERY or len(files) == frames):
+                    last, each = now, (now - since) / (made - 1)
+                    say("frame", f"{len(files)} of {frames}, {each:.2f} s each, {_clock(each * (frames - len(files)))} left")
     except KeyboardInterrupt:
         say("stopped", f"{len(files)} of {frames} frames are in {folder}; the same command goes on from there")
         raise
@@ -278,7 +279,7 @@ def _render(rendered: Iterator[FrameFile], frames: int, folder: Path) -> list[Pa
     return files
 
 
-def _left(seconds: float, made: int, frames: int) -> str:
-    minutes, rest = divmod(round(seconds / made * frames), 60)
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d} left"
+    return f"{hours}:{minutes:02d}:{rest:02d}"

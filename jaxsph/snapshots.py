@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.io.matching import Matched, between, ids_of, match
+from jaxsph.io.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.particles import capacity_class
 from jaxsph.survey import Reading, Survey, surveyed
@@ -32,6 +32,14 @@ class Loaded(NamedTuple):
     columns: dict[str, np.ndarray]
     kernel: str
     ids: np.ndarray | str
+    velocity: np.ndarray | None
+
+
+class Way(NamedTuple):
+    """From one snapshot to the next: who is who, and velocities times the time between where they tell how particles move."""
+
+    matched: Matched
+    run: tuple[np.ndarray, np.ndarray] | None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,7 +54,7 @@ class Snapshots:
     survey: Survey
     transfer: TransferFunction
     _loaded: dict[int, Loaded] = dataclasses.field(default_factory=dict, repr=False)
-    _matched: dict[int, Matched | str] = dataclasses.field(default_factory=dict, repr=False)
+    _ways: dict[int, Way | str] = dataclasses.field(default_factory=dict, repr=False)
 
     @classmethod
     def from_files(
@@ -95,9 +103,10 @@ class Snapshots:
     def at(self, time: float) -> Scene:
         """Particles at a time: those of a file, or between two.
 
-        Where ids match, particles move straight and evenly from one file to the next, on the shortest way in a periodic box;
-        supports and volumes change geometrically, the quantity linearly. Those that are in one of the two alone are there for
-        the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file as it is.
+        Where ids match, particles move from one file to the next on the shortest way in a periodic box: on the cubic that has
+        their velocities at its ends where files have velocities that lead to where particles are, else straight and evenly.
+        Supports and volumes change geometrically, the quantity linearly. Particles that are in one of the two alone are there
+        for the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file.
         """
         particles = self._particles(*self.place(time))
         return Scene(particles=particles, transfer=self.transfer)
@@ -131,14 +140,26 @@ class Snapshots:
         if share == 0:
             return self._packed(first.columns, first.kernel)
         second = self._load(before + 1)
-        if before not in self._matched:
-            self._matched.clear()
-            self._matched[before] = match(first.ids, second.ids)
-        matched = self._matched[before]
-        if isinstance(matched, str):
+        if before not in self._ways:
+            self._ways.clear()
+            self._ways[before] = self._way(first, second, self.times[before + 1] - self.times[before])
+        way = self._ways[before]
+        if isinstance(way, str):
             nearer = first if share < 0.5 else second
             return self._packed(nearer.columns, nearer.kernel)
-        return self._packed(between(first.columns, second.columns, matched, share, self.survey.box), first.kernel)
+        columns = between(first.columns, second.columns, way.matched, share, self.survey.box, way.run)
+        return self._packed(columns, first.kernel)
+
+    def _way(self, first: Loaded, second: Loaded, step: float) -> Way | str:
+        matched = match(first.ids, second.ids)
+        if isinstance(matched, str):
+            return matched
+        run = runs(first.velocity, second.velocity, step if self.survey.order.by_files else None)
+        if run is not None:
+            places = first.columns["position"][matched.first], second.columns["position"][matched.second]
+            way = way_of(*places, self.survey.box)
+            run = run if agree(way, (run[0][matched.first], run[1][matched.second])) else None
+        return Way(matched, run)
 
     def _load(self, number: int) -> Loaded:
         """A snapshot's particles; those of two files are kept."""
@@ -151,7 +172,9 @@ class Snapshots:
             table = self.survey.reading.table(file.path)
             particles, _ = io.particles_from_table(table, self.survey.quantity, *self.survey.reading.how)
             exact = particles.exact_position()[np.asarray(particles.valid)]
-            self._loaded[number] = Loaded({**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table))
+            self._loaded[number] = Loaded(
+                {**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table), velocity_of(table)
+            )
         return self._loaded[number]
 
     def _packed(self, columns: dict[str, np.ndarray], kernel: str) -> Particles:
@@ -171,7 +194,7 @@ class Snapshots:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what was read, so that a source can be sent to where its frame is rendered."""
-        return {**self.__dict__, "_loaded": {}, "_matched": {}}
+        return {**self.__dict__, "_loaded": {}, "_ways": {}}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import io
-from jaxsph.io.matching import Matched, ids_of, match
+from jaxsph.io.matching import agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.quantities import choose_quantity
 from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
@@ -73,6 +73,7 @@ class Step:
         matched: particles that are in both, by their ids.
         vanish, appear: particles that are in one alone.
         moved: median way of a particle over the median support; None where supports are not in the file.
+        curved: whether velocities tell how particles move.
         why: why ids could not be matched; None where they could.
     """
 
@@ -80,6 +81,7 @@ class Step:
     vanish: int = 0
     appear: int = 0
     moved: float | None = None
+    curved: bool = False
     why: str | None = None
 
 
@@ -128,10 +130,12 @@ class Survey:
         if together:
             counts = [f"{sum(getattr(step, name) for step in together):,} {name}" for name in ("matched", "vanish", "appear")]
             where = f"in {len(together)} of {len(self.steps)} intervals: {', '.join(counts)}"
-            said.insert(0, f"particles move straight and evenly where ids match, {where}")
+            said.insert(0, f"particles move from file to file by their ids, {where}")
+            curved = sum(step.curved for step in together)
+            said.insert(1, f"by their velocities in {curved} of these, straight and evenly in {len(together) - curved}")
         far = max((step.moved for step in together if step.moved is not None), default=0.0)
         if far > FAR:
-            said.append(f"the median particle moves by up to {far:.2g} supports from file to file: straight ways are a guess")
+            said.append(f"the median particle moves by up to {far:.2g} supports from file to file: what is between is a guess")
         return said
 
 
@@ -249,13 +253,10 @@ def _step(first: io.ParticleTable, second: io.ParticleTable, box: tuple[float, .
     found = match(ids_of(first), ids_of(second))
     if isinstance(found, str):
         return Step(why=found)
-    return Step(len(found.first), len(found.only_first), len(found.only_second), _moved(first, second, found, box))
-
-
-def _moved(first: io.ParticleTable, second: io.ParticleTable, found: Matched, box: tuple[float, ...] | None) -> float | None:
-    if first.support is None or not len(found.first):
-        return None
-    way = second.position[found.second].astype(np.float64) - first.position[found.first]
-    if box is not None:
-        way -= np.asarray(box) * np.round(way / np.asarray(box))
-    return float(np.median(np.linalg.norm(way, axis=1)) / np.median(first.support))
+    way = way_of(first.position[found.first], second.position[found.second], box)
+    length = float(np.median(np.linalg.norm(way, axis=1)))
+    moved = None if first.support is None else length / float(np.median(first.support))
+    step = None if first.time is None or second.time is None else second.time - first.time
+    run = runs(velocity_of(first), velocity_of(second), step)
+    curved = run is not None and agree(way, (run[0][found.first], run[1][found.second]))
+    return Step(len(found.first), len(found.only_first), len(found.only_second), moved, curved)

@@ -11,11 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
+from .quantities import ROLES
 from .table import ParticleTable
 
 ID_NAMES = ("id", "ids", "idp", "pid", "particleid", "particleids", "particle_id", "particle_ids")
 MIN_MATCHED = 0.5
 """Share of the smaller snapshot that must be found in the other: with fewer, ids are numbers of something else."""
+MAX_MISSED = 0.5
+"""Share of their way by which velocities may miss where particles are in the next snapshot, the median, to be of use."""
 GEOMETRIC = ("support", "volume")
 """Columns that are positive by nature, and change by factors."""
 
@@ -48,6 +51,21 @@ def ids_of(table: ParticleTable) -> np.ndarray | str:
     return ids
 
 
+def velocity_of(table: ParticleTable) -> np.ndarray | None:
+    """The velocities of a table's particles, (N, 3), or None."""
+    name = table.named(*ROLES["velocity"])
+    found = None if name is None else table.columns[name]
+    usable = found is not None and found.ndim == 2 and found.shape[1] == 3 and np.isfinite(found).all()
+    return found if usable else None
+
+
+def runs(first: np.ndarray | None, second: np.ndarray | None, step: float | None) -> tuple[np.ndarray, np.ndarray] | None:
+    """Velocities of two snapshots times the time between them, or None where any is not known."""
+    if first is None or second is None or step is None:
+        return None
+    return step * first.astype(np.float64), step * second.astype(np.float64)
+
+
 def match(first: np.ndarray | str, second: np.ndarray | str) -> Matched | str:
     """The particles of two snapshots that have the same id, or why they cannot be told."""
     for ids in (first, second):
@@ -69,18 +87,22 @@ def between(
     matched: Matched,
     share: float,
     box: tuple[float, float, float] | None = None,
+    run: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Columns of the particles at a share in (0, 1) of the way from one snapshot to the next, float64.
 
-    Particles in both move straight and evenly, on the shortest way across the faces of a periodic `box`; supports and volumes
-    change geometrically, all else linearly. Particles in one alone are there for the half that is nearer to it, where they are.
+    Particles in both move straight and evenly, on the shortest way across the faces of a periodic `box`; with `run`, velocities
+    times the time between the snapshots, all of first and second, they move on the cubic that has them at its ends. Supports
+    and volumes change geometrically, all else linearly. Particles in one alone are there for the half that is nearer to it,
+    where they are.
     """
     found = {}
     for name, before in first.items():
         one, other = (np.asarray(column, np.float64) for column in (before, second[name]))
         same = one[matched.first], other[matched.second]
         if name == "position":
-            moved = _moved(*same, share, box)
+            ends = None if run is None else (run[0][matched.first], run[1][matched.second])
+            moved = _moved(*same, share, box, ends)
         elif name in GEOMETRIC and all((end > 0).all() for end in same):
             moved = np.exp((1 - share) * np.log(same[0]) + share * np.log(same[1]))
         else:
@@ -90,13 +112,37 @@ def between(
     return found
 
 
-def _moved(
-    first: Float[np.ndarray, "both 3"], second: Float[np.ndarray, "both 3"], share: float, box: tuple[float, ...] | None
-) -> Float[np.ndarray, "both 3"]:
-    way = second - first
+def way_of(first: np.ndarray, second: np.ndarray, box: tuple[float, ...] | None) -> Float[np.ndarray, "both 3"]:
+    """How far particles have moved: in a periodic box, on the shortest way."""
+    way = second.astype(np.float64) - first
     if box is None:
-        return first + share * way
+        return way
     edges = np.asarray(box, np.float64)
-    place = first + share * (way - edges * np.round(way / edges))
-    inside = (first >= 0).all() and (first <= edges).all()
-    return place % edges if inside else place
+    return way - edges * np.round(way / edges)
+
+
+def agree(way: Float[np.ndarray, "both 3"], run: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Whether velocities tell how particles move from one snapshot to the next: are in its units, and change little enough.
+
+    The mean of the two must lead the median particle to within half of its way of where it is.
+    """
+    missed = np.linalg.norm(way - 0.5 * (run[0] + run[1]), axis=1)
+    return bool(np.median(missed) <= MAX_MISSED * np.median(np.linalg.norm(way, axis=1)))
+
+
+def _moved(
+    first: Float[np.ndarray, "both 3"],
+    second: Float[np.ndarray, "both 3"],
+    share: float,
+    box: tuple[float, ...] | None,
+    run: tuple[np.ndarray, np.ndarray] | None,
+) -> Float[np.ndarray, "both 3"]:
+    way = way_of(first, second, box)
+    if run is None:
+        place = first + share * way
+    else:
+        begin, end = share * (1 - share) ** 2, share**2 * (1 - share)
+        place = first + share**2 * (3 - 2 * share) * way + begin * run[0] - end * run[1]
+    if box is None or not ((first >= 0).all() and (first <= np.asarray(box)).all()):
+        return place
+    return place % np.asarray(box, np.float64)

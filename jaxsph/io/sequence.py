@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 DIGITS = re.compile(r"\d+")
+BY_FILES = "as the files say"
 MAX_NAMED = 8
 """Missing numbers that a message names one by one."""
 
@@ -25,11 +26,13 @@ class Order:
         indices: of the files as given, in the order of time.
         times: that ascend, one a file.
         told: one sentence on where they are from.
+        by_files: whether the files say them.
     """
 
     indices: tuple[int, ...]
     times: tuple[float, ...]
     told: str
+    by_files: bool
 
 
 def numbers_of(paths: Sequence[Path]) -> tuple[int, ...] | None:
@@ -86,7 +89,7 @@ def in_order(paths: Sequence[Path], times: Sequence[float | None]) -> Order:
     numbers = numbers_of(paths)
     if all(time is not None for time in times):
         found = [float(time) for time in times if time is not None]
-        told = "as the files say"
+        told = BY_FILES
     elif numbers is not None:
         found, told = [float(number) for number in numbers], "the numbers in the names, as not all files say when they are"
     else:
@@ -96,6 +99,7 @@ def in_order(paths: Sequence[Path], times: Sequence[float | None]) -> Order:
     for one, other in itertools.pairwise(indices):
         if found[one] == found[other]:
             raise ValueError(f"{paths[one]} and {paths[other]} are both of time {found[one]:g}; leave one of them out")
-    if told == "as the files say" and numbers is not None and [numbers[i] for i in indices] != sorted(numbers):
+    if told == BY_FILES and numbers is not None and [numbers[i] for i in indices] != sorted(numbers):
         told += "; that is another order than the numbers in their names have"
-    return Order(indices, tuple(found[place] for place in indices), told)
+    by_files = told.startswith(BY_FILES)
+    return Order(indices, tuple(found[place] for place in indices), told, by_files)

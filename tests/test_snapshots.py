@@ -1,0 +1,110 @@
+"""Sequences of snapshots: one look, particles at any time, and files that cannot be part of one."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+
+
+def write(folder, number, *, ids=True, time=True, seed=0, count=200, shift=0.0, dtype=np.float32, **more):
+    rng = np.random.default_rng(seed)
+    position = (rng.normal(size=(count, 3)) + (shift, 0, 0)).astype(dtype)
+    columns = {"temperature": np.linspace(0, 1 + number, count), "support": np.full(count, 0.5)}
+    columns |= {"id": np.arange(count)} if ids else {}
+    columns |= {"time": 0.5 * number} if time else {}
+    path = folder / f"s_{number:02d}.npz"
+    np.savez(path, position=position, **(columns | more))
+    return path
+
+
+def test_between_two_files_particles_are_on_their_way(tmp_path):
+    snapshots = js.Snapshots.from_files([write(tmp_path, 0), write(tmp_path, 1, shift=4.0)])
+    for share in (0.0, 0.25, 1.0):
+        found = snapshots.at(0.5 * share).particles
+        expected = np.random.default_rng(0).normal(size=(200, 3)) + (4 * share, 0, 0)
+        np.testing.assert_allclose(found.to_numpy()["position"], expected, atol=1e-5)
+    assert snapshots.times == (0.0, 0.5)
+    assert "straight and evenly in 1" in snapshots.survey.told()[1]
+    assert "8 supports" in snapshots.survey.told()[2]
+
+
+def test_velocities_that_lead_there_bend_the_way(tmp_path):
+    fall = np.zeros((200, 3))
+    fall[:, 0] = 1
+    paths = [write(tmp_path, 0, velocity=0 * fall), write(tmp_path, 1, shift=1.0, velocity=4 * fall)]
+    snapshots = js.Snapshots.from_files(paths)
+    found = snapshots.at(0.25).particles.to_numpy()["position"] - np.random.default_rng(0).normal(size=(200, 3))
+    np.testing.assert_allclose(found[:, 0], 0.25, atol=1e-5)  # a quarter of the way in half of the time
+    assert "by their velocities in 1" in snapshots.survey.told()[1]
+
+
+def test_without_ids_it_is_the_nearer_file_and_that_is_said(tmp_path):
+    snapshots = js.Snapshots.from_files([write(tmp_path, 0), write(tmp_path, 1, ids=False, shift=4.0)])
+    for time, shift in ((0.24, 0), (0.26, 4)):
+        expected = np.random.default_rng(0).normal(size=(200, 3)) + (shift, 0, 0)
+        np.testing.assert_allclose(snapshots.at(time).particles.to_numpy()["position"], expected, atol=1e-5)
+    assert snapshots.survey.told() == ["1 of 1 intervals show the nearer snapshot, as particles have no ids"]
+
+
+def test_colours_span_nearly_all_values_of_all_files_and_stay(tmp_path):
+    snapshots = js.Snapshots.from_files([write(tmp_path, number, count=400) for number in range(3)])
+    low, high = np.percentile(np.concatenate([np.linspace(0, 1 + number, 400) for number in range(3)]), (0.5, 99.5))
+    assert snapshots.survey.span == pytest.approx((low, high))
+    looks = [snapshots.at(time).transfer for time in (0, 0.3, 1)]
+    assert all(look is looks[0] for look in looks)
+
+
+def test_all_moments_have_arrays_of_one_size_and_structure(tmp_path):
+    paths = [write(tmp_path, 0, count=150), write(tmp_path, 1, count=600), write(tmp_path, 2, count=300, dtype=np.float64)]
+    snapshots = js.Snapshots.from_files(paths)
+    found = [snapshots.at(time).particles for time in (0, 0.2, 0.5, 0.9, 1)]
+    assert {one.capacity for one in found} == {snapshots.capacity}
+    assert [one.num_particles for one in found] == [150, 150, 600, 300, 300]
+    assert len({one.position_rest is None for one in found}) == 1
+
+
+def test_bounds_hold_all_particles_of_all_files(tmp_path):
+    paths = [write(tmp_path, 0), write(tmp_path, 1, shift=9.0)]
+    lower, upper = js.Snapshots.from_files(paths).bounds()
+    position = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    np.testing.assert_allclose(lower, position.min(0) - 0.5, rtol=1e-6)
+    np.testing.assert_allclose(upper, position.max(0) + (9.5, 0.5, 0.5), rtol=1e-5)
+
+
+def test_a_density_that_is_summed_can_be_shown(tmp_path):
+    snapshots = js.Snapshots.from_files([write(tmp_path, number, count=80) for number in range(2)], "density")
+    assert snapshots.survey.quantity == "density" and snapshots.survey.span[1] > 0
+
+
+def test_all_files_that_are_cut_short_are_named(tmp_path):
+    paths = [write(tmp_path, number) for number in range(6)]
+    for number in (1, 3):  # the one in the middle is among them
+        paths[number].write_bytes(paths[number].read_bytes()[:900])
+    with pytest.raises(ValueError, match="2 of 6 snapshots cannot be read") as error:
+        js.Snapshots.from_files(paths)
+    assert all(str(paths[number]) in str(error.value) for number in (1, 3)) and str(paths[0]) not in str(error.value)
+
+
+def test_a_missing_number_is_refused_unless_gaps_are_wanted(tmp_path):
+    paths = [write(tmp_path, number) for number in (0, 1, 3)]
+    with pytest.raises(ValueError, match="number 2 is missing"):
+        js.Snapshots.from_files(paths)
+    assert js.Snapshots.from_files(paths, gaps=True).times == (0, 0.5, 1.5)
+
+
+def test_other_refusals_say_what_is_wrong(tmp_path):
+    path = write(tmp_path, 0)
+    with pytest.raises(ValueError, match="at least one"):
+        js.Snapshots.from_files([])
+    with pytest.raises(FileNotFoundError, match="none"):
+        js.Snapshots.from_files([path, tmp_path / "none.npz"])
+    with pytest.raises(ValueError, match="no quantity 'entropy'"):
+        js.Snapshots.from_files([path], "entropy")
+    with pytest.raises(ValueError, match=r"must lie in \[0, 0\]"):
+        js.Snapshots.from_files([path]).at(1)
+
+
+def test_progress_is_told_file_by_file(tmp_path):
+    seen = []
+    js.Snapshots.from_files([write(tmp_path, n) for n in range(3)], progress=lambda *count: seen.append(count))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
