@@ -6,9 +6,13 @@ from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.held import emission
+from jaxsph.model.projection import Projection
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
+from jaxsph.project import project
+from jaxsph.projection_plan import ProjectionPlan, plan_projection
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
 from jaxsph.splats import splat_bound
@@ -25,6 +29,8 @@ __all__ = [
     "Plan",
     "Points",
     "Progressive",
+    "Projection",
+    "ProjectionPlan",
     "Scene",
     "Settings",
     "TransferFunction",
@@ -32,12 +38,15 @@ __all__ = [
     "__version__",
     "coarse_bound",
     "coarsened",
+    "emission",
     "in_octree",
     "io",
     "octree_plans",
     "plan",
+    "plan_projection",
     "prepare",
     "progressive",
+    "project",
     "reference",
     "render",
     "resample",

@@ -64,12 +64,13 @@ def pixel_shares(
 
 
 def _between(shares: Shares, edges: Array) -> Float[Array, "... pixels products"]:
-    """Differences of all g_k between neighbouring edges, upwards."""
-    at = jnp.clip(edges, -1, 1)
-    terms, square = [at, (4 * at * at - 3) * at], 4 * at * at - 2
-    for _ in range(TERMS - 2):
-        terms.append(square * terms[-1] - terms[-2])  # T_(n+2) = 2 T_2 T_n - T_(n-2)
-    values = jnp.matmul(jnp.stack(terms, -1), shares.polynomials.astype(at.dtype), precision="highest")
+    """Differences of all g_k between neighbouring edges, upwards; by Clenshaw's recurrence, of which XLA makes one chain."""
+    at = jnp.clip(edges, -1, 1)[..., None]
+    coefficients, double = shares.polynomials.astype(at.dtype), 4 * at * at - 2  # T_(n+2) = 2 T_2 T_n - T_(n-2)
+    last = before = jnp.zeros_like(at * coefficients[0])
+    for row in coefficients[::-1]:
+        last, before = row + double * last - before, last
+    values = at * (last - before)
     return values[..., 1:, :] - values[..., :-1, :]
 
 
