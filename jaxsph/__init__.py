@@ -9,9 +9,13 @@ from jaxsph.frames import FrameFile, render_frames
 from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.domains import control_values
+from jaxsph.model.held import emission
+from jaxsph.model.projection import Projection
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
+from jaxsph.project import project
+from jaxsph.projection_plan import ProjectionPlan, plan_projection
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
 from jaxsph.snapshots import Snapshots
@@ -32,6 +36,8 @@ __all__ = [
     "Plan",
     "Points",
     "Progressive",
+    "Projection",
+    "ProjectionPlan",
     "Scene",
     "Settings",
     "Snapshots",
@@ -41,14 +47,17 @@ __all__ = [
     "coarse_bound",
     "coarsened",
     "control_values",
+    "emission",
     "image_figure",
     "in_octree",
     "io",
     "met",
     "octree_plans",
     "plan",
+    "plan_projection",
     "prepare",
     "progressive",
+    "project",
     "reference",
     "render",
     "render_frames",

@@ -22,10 +22,11 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.reference_columns import project
 from jaxsph.reference_integral import integral
 from jaxsph.reference_points import thickness
 
-__all__ = ["field", "integral", "render", "sample_depths"]
+__all__ = ["field", "integral", "project", "render", "sample_depths"]
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
 """What a part of a scene has in a sample of every ray: its optical thickness, and the same times colour."""

@@ -1,0 +1,162 @@
+"""Projection: raw values of an image of integrals along rays, and pictures of them.
+
+Flow: project -> [projection] -> files, notebooks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import os
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsph.model.colormaps import colormap as colors_of
+from jaxsph.model.colormaps import value_range
+
+NORMS = ("log", "linear")
+DECADES = 1.0  # positive values that span more are shown by their logarithm when nobody chose
+EMPTY = 0  # of a picture, where there is no value
+
+
+@dataclasses.dataclass(frozen=True)
+class Projection:
+    """Integrals along rays. Row 0 is the top, column 0 the left.
+
+    Attributes:
+        values: amounts a unit of area; or means, NaN where there is nothing.
+        weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without.
+        pixel_area: of a pixel, length units squared; with perspective, at depth 1.
+        perspective: whether rays spread with depth.
+        faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
+        name: of the values.
+        unit: of the values; empty where it is not known.
+        metadata: strings and numbers for the file header.
+    """
+
+    values: Float[Array, "height width"]
+    weight: Float[Array, "height width"] | None
+    pixel_area: Float[Array, ""]
+    perspective: bool
+    faults: Int[Array, ""] | int = 0
+    name: str = "values"
+    unit: str = ""
+    metadata: tuple[tuple[str, Any], ...] = ()
+
+    writer: ClassVar[Callable[..., None]]
+    """How projections become files: given by `jaxsph.io`, which knows the formats."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return int(self.values.shape[0]), int(self.values.shape[1])
+
+    def total(self) -> Float[Array, ""]:
+        """The amount in the image, such as its mass: the sum of values times the area of a pixel.
+
+        Raises:
+            ValueError: of means; and with perspective, where pixels are no areas.
+        """
+        if self.weight is not None or self.perspective:
+            what = "means are not added up" if self.weight is not None else "pixels of a perspective camera have no area"
+            raise ValueError(f"{what}: project amounts without `weight`, by an orthographic camera")
+        return self.values.sum() * self.pixel_area
+
+    def save(self, path: str | os.PathLike[str], **look: Any) -> None:
+        """Write to `path`: `.exr` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
+        type(self).writer(path, self, **look)
+
+    def to_uint8(
+        self, colormap: str = "viridis", norm: str | None = None, value_span: tuple[float, float] | None = None
+    ) -> np.ndarray:
+        """(H, W, 3) uint8: a colour map over values or their logarithms; black where there is no value.
+
+        Args:
+            colormap: name of a colour map.
+            norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
+            value_span: values that the colours span; default nearly all.
+        """
+        values: Any = np.asarray(self.values, np.float64)
+        log, (low, high) = self.span(norm, value_span)
+        there = np.isfinite(values) & ((values > 0) | (not log))
+        shown = np.where(there, values, high)
+        if log:
+            shown, low, high = np.log10(shown), math.log10(low), math.log10(high)
+        share = np.clip((shown - low) / (high - low), 0, 1)
+        colors = colors_of(colormap)
+        at = np.linspace(0, 1, len(colors))
+        picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
+        filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
+        picture = np.where((np.isfinite(values) & ~there & filled)[..., None], colors[0], picture)
+        return (np.where(filled[..., None], picture, EMPTY) * 255 + 0.5).astype(np.uint8)
+
+    def span(self, norm: str | None = None, value_span: tuple[float, float] | None = None) -> tuple[bool, tuple[float, float]]:
+        """Whether colours are of logarithms, and the values that they span.
+
+        Raises:
+            ValueError: an unknown norm, or values that do not ascend or have no logarithm.
+        """
+        if norm not in (None, *NORMS):
+            raise ValueError(f"`norm` must be {' or '.join(map(repr, NORMS))}, got {norm!r}")
+        values: Any = np.asarray(self.values, np.float64)
+        finite = values[np.isfinite(values)]
+        positive = finite[finite > 0]
+        some = positive if positive.size else np.ones(1)
+        logs = value_range(np.log10(some))
+        log = norm == "log" or (norm is None and bool((finite >= 0).all()) and logs[1] - logs[0] > DECADES)
+        if value_span is None:
+            return log, ((10.0 ** logs[0], 10.0 ** logs[1]) if log else value_range(finite))
+        low, high = (float(value) for value in value_span)
+        if not (math.isfinite(low) and math.isfinite(high) and low < high) or (log and low <= 0):
+            more = ", above 0 for logarithms" if log else ""
+            raise ValueError(f"`value_span` must be two finite values that ascend{more}, got ({low}, {high})")
+        return log, (low, high)
+
+    def figure(self, colormap: str = "viridis", norm: str | None = None, value_span: tuple[float, float] | None = None) -> Any:
+        """A figure of matplotlib with a colour bar; arguments as for `to_uint8`.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+        """
+        try:
+            from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
+            from matplotlib.figure import Figure
+        except ImportError as error:
+            raise ImportError('a figure needs the library `matplotlib`: pip install "jaxsph[color]"') from error
+        log, (low, high) = self.span(norm, value_span)
+        made = Figure(figsize=(6.4, 5.2), layout="constrained")
+        axes = made.subplots()
+        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors_of(colormap))), 256)
+        map_of.set_bad("black" if self.weight is not None else tuple(colors_of(colormap)[0]))
+        height, width = self.shape
+        side = math.sqrt(float(self.pixel_area))
+        reach = (-width / 2 * side, width / 2 * side, -height / 2 * side, height / 2 * side)
+        shown = axes.imshow(
+            np.asarray(self.values, np.float64), cmap=map_of, norm=(LogNorm if log else Normalize)(low, high), extent=reach
+        )
+        made.colorbar(shown, ax=axes, label=self.label)
+        return made
+
+    @property
+    def label(self) -> str:
+        """Name and unit."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    def _repr_png_(self) -> bytes:
+        from PIL import Image as Pillow
+
+        buffer = io.BytesIO()
+        Pillow.fromarray(self.to_uint8()).save(buffer, format="PNG")
+        return buffer.getvalue()
+
+
+jax.tree_util.register_dataclass(
+    Projection,
+    data_fields=["values", "weight", "pixel_area", "faults"],
+    meta_fields=["perspective", "name", "unit", "metadata"],
+)

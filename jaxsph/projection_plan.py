@@ -1,0 +1,176 @@
+"""Capacities of a projection: everything that fixes a shape, counted from the particles that a camera sees.
+
+Flow: particles, camera -> [projection_plan] -> project.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxsph.access.lists import TILE, ListPlan
+from jaxsph.access.ordering import Ordered
+from jaxsph.access.pixel_lists import Placed, footprints, place
+from jaxsph.field.column_sums import BLOCK, subrays_of
+from jaxsph.measures import Measures, measure
+from jaxsph.model.camera import Camera
+from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.tuning import CPU, Tuning, memory_for, tuning_for
+from jaxsph.plan import MAX_CAPACITY
+
+PIXELS = ("mean", "ray")
+SUBRAYS = 3  # of a pixel on each axis in means, where there are no shares: good to 1e-4 of the peak from 3 pixels a support on
+SHARES = 0
+"""Number of rays that stands for shares instead."""
+BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectionPlan:
+    """Everything that fixes a shape: hashable, and shared by similar projections.
+
+    Attributes:
+        width, height: of the image, pixels.
+        num_particles: entries of the particle arrays, padding included.
+        pixel: `"mean"` or `"ray"`.
+        bands: horizontal bands that are projected one after the other.
+        rays, shares: lists of the particles of either rule in one band; None where there is none.
+        tuning: for the machine.
+    """
+
+    width: int
+    height: int
+    num_particles: int
+    pixel: str
+    bands: int
+    rays: ListPlan | None
+    shares: ListPlan | None
+    tuning: Tuning = CPU
+
+    def __post_init__(self) -> None:
+        if self.pixel not in PIXELS:
+            raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {self.pixel!r}")
+
+    @property
+    def rules(self) -> list[tuple[int, ListPlan | None]]:
+        """Rays a pixel on each axis, or `SHARES`, and lists, of each rule that particles may follow."""
+        return [(1, self.rays)] if self.pixel == "ray" else [(SHARES, self.shares), (SUBRAYS, self.rays)]
+
+    @property
+    def tile_rows(self) -> int:
+        """Of a band."""
+        return -(-(-(-self.height // TILE)) // self.bands)
+
+    @property
+    def band_height(self) -> int:
+        """Pixel rows of a band."""
+        return self.tile_rows * TILE
+
+    def chunk(self, subrays: int) -> int:
+        """Bundles that are summed together: not more than there are."""
+        lists = self.shares if subrays == SHARES else self.rays
+        return max(min(self.tuning.samples_at_once // (BLOCK * max(subrays, 1) ** 2), lists.num_bundles if lists else 1), 1)
+
+    def check(self, particles: Particles, camera: Camera, pixel: str) -> None:
+        """Raise `ValueError` where the plan is for other shapes than those given."""
+        given = {
+            "camera.width": (camera.width, self.width),
+            "camera.height": (camera.height, self.height),
+            "particles.capacity": (particles.capacity, self.num_particles),
+            "pixel": (pixel, self.pixel),
+        }
+        for name, (have, planned) in given.items():
+            if have != planned:
+                raise ValueError(
+                    f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan_projection`"
+                )
+
+
+def plan_projection(
+    particles: Particles, camera: Camera, *, pixel: str = "mean", memory_limit: int | None = None
+) -> ProjectionPlan:
+    """Measure the room that a projection needs (host side; values must be concrete).
+
+    Args:
+        particles, camera, pixel: as for `jaxsph.project`.
+        memory_limit: bytes of working memory; default 4 GiB, or half of an accelerator's.
+
+    Raises:
+        ValueError: under a trace; when even a band of one row of tiles exceeds `memory_limit`.
+    """
+    if is_traced(particles, camera):
+        raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
+    rules = [(1, wanted_all)] if pixel == "ray" else [(SHARES, wanted_small), (SUBRAYS, wanted_large)]
+    placed = placed_by(particles, camera)
+    counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in rules]  # type: ignore[arg-type]
+    machine, limit = tuning_for(particles.support), memory_limit or memory_for(particles.support)
+    size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
+    while True:
+        lists = [_lists(one, camera, bands) for one in counts]
+        made = ProjectionPlan(*size, pixel, bands, lists[-1], lists[0] if pixel == "mean" else None, machine)
+        needed = _bytes(made)
+        if needed <= limit and all(one is None or one.list_capacity <= MAX_CAPACITY for one in lists):
+            return made
+        if made.tile_rows == 1:
+            raise ValueError(
+                f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes; "
+                "raise the limit, or project fewer particles or pixels"
+            )
+        bands = min(2 * bands, rows)
+
+
+def beside(subrays: int) -> float:
+    """How far from the middle of its pixel a rule looks, in pixels on either axis."""
+    return 0.5 if subrays == SHARES else float(np.max(np.abs(subrays_of(subrays)[0] - 0.5)))
+
+
+def wanted_all(placed: Placed) -> Bool[Array, " particles"]:
+    """Particles that follow rays through the middles of pixels."""
+    return placed.live
+
+
+def wanted_small(placed: Placed) -> Bool[Array, " particles"]:
+    """Particles that pixels get shares of."""
+    return placed.live & placed.small
+
+
+def wanted_large(placed: Placed) -> Bool[Array, " particles"]:
+    """Particles that are met by several rays a pixel."""
+    return placed.live & ~placed.small
+
+
+WANTED: dict[int, Callable[[Placed], Array]] = {1: wanted_all, SHARES: wanted_small, SUBRAYS: wanted_large}
+placed_by = jax.jit(place)
+
+
+@functools.partial(jax.jit, static_argnames="subrays")
+def _footprints(placed: Placed, camera: Camera, *, subrays: int) -> Ordered:
+    return footprints(placed, camera, WANTED[subrays](placed), beside(subrays))
+
+
+def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan | None:
+    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    of_band = -(-rows // bands)
+    pairs = [_fullest(counts, of_band) for counts in (counted.tile_pairs, counted.bundle_pairs)]
+    if pairs[0] == 0:
+        return None
+    return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
+
+
+def _fullest(counts: np.ndarray, rows: int) -> int:
+    """Most pairs of any band of so many rows of tiles."""
+    return int(np.pad(counts, (0, -len(counts) % rows)).reshape(-1, rows).sum(1).max(initial=0))
+
+
+def _bytes(plan: ProjectionPlan) -> int:
+    lists = [one for _, one in plan.rules if one is not None]
+    pairs = sum(one.tile_capacity * BYTES_OF_TILE_PAIR + one.list_capacity * BYTES_OF_PAIR for one in lists)
+    subrays = max((n for n, one in plan.rules if one is not None), default=1)
+    of_band = plan.band_height * plan.width * BYTES_OF_PIXEL * max(subrays, 1) ** 2
+    return plan.num_particles * BYTES_OF_PARTICLE + pairs + of_band + plan.width * plan.height * BYTES_OF_PIXEL

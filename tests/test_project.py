@@ -1,0 +1,244 @@
+"""Projections against the float64 oracle, against what is known in closed form, and under the transforms of JAX."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model import kernels
+from jaxsph.numerics import faults
+
+NAMES = sorted(kernels.KERNELS)
+SIZE = {"width": 20, "height": 13}
+
+
+def particles_of(seed=0, kernel="cubic_spline", count=40, decades=1.2, dtype=np.float32):
+    rng = np.random.default_rng(seed)
+    support = 0.9 * 10 ** -rng.uniform(0, decades, count)
+    columns = (rng.uniform(-1, 1, (count, 3)), support, rng.uniform(-1, 1, count), rng.uniform(0.1, 1, count))
+    return js.Particles.from_arrays(*(column.astype(dtype) for column in columns), kernel, capacity=48)
+
+
+def camera_of(projection="orthographic", near=0.5, far=6.0, **more):
+    place = {"eye": (1.0, 0.7, 2.9), "target": (0.05, 0, 0), "near": near, "far": far} | SIZE | more
+    if projection == "orthographic":
+        return js.Camera.orthographic(view_height=3.6, **place)
+    return js.Camera.look_at(fov_degrees=55.0, **place)
+
+
+def peaks(particles, camera):
+    """What the columns through all centres that could be met add up to: what errors are measured against."""
+    return float(js.reference.project(particles, camera, pixel="ray").values.max())
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+@pytest.mark.parametrize("kernel", NAMES)
+def test_rays_are_those_of_the_oracle(kernel, projection):
+    particles, camera = particles_of(1, kernel), camera_of(projection)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    found = js.project(particles, camera, pixel="ray").values
+    np.testing.assert_allclose(found, truth, atol=3e-5 * truth.max())
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+def test_parts_of_rays_are_those_of_the_oracle_and_add_up(projection):
+    particles, camera = particles_of(2), camera_of(projection, near=1.9, far=3.1)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    part = js.project(particles, camera, pixel="ray")
+    np.testing.assert_allclose(part.values, truth, atol=3e-5 * truth.max())
+    whole = js.project(particles, camera, pixel="ray", depth_range=(0.1, 9.0)).values
+    others = [js.project(particles, camera, pixel="ray", depth_range=ends).values for ends in ((0.1, 1.9), (3.1, 9.0))]
+    np.testing.assert_allclose(part.values + others[0] + others[1], whole, atol=3e-5 * truth.max())
+
+
+@pytest.mark.parametrize("near", [0.5, 2.4])
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+def test_means_over_pixels_are_those_of_the_oracle(projection, near):
+    particles, camera = particles_of(3, decades=0.4), camera_of(projection, near=near)
+    truth = js.reference.project(particles, camera, subrays=12).values
+    np.testing.assert_allclose(js.project(particles, camera).values, truth, atol=2e-4 * truth.max())
+
+
+def test_double_precision_is_exact(x64):
+    particles, camera = particles_of(4, "wendland_c2", dtype=np.float64), camera_of("perspective", near=np.float64(2.0))
+    camera = jax.tree.map(lambda leaf: leaf.astype(np.float64), camera)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    found = js.project(particles, camera, pixel="ray").values
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, truth, atol=1e-9 * truth.max())
+
+
+@pytest.mark.parametrize("kernel", NAMES)
+def test_no_mass_is_lost_however_small_supports_are(kernel):
+    rng = np.random.default_rng(5)
+    mass, pixel = rng.uniform(0.5, 2, 200).astype(np.float32), 2.6 / 13
+    for size in (1e-3, 0.3, 0.8, 1.7, 2.9, 3.1, 4.0):
+        position = rng.uniform(-1, 1, (200, 3)) * (2 - size * pixel, 1.3 - size * pixel, 1)
+        particles = js.Particles.from_arrays(position, size * pixel, 0.0, mass, kernel)
+        camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.6, near=0, far=10, **SIZE)
+        assert abs(float(js.project(particles, camera).total()) / mass.sum() - 1) < 1e-4
+
+
+def test_mass_between_two_depths_is_kept_where_they_cut_small_supports():
+    rng = np.random.default_rng(6)
+    position = rng.uniform(-1, 1, (400, 3)) * (1.5, 1, 0)
+    particles = js.Particles.from_arrays(position, 0.05, 0.0, 1.0, "cubic_spline")
+    camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.6, near=0, far=5, **SIZE)
+    assert abs(float(js.project(particles, camera).total()) / 200 - 1) < 1e-4
+
+
+def test_a_uniform_box_has_its_column_density_to_1e_4():
+    axis = (np.arange(24) + 0.5) / 12 - 1
+    position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    particles = js.Particles.from_arrays(position, 4.2 / 12, 0.0, 3.0 * 12.0**-3, "wendland_c2")
+    turned = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=0.7, near=1, far=9, **SIZE)
+    np.testing.assert_allclose(js.project(particles, turned).values, 3.0 * 2, rtol=1e-4)
+    part = js.project(particles, turned, depth_range=(4.6, 5.3)).values
+    np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
+
+
+def test_small_points_seen_in_perspective_keep_their_mass():
+    rng = np.random.default_rng(7)
+    position = rng.uniform(-0.5, 0.5, (100, 3))
+    particles = js.Particles.from_arrays(position, 1e-3, 0.0, 1.0, "poly6")
+    camera = js.Camera.look_at((0, 0.1, 3), (0, 0, 0), near=1, far=5, **SIZE)
+    offset = position - camera.exact_eye()
+    depth = offset @ np.asarray(camera.axes, np.float64)[2]
+    seen = (np.linalg.norm(offset, axis=1) / depth**3).sum()  # of 1 / area at each depth, along slanted rays
+    image = js.project(particles, camera)
+    assert abs(float(image.values.sum() * image.pixel_area) / seen - 1) < 1e-4
+
+
+def test_a_mean_of_a_constant_is_that_constant_and_nothing_where_nothing_is():
+    particles = dataclasses.replace(particles_of(8, decades=0.2), quantity=jnp.full(48, 7.0))
+    image = js.project(particles, camera_of(), weight="volume")
+    values, weight = np.asarray(image.values), np.asarray(image.weight)
+    np.testing.assert_allclose(values[weight > 0], 7.0, rtol=2e-6)
+    assert np.isnan(values[weight == 0]).all() and (weight == 0).any()
+
+
+def test_means_are_those_of_the_oracle():
+    particles, camera = particles_of(9, decades=0.3), camera_of()
+    mass = np.random.default_rng(0).uniform(1e40, 2e40, particles.num_particles)  # that float32 cannot hold
+    found, truth = (one(particles, camera, weight=mass) for one in (js.project, js.reference.project))
+    solid = truth.weight > 1e-3 * truth.weight.max()
+    np.testing.assert_allclose(np.asarray(found.values)[solid], truth.values[solid], atol=2e-3)
+
+
+def test_amounts_that_float32_cannot_hold_are_projected():
+    particles, camera = particles_of(10), camera_of()
+    mass = np.full(particles.num_particles, 1e37)
+    truth = js.reference.project(particles, camera, mass, pixel="ray").values
+    np.testing.assert_allclose(js.project(particles, camera, mass, pixel="ray").values, truth, atol=3e-5 * truth.max())
+
+
+def test_emission_of_power_one_is_the_column_density_and_others_weigh_by_density():
+    mass, density = np.array([1.0, 2.0]), np.array([3.0, 5.0])
+    np.testing.assert_allclose(js.emission(mass, density, power=1), mass)
+    np.testing.assert_allclose(js.emission(mass, density, 0.5), 0.5 * density * mass)
+    np.testing.assert_allclose(jax.jit(js.emission)(mass, density), density * mass, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pixel", ["mean", "ray"])
+def test_bands_change_nothing(pixel):
+    particles = particles_of(11)
+    camera = camera_of(height=40)
+    whole = js.plan_projection(particles, camera, pixel=pixel)
+    cut = dataclasses.replace(whole, bands=3)
+    cut = dataclasses.replace(cut, **{
+        name: dataclasses.replace(getattr(cut, name), tile_rows=1) for name in ("rays", "shares") if getattr(cut, name)
+    })  # fmt: skip
+    images = [js.project(particles, camera, pixel=pixel, plan=plan).values for plan in (whole, cut)]
+    np.testing.assert_allclose(*images, rtol=1e-6)
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+@pytest.mark.parametrize("pixel", ["mean", "ray"])
+def test_gradients_are_those_of_differences(pixel, projection, x64):
+    particles = particles_of(12, "wendland_c2", 12, decades=1.0, dtype=np.float64)
+    camera = jax.tree.map(lambda leaf: leaf.astype(np.float64), camera_of(projection, near=2.2, far=3.4))
+    plan = js.plan_projection(particles, camera, pixel=pixel)
+    pattern = np.random.default_rng(0).normal(size=(13, 20))
+    mass = jnp.linspace(1.0, 2.0, 48)
+
+    @jax.jit
+    def loss(position, support, mass, eye, far):
+        moved = dataclasses.replace(particles, position=position, support=support)
+        seen = dataclasses.replace(camera, eye=eye, far=far)
+        return (js.project(moved, seen, mass, pixel=pixel, plan=plan).values * pattern).sum()
+
+    inputs = particles.position, particles.support, mass, camera.eye, camera.far
+    rng = np.random.default_rng(1)
+    moves = tuple(jnp.asarray(rng.normal(size=np.shape(value))) for value in inputs)
+    step = 1e-5
+    ends = [loss(*(value + side * step * move for value, move in zip(inputs, moves, strict=True))) for side in (1, -1)]
+    wanted = (ends[0] - ends[1]) / (2 * step)
+    pulled = jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3, 4)))(*inputs)
+    backward = sum((cotangent * move).sum() for cotangent, move in zip(pulled, moves, strict=True))
+    forward = jax.jit(lambda *moves: jax.jvp(loss, inputs, moves)[1])(*moves)
+    assert abs(forward - wanted) < 2e-4 * abs(wanted) + 1e-4
+    assert abs(backward - forward) < 1e-9 * abs(forward) + 1e-9
+
+
+def test_one_program_serves_moved_particles_and_many_at_once():
+    particles, camera = particles_of(13), camera_of()
+    plan = js.plan_projection(particles, camera)
+
+    def shifted(shift):
+        moved = dataclasses.replace(particles, position=particles.position + shift)
+        return js.project(moved, camera, plan=plan).values
+
+    shifts = jnp.asarray([0.0, 0.02])
+    together = jax.jit(jax.vmap(shifted))(shifts)
+    np.testing.assert_allclose(together[0], js.project(particles, camera).values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
+
+
+def test_a_plan_that_is_too_small_is_refused_or_a_fault():
+    particles, camera = particles_of(14), camera_of()
+    plan = js.plan_projection(particles, camera, pixel="ray")
+    small = dataclasses.replace(plan, rays=dataclasses.replace(plan.rays, list_capacity=3))
+    with pytest.raises(js.CapacityError, match="plan_projection"):
+        js.project(particles, camera, pixel="ray", plan=small)
+    with pytest.raises(js.CapacityError):
+        js.project(particles, camera, pixel="ray", plan=dataclasses.replace(plan, rays=None))
+    word = jax.jit(lambda particles: js.project(particles, camera, pixel="ray", plan=small).faults)(particles)
+    assert int(word) & faults.LIST_OVERFLOW
+
+
+def test_nothing_is_nothing():
+    empty = js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)
+    image = js.project(empty, camera_of())
+    assert (np.asarray(image.values) == 0).all() and image.to_uint8().shape == (13, 20, 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"of": "mass"}, "'volume' or 'quantity'"),
+        ({"of": np.ones(7)}, "one number for each particle"),
+        ({"of": np.full(40, np.nan)}, "`of` must be finite"),
+        ({"weight": -np.ones(40)}, "not negative"),
+        ({"pixel": "corner"}, "`pixel` must be"),
+        ({"depth_range": (3, 2)}, "two finite depths"),
+    ],
+)
+def test_bad_input_is_refused_by_name(given, said):
+    with pytest.raises(ValueError, match=said):
+        js.project(particles_of(), camera_of(), **given)
+
+
+def test_bad_particles_and_missing_plans_are_refused():
+    particles, camera = particles_of(), camera_of()
+    broken = dataclasses.replace(particles, position=particles.position.at[3, 1].set(jnp.nan))
+    with pytest.raises(ValueError, match="not finite"):
+        js.project(broken, camera)
+    with pytest.raises(ValueError, match="plan_projection"):
+        jax.jit(lambda particles: js.project(particles, camera).values)(particles)
+    with pytest.raises(ValueError, match=r"camera\.width"):
+        js.project(particles, camera_of(width=21), plan=js.plan_projection(particles, camera))
+    with pytest.raises(ValueError, match="memory_limit"):
+        js.plan_projection(particles, camera, memory_limit=100)
