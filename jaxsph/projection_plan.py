@@ -65,7 +65,8 @@ class ProjectionPlan:
     @property
     def tile_rows(self) -> int:
         """Of a band."""
-        return -(-(-(-self.height // TILE)) // self.bands)
+        rows = -(-self.height // TILE)
+        return -(-rows // self.bands)
 
     @property
     def band_height(self) -> int:
