@@ -1,5 +1,7 @@
 """Means of columns over pixels against quadrature."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +19,7 @@ def by_quadrature(name, x, y):
     parts = int(np.ceil((x[1] - x[0]) / 0.1))
 
     def points(edges):
-        fine = np.concatenate(
-            [np.linspace(a, b, parts + 1)[:-1] for a, b in zip(edges[:-1], edges[1:], strict=True)] + [edges[-1:]]
-        )
+        fine = np.concatenate([np.linspace(a, b, parts + 1)[:-1] for a, b in itertools.pairwise(edges)] + [edges[-1:]])
         half = np.diff(fine)[:, None] / 2
         return (fine[:-1, None] + half * (1 + NODES)).ravel(), (half * WEIGHTS).ravel()
 
