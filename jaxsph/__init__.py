@@ -5,7 +5,9 @@ from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
+from jaxsph.field.within import Within
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.clips import Box, Plane, Sphere
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -16,6 +18,7 @@ from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
 __all__ = [
+    "Box",
     "Camera",
     "CapacityError",
     "Coarsened",
@@ -23,12 +26,15 @@ __all__ = [
     "IsoSurface",
     "Particles",
     "Plan",
+    "Plane",
     "Points",
     "Progressive",
     "Scene",
     "Settings",
+    "Sphere",
     "TransferFunction",
     "Volume",
+    "Within",
     "__version__",
     "coarse_bound",
     "coarsened",

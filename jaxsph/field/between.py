@@ -55,7 +55,7 @@ def _intervals(weight: Array, weighted: Array, cover: Cover, depth: Array, task:
     inside, solid = weight > 0, weight > least_weight(weight.dtype)
     still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
     ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
-    near, far, share = intervals_of(ratio, inside, cover, depth)
+    near, far, share = intervals_of(ratio, inside, cover, depth, task.part)
     reference = task.entry.reference_quantity[:, None, None]
     return Intervals(reference + near, reference + far, share)
 

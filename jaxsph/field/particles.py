@@ -70,6 +70,7 @@ class ParticleMedium(Medium):
     """
 
     at_points = False  # lists are of slabs
+    in_parts = True
     grid: Grid
     segments: Segments
     tables: MeanTables | None
