@@ -5,9 +5,11 @@ from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
+from jaxsph.field.within import Within
 from jaxsph.frames import FrameFile, render_frames
 from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.clips import Box, Plane, Sphere
 from jaxsph.model.domains import control_values
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
@@ -24,6 +26,7 @@ from jaxsph.sweep import sweep
 from jaxsph.version import __version__
 
 __all__ = [
+    "Box",
     "Camera",
     "CameraPath",
     "CapacityError",
@@ -34,6 +37,7 @@ __all__ = [
     "Met",
     "Particles",
     "Plan",
+    "Plane",
     "Points",
     "Progressive",
     "Projection",
@@ -41,8 +45,10 @@ __all__ = [
     "Scene",
     "Settings",
     "Snapshots",
+    "Sphere",
     "TransferFunction",
     "Volume",
+    "Within",
     "__version__",
     "coarse_bound",
     "coarsened",

@@ -265,4 +265,6 @@ def _taken(tree: Any, *, chosen: np.ndarray) -> Any:
         rest = None if tree.position_rest is None else tree.position_rest[chosen]
         attributes = {name: value[chosen] for name, value in tree.attributes.items()}
         return dataclasses.replace(tree, **columns, position_rest=rest, attributes=attributes)
+    if isinstance(tree, Particles):
+        return tree.at(chosen)
     return jax.tree.map(lambda column: column[chosen], tree)

@@ -20,6 +20,7 @@ from jaxsph.host_stages import MAKE_GRID, ORDER
 from jaxsph.layers import OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
@@ -68,6 +69,7 @@ class Frame:
     """What all bands of a frame have in common; `shards` of each are cast side by side.
 
     `limits` are what rays keep to, of which each may take a share of what is `allowed` where pixels are interpolated too.
+    Particles are shown `within` a clip, or everywhere.
     """
 
     ordered: Ordered
@@ -80,6 +82,7 @@ class Frame:
     shards: int
     allowed: Float[Array, ""] | None
     min_transmittance: Float[Array, ""] | None
+    within: Clip | None = None
 
     @classmethod
     def begun(
@@ -94,7 +97,7 @@ class Frame:
         least = jnp.asarray(least_transmittance(settings), dtype) if ends(settings) else None
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
-        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least, seen.within)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
         """The band that begins at a row of pixels."""
@@ -124,7 +127,7 @@ class Frame:
         scene = (grid, camera or self.camera, self.transfer, self.media)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         how = lattice, self.min_transmittance, tolerance
-        inputs = [(*scene, schedule, *how, nth) for schedule, nth in zip(schedules, self._each, strict=True)]
+        inputs = [(*scene, schedule, *how, nth, self.within) for schedule, nth in zip(schedules, self._each, strict=True)]
         method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays
@@ -156,7 +159,7 @@ class Frame:
 
     def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
-        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth) for nth in self._each]
+        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth, self.within) for nth in self._each]
         static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
         return run.each("adapt", decide_full_rate, inputs, **static)
 
@@ -174,7 +177,7 @@ class Frame:
         several, tuning = self.shards > 1, self.plan.cast.tuning
         lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
-        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice), **self._cast)], lattice
+        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice, self.within), **self._cast)], lattice
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
         static = {"shards": self.shards, "control": self.plan.control, **self._cast}
@@ -183,7 +186,7 @@ class Frame:
         if not run.may_hold(pays):
             return self.leave(grid, run, with_levels=True)
         view = (grid, self.camera, self.transfer, self.limits)
-        inputs = [(*view, of_shard, nth) for of_shard, nth in zip(wanted, self._each, strict=True)]
+        inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(wanted, self._each, strict=True)]
         return run.each("adapt", decide_by_bounds, inputs, **static)
 
 

@@ -26,6 +26,7 @@ from jaxsph.measures import Measures, measure
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.periodic import num_ghosts
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.spheres import spheres_of
@@ -34,7 +35,7 @@ from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class
-from jaxsph.viewing import Seen, view_scene
+from jaxsph.viewing import Seen, longest_interval, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 MAX_KEPT = 64
@@ -73,7 +74,7 @@ def plan(
         raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
     scene = reachable(scene, settings)
     settings = along_rays(scene, settings)
-    shape = dataclasses.replace(shape_of(spheres_of(scene), camera, settings), headroom=1.0)
+    shape = dataclasses.replace(shape_of_scene(scene, camera, settings), headroom=1.0)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
@@ -100,12 +101,17 @@ def _with_headroom(shape: FrameShape, headroom: float, more_particles: bool) -> 
 def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -> Seen:
     """Have the scene viewed, with its particles padded to the capacity of a frame."""
     capacity = sizes.num_particles
-    if not scene.point_sets and scene.particle_set.capacity < capacity:
+    if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
         scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particle_set,), capacity=capacity))
-    between = bool(scene.point_sets) or registry.between_samples(sizes.integrator)
+    between = _between(scene, sizes.integrator)
     static = {"samples": sizes.samples, "num_classes": sizes.num_classes, "between_samples": between}
     seen: Seen = run.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
     return seen.with_data(scene)
+
+
+def _between(scene: Scene, integrator: str) -> bool:
+    """Whether any sphere is met between samples."""
+    return bool(scene.point_sets) or registry.between_samples(integrator)
 
 
 @compiled_quickly
@@ -135,7 +141,7 @@ class Plans:
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings = along_rays(scene, settings)
-        shape = self._similar(shape_of(spheres_of(scene), camera, settings))
+        shape = self._similar(shape_of_scene(scene, camera, settings))
         run.mark("plan")
         seen = see(scene, camera, shape, run)
         seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
@@ -190,6 +196,16 @@ PLANS = Plans()
 def stride_of(settings: Settings) -> int:
     """Pixels between the rays of the first lattice; 1 where every pixel has its own."""
     return settings.leaf_pixels // 2 if settings.screen == "quadtree" else 1
+
+
+def shape_of_scene(scene: Scene, camera: Camera, settings: Settings) -> FrameShape:
+    """The same of all of a scene, ghosts of periodic sets included."""
+    spheres, shape = spheres_of(scene), shape_of(spheres_of(scene), camera, settings)
+    if scene.particles is None or scene.particles.box is None:
+        return shape
+    margin = longest_interval(camera, shape.samples) if _between(scene, settings.integrator) else 0.0
+    ghosts = num_ghosts(scene.particles, margin)
+    return dataclasses.replace(shape, num_particles=capacity_class(spheres.capacity + ghosts), headroom=1.0)
 
 
 def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameShape:

@@ -25,6 +25,8 @@ from jaxsph.model.volume import Volume
 from jaxsph.reference_columns import project
 from jaxsph.reference_integral import integral
 from jaxsph.reference_points import thickness
+from jaxsph.reference_where import columns_of, to_world
+from jaxsph.reference_where import inside as within
 
 __all__ = ["field", "integral", "project", "render", "sample_depths"]
 
@@ -60,10 +62,16 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     inside = denominator > 0
     quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
     edges, lengths = _depth(camera, np.arange(settings.samples + 1), settings.samples), _ray_lengths(camera, every)
+    places = None
+    if scene.particles_within is not None:
+        places = _world(camera, settings.samples, every)
+        inside &= within(scene.particles_within, places)
     parts = [] if scene.transfer is None else [_in_medium(quantities, inside, scene.transfer, edges, lengths)]
-    for volume, look in scene.volumes:
-        parts.append(_in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths))
-    parts += [_of_points(points, camera, every, edges) for points in scene.point_sets]
+    others = [
+        _in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths) for volume, look in scene.volumes
+    ]
+    others += [_of_points(points, camera, every, edges) for points in scene.point_sets]
+    parts += others if scene.within is None or places is None else [_clipped(one, within(scene.within, places)) for one in others]
     color, transmittance, depth = _composite(parts, edges, lengths.shape, scene.mix)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
@@ -118,10 +126,7 @@ def _fields(
 
 
 def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
-    particles = scene.particle_set
-    valid = np.asarray(particles.valid)
-    arrays = (particles.exact_position(), particles.support, particles.volume, *particles.quantities)
-    position, support, volume, *quantities = (np.asarray(a, np.float64)[valid] for a in arrays)
+    position, support, volume, *quantities = columns_of(scene.particle_set)
     view = (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     return view, support, quantities, volume
 
@@ -161,14 +166,27 @@ def _box(
     return rows, columns, slice(first, last)
 
 
-def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """The trilinear quantity at every sample, and whether it is inside the grid; (height, width, samples) each."""
+def _world(camera: Camera, samples: int, every: int) -> np.ndarray:
+    """World coordinates of all samples, (height, width, samples, 3)."""
     u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
-    x, y, z = np.broadcast_arrays(spread * u[None, :, None], spread * v[:, None, None], s)
-    world = np.stack([x, y, z], -1) @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
-    at = (world - volume.bounds()[0]) / np.asarray(volume.spacing, np.float64)
+    return to_world(np.stack(np.broadcast_arrays(spread * u[None, :, None], spread * v[:, None, None], s), -1), camera)
+
+
+def _clipped(part: Part, shown: np.ndarray) -> Part:
+    """A part at those samples alone that are in a clip."""
+
+    def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
+        own, colored = part(i)
+        return np.where(shown[..., i], own, 0), np.where(shown[..., i, None], colored, 0)
+
+    return sample
+
+
+def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """The trilinear quantity at every sample, and whether it is inside the grid; (height, width, samples) each."""
+    at = (_world(camera, samples, every) - volume.bounds()[0]) / np.asarray(volume.spacing, np.float64)
     values: Any = np.asarray(volume.values, np.float64)
     last = np.array(values.shape) - 1
     inside = ((at >= 0) & (at <= last)).all(-1)

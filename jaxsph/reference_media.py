@@ -6,11 +6,13 @@ Flow: scene, rays -> [reference_media] -> cuts of rays; portions -> [reference_m
 from __future__ import annotations
 
 import abc
+import dataclasses
 
 import numpy as np
 
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip
 from jaxsph.model.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
@@ -20,6 +22,7 @@ from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference_points import at_offset, kinks
 from jaxsph.reference_portions import Cuts, Lists, Portions, borders, lists
+from jaxsph.reference_where import columns_of, crossings, inside
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 
@@ -66,9 +69,11 @@ def parts_of(scene: Scene, camera: Camera) -> list[Whole]:
     """All of a scene."""
     parts: list[Whole] = []
     if scene.particles is not None and scene.transfer is not None:
-        parts.append(AllParticles(scene.particles, scene.transfer, camera))
-    parts += [AllOfVolume(volume, look, camera) for volume, look in scene.volumes]
-    return parts + [AllPoints(points, camera) for points in scene.point_sets]
+        own: Whole = AllParticles(scene.particles, scene.transfer, camera)
+        parts.append(own if scene.particles_within is None else AllWithin(own, scene.particles_within, camera))
+    others: list[Whole] = [AllOfVolume(volume, look, camera) for volume, look in scene.volumes]
+    others += [AllPoints(points, camera) for points in scene.point_sets]
+    return parts + [one if scene.within is None else AllWithin(one, scene.within, camera) for one in others]
 
 
 def to_view(position: np.ndarray, camera: Camera) -> np.ndarray:
@@ -80,10 +85,9 @@ class AllParticles(Whole):
     """Particles; those of no volume are not there."""
 
     def __init__(self, particles: Particles, transfer: TransferFunction, camera: Camera):
-        there = np.asarray(particles.valid) & (np.asarray(particles.volume) > 0)
-        columns = particles.support, particles.volume, *particles.quantities
-        self.support, volume, *self.quantities = (np.asarray(column, np.float64)[there] for column in columns)
-        center = to_view(particles.exact_position()[there], camera)
+        columns = columns_of(particles)
+        position, self.support, volume, *self.quantities = (column[columns[2] > 0] for column in columns)
+        center = to_view(position, camera)
         strength = volume / self.support**3
         self.strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
         self.spheres = Spheres(center, self.support, camera.is_perspective)
@@ -170,6 +174,56 @@ def _filled(quantity: np.ndarray) -> np.ndarray:
             before = node - 1 if nodes.step > 0 else node + 1
             quantity[node] = np.where(np.isnan(quantity[node]), quantity[before], quantity[node])
     return quantity
+
+
+class AllWithin(Whole):
+    """A part in a clip alone."""
+
+    def __init__(self, whole: Whole, clip: Clip, camera: Camera):
+        self.clip, self._whole, self._axes, self._eye = clip, whole, np.asarray(camera.axes, np.float64), camera.exact_eye()
+
+    def seen_by(self, rays: Rays) -> Part:
+        """See `Whole`."""
+        return MetWithin(self._whole.seen_by(rays), self.clip, rays.start @ self._axes + self._eye, rays.direction @ self._axes)
+
+
+class MetWithin(Part):
+    """A part in a clip, as some rays meet it; portions are cut where rays may pass its faces, so that each is in it or not."""
+
+    def __init__(self, part: Part, clip: Clip, start: np.ndarray, direction: np.ndarray):
+        self._part, self._clip, self._start, self._direction = part, clip, start, direction
+        self.chords = part.chords
+        self._shown: np.ndarray = np.zeros(0, bool)
+
+    def cuts(self) -> Cuts:
+        """See `Part`."""
+        depth = crossings(self._clip, self._start, self._direction)
+        ray, place = np.nonzero(~np.isnan(depth))
+        rays, depths = self._part.cuts()
+        return np.concatenate([rays, ray]), np.concatenate([depths, depth[ray, place]])
+
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        """See `Part`."""
+        middle = (roots.start + roots.end) / 2
+        self._shown = inside(self._clip, self._start[roots.ray] + middle[:, None] * self._direction[roots.ray])
+        return self._part.lies_over(roots) & self._shown
+
+    def keep(self, which: np.ndarray) -> None:
+        """See `Part`."""
+        self._shown = self._shown[which]
+        self._part.keep(which)
+
+    def add(self, seen: AtNodes, portions: Portions) -> None:
+        """See `Part`."""
+        some = np.flatnonzero(self._shown[portions.root])
+        part = dataclasses.replace(seen, **{name: column[..., some] for name, column in vars(seen).items()})
+        self._part.add(part, portions.some(some))
+        for name, column in vars(seen).items():
+            column[..., some] = getattr(part, name)
+
+    def border_by(self, portions: Portions) -> np.ndarray:
+        """See `Part`."""
+        return self._part.border_by(portions)
 
 
 class AllOfVolume(Whole):

@@ -158,7 +158,7 @@ class Refinement:
         if kind == "scattered":
             cast_plan = cast_plan.for_rays(SCATTERED)
         scene = grid, frame.camera, frame.transfer, frame.media, schedule, lattice, queue, frame.min_transmittance
-        inputs = [(*scene, jnp.int32(turn * packets)) for turn in range(turns)]
+        inputs = [(*scene, jnp.int32(turn * packets), frame.within) for turn in range(turns)]
         static = {"shape": (plan.height, plan.width), "packets": packets, "kind": kind, "cast_plan": cast_plan}
         method = {"integrator": plan.chosen_integrator, "formulas": frame.formulas, **self._tuned}
         return [

@@ -23,6 +23,7 @@ from jaxsph.field.schedule import SlabSchedule, evaluations
 from jaxsph.layers import Layers
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Formulas
 from jaxsph.model.transfer import TransferFunction
@@ -160,6 +161,7 @@ def shoot(
     queue: Queue,
     min_transmittance: Float[Array, ""] | None,
     first: Int[Array, ""],
+    within: Clip | None = None,
     *,
     shape: tuple[int, int],
     packets: int,
@@ -174,7 +176,7 @@ def shoot(
     pick, packets_of = KINDS[kind]
     chosen, made = pick(queue, first, packets), registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan, made, packets_of, formulas.mix)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen, min_transmittance)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen, min_transmittance, None, within)
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
     if rays.left_out is not None:

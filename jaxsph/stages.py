@@ -21,7 +21,7 @@ from jaxsph.access.grid import Grid
 from jaxsph.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.access.shards import shard, shard_of_grid
-from jaxsph.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders
+from jaxsph.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders, whole_cells
 from jaxsph.access.view import Viewed
 from jaxsph.cast.adjoint import CastMethod, cast
 from jaxsph.cast.batches import CastPlan
@@ -32,9 +32,11 @@ from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.control.probe import Probe, worthwhile
 from jaxsph.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.field.nodes import sum_at_nodes
-from jaxsph.field.schedule import SlabSchedule, evaluations, full_rate, reference_quantities
+from jaxsph.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.field.within import over_slabs
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip, Overlap
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
@@ -238,6 +240,7 @@ def decide_full_rate(
     transfer: TransferFunction | None,
     media: tuple[Medium, ...],
     nth: Int[Array, ""],
+    within: Clip | None = None,
     *,
     shards: int,
     cast: CastPlan,
@@ -246,8 +249,9 @@ def decide_full_rate(
     tuning: Tuning,
 ) -> Decided:
     """Every cell of the `nth` of `shards` of a band at full rate: without error control, or where none of it would pay."""
-    grid, camera, transfer, media = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), camera, transfer, media))
-    schedule, full = _at_full_rate(grid, transfer, cast, halo)
+    given = shard_of_grid(grid, nth, shards), camera, transfer, media, within
+    grid, camera, transfer, media, within = jax.tree.map(lax.stop_gradient, given)
+    schedule, full = _at_full_rate(grid, transfer, cast, halo, _overlap(grid, camera, within, cast))
     extents = slab_extents(grid, camera, cast.slab_samples) if media else None
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
     levels = untouched(grid.windows, cast.slab_samples) if with_levels else None
@@ -257,15 +261,28 @@ def decide_full_rate(
 
 @stage("cast", quickly=True)
 def decide_by_pilot(
-    grid: Grid, camera: Camera, transfer: TransferFunction, limits: Limits, lattice: Lattice, *, cast: CastPlan, tuning: Tuning
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    limits: Limits,
+    lattice: Lattice,
+    within: Clip | None = None,
+    *,
+    cast: CastPlan,
+    tuning: Tuning,
 ) -> Decided:
-    """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient."""
-    grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
-    schedule, full = _at_full_rate(grid, transfer, cast)
+    """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient.
+
+    Slabs that a face of a clip may cross are at full rate.
+    """
+    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
+    lies = _overlap(grid, camera, within, cast)
+    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
     found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
-    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples)
-    return Decided(schedule, Verdict(bound, full, None))
+    able = None if lies is None else lies.holds
+    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples, able)
+    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, None))
 
 
 @stage("shards", "cast", "control")
@@ -276,28 +293,39 @@ def decide_by_bounds(
     limits: Limits,
     wanted: Bool[Array, "cells bundles"],
     nth: Int[Array, ""],
+    within: Clip | None = None,
     *,
     shards: int,
     cast: CastPlan,
     control: ControlPlan,
     tuning: Tuning,
 ) -> Decided:
-    """How each cell of the `nth` of `shards` of a band is sampled, if it is `wanted`. Decisions carry no gradient."""
-    grid, camera, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits))
+    """How each cell of the `nth` of `shards` of a band is sampled, if it is `wanted`. Decisions carry no gradient.
+
+    Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
+    """
+    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
     dtype, grid = grid.half_steps.dtype, shard_of_grid(grid, nth, shards)
-    schedule, full = _at_full_rate(grid, transfer, cast)
+    lies = _overlap(grid, camera, within, cast)
+    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
+    wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
     references = schedule.references
     schedule, bound, levels = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
-    return Decided(schedule, Verdict(bound, full, levels))
+    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels))
+
+
+def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) -> Overlap | None:
+    """How a clip lies to the slabs of a band or of a shard of it; None without one."""
+    return None if within is None else over_slabs(within, slab_extents(grid, camera, cast.slab_samples))
 
 
 def _at_full_rate(
-    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0
+    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0, lies: Overlap | None = None
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """The schedule of the reference image, and its evaluations."""
     references = [reference_quantities(grid.windows, grid.lists.rank, one) for one in grid.ordered.quantities]
-    schedule = full_rate(grid.windows, _among(transfer, references))
+    schedule = clipped(full_rate(grid.windows, _among(transfer, references)), None if lies is None else lies.meets)
     return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
 
 
@@ -327,6 +355,7 @@ def cast_shard(
     min_transmittance: Float[Array, ""] | None,
     tolerance: Float[Array, ""] | None,
     nth: Int[Array, ""],
+    within: Clip | None = None,
     *,
     shards: int,
     cast_plan: CastPlan,
@@ -343,7 +372,7 @@ def cast_shard(
     made = registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within)
     spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
     if rays.refined is not None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.quantities import in_units_of, too_small
@@ -18,10 +19,13 @@ from jaxsph.access.resolution import too_fine
 from jaxsph.access.view import Viewed, view_particles
 from jaxsph.field.points import PointsMedium
 from jaxsph.field.volume import VolumeMedium
+from jaxsph.field.within import Within
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
+from jaxsph.model.periodic import unfolded
 from jaxsph.model.scene import Scene
-from jaxsph.model.spheres import first_spheres, spheres_of
+from jaxsph.model.spheres import first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.programs import compiled_quickly
@@ -31,13 +35,14 @@ class Seen(NamedTuple):
     """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
 
     A scene without particles has no transfer function, and particles in name only.
-    `order` is that of the particles' keys, where the host has found it.
+    `order` is that of the particles' keys, where the host has found it; `within` is where particles are shown, None everywhere.
     """
 
     viewed: Viewed
     transfer: TransferFunction | None
     media: tuple[Medium, ...]
     order: Int[Array, " particles"] | None = None
+    within: Clip | None = None
 
     def with_data(self, scene: Scene) -> Seen:
         """With the arrays of the scene that media read, which no stage is to copy."""
@@ -51,29 +56,55 @@ def view_scene(
     scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool = False
 ) -> Seen:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
-    dtype, particles = jnp.promote_types(scene.dtype, camera.dtype), spheres_of(scene).padded(capacity)
+    dtype, within = jnp.promote_types(scene.dtype, camera.dtype), scene.particles_within
+    margin = longest_interval(camera, samples) if between_samples else 0.0
+    scene, folded = _unfolded(scene, capacity, margin)
+    particles = spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     if transfer is not None:
         particles, transfer = in_units_of(particles, transfer)
     depths = sphere_depths(camera, dtype, samples, between_samples)
     viewed = view_particles(particles, camera, depths, num_classes)
-    media = _media(scene, camera)
+    media = _media(scene, camera, dtype)
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
-    return Seen(dataclasses.replace(viewed, faults=viewed.faults | word), transfer, media)
+    viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded)
+    return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
 
 
-def _media(scene: Scene, camera: Camera) -> tuple[Medium, ...]:
+def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Array, ""]]:
+    """The scene with as many ghosts of a periodic set as there is room for; and a fault word."""
+    if scene.particles is None or scene.particles.box is None:
+        return scene, jnp.int32(faults.NONE)
+    particles, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+    return dataclasses.replace(scene, particles=particles), word
+
+
+def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:
+    return None if clip is None else jax.tree.map(lambda leaf: leaf.astype(dtype), clip.seen_by(camera))  # type: ignore[no-any-return]
+
+
+def _media(scene: Scene, camera: Camera, dtype: Any) -> tuple[Medium, ...]:
     """All media but particles, in view space."""
+    clip = _clip(scene.within, camera, dtype)
     volumes = (VolumeMedium.seen(volume, transfer, camera) for volume, transfer in scene.volumes)
     first = first_spheres(scene)
     sets = (PointsMedium.seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
-    return *volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)
+    return tuple(Within.of(one, clip) for one in (*volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)))
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
     """View depths s(0), s(1/2), ... s(N): fine samples sit at the odd entries, between borders at the even ones."""
     return camera.depth(jnp.arange(2 * samples + 1, dtype=dtype) / 2, samples).astype(dtype)
+
+
+def longest_interval(camera: Camera, samples: int) -> Float[Array, ""]:
+    """Path length between neighbouring samples on borders, where they are farthest apart."""
+    depth = half_steps(camera, camera.dtype, samples)[::2]
+    step = (depth[1:] - depth[:-1]).max()
+    if not camera.is_perspective:
+        return step
+    return step * jnp.sqrt(1 + camera.half_height**2 * (1 + (camera.width / camera.height) ** 2))
 
 
 def sphere_depths(camera: Camera, dtype: Any, samples: int, between_samples: bool) -> Float[Array, " samples"]:

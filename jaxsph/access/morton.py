@@ -46,7 +46,7 @@ def prepare(particles: Particles) -> Particles:
 @jax.jit
 def _prepared(particles: Particles) -> Particles:
     order = jnp.argsort(lax.stop_gradient(morton_keys(particles)), stable=True)
-    return jax.tree.map(lambda column: column[order], particles)
+    return particles.at(order)
 
 
 def morton_keys(particles: Particles) -> Int[Array, " particles"]:

@@ -14,7 +14,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxsph.access.lists import BundleLists
 from jaxsph.access.ordering import Ordered
@@ -71,6 +71,13 @@ def pad_slabs(value: Array, cells: SlabWindows) -> Array:
     """Round the number of slabs up to whole windows of the coarsest level."""
     missing = -cells.count.shape[0] % (1 << MAX_LEVEL)
     return jnp.pad(value, [(0, 0)] * (value.ndim - 2) + [(0, missing), (0, 0)])
+
+
+def whole_cells(slabs: Bool[Array, "slabs bundles"], slab_samples: int) -> Bool[Array, "cells bundles"]:
+    """Cells all of whose slabs are marked."""
+    per_cell = CELL_SAMPLES // slab_samples
+    padded = jnp.pad(slabs, ((0, -slabs.shape[0] % per_cell), (0, 0)), constant_values=True)
+    return padded.reshape(-1, per_cell, slabs.shape[1]).all(1)
 
 
 def _windows(lists: BundleLists, first: Array, last: Array) -> SlabWindows:

@@ -33,7 +33,9 @@ from jaxsph.field.particles import ParticleMedium, Wanted
 from jaxsph.field.schedule import SlabSchedule
 from jaxsph.field.tasks import RayPackets, SlabTask
 from jaxsph.field.transposed import COLUMNS
+from jaxsph.field.within import Within
 from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.mixture import Mixture
 from jaxsph.model.transfer import TransferFunction
@@ -63,13 +65,17 @@ class CastMethod:
 
 @dataclasses.dataclass(frozen=True)
 class DiffInputs:
-    """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any."""
+    """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any.
+
+    `within` is where particles are shown, None everywhere; other media are so by themselves.
+    """
 
     columns: dict[str, Float[Array, " particles"]]
     half_steps: Float[Array, " two_samples_and_one"]
     half_height: Float[Array, ""]
     transfer: TransferFunction | None
     media: tuple[Medium, ...]
+    within: Clip | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +102,7 @@ def cast(
     chosen: Any = None,
     min_transmittance: Float[Array, ""] | None = None,
     tolerance: Float[Array, ""] | None = None,
+    within: Clip | None = None,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
@@ -110,7 +117,7 @@ def cast(
     """
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
-    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media)
+    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
     fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance))
     return _cast(method, inputs, fixed)
 
@@ -144,7 +151,7 @@ def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted:
         return media
     segments = tuple(part.segments() for part in inputs.transfer.parts())
     tables = tuple(map(MeanTables.of, segments)) if between else None
-    return ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), *media
+    return Within.of(ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), inputs.within), *media
 
 
 def _moved(
@@ -245,14 +252,17 @@ def _pull(
         found = _Backward(batches, medium, method.integrator, wanted.field).pull(image, cotangent, start)
     of_media = found.medium if len(media) > 1 else (found.medium,)
     columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, of_media
+    within = jax.tree.map(jnp.zeros_like, inputs.within)
     if inputs.transfer is not None:
         particles, *others = of_media
+        if inputs.within is not None:
+            particles, within = particles.medium, particles.clip
         found_columns, transfer = particles.columns(), particles.of_transfer()
         columns = {name: found_columns[name] for name in columns}
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)
-    total = DiffInputs(columns, half_steps, half_height, transfer, tuple(others))
+    total = DiffInputs(columns, half_steps, half_height, transfer, tuple(others), within)
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 

@@ -49,11 +49,13 @@ def pilot(
     references: tuple[Float[Array, "slabs bundles"], ...],
     tolerance: Float[Array, ""],
     slab_samples: int,
+    able: Bool[Array, "slabs bundles"] | None = None,
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """Choose the slabs that are interpolated: as many evaluations saved as the tolerance allows.
 
     A slab is interpolated from the lattice, marched at `SUBSAMPLE` of its rays, or marched at all. At all are those whose
-    stencils leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice.
+    stencils leave the band's lattice, that may hold empty space, or that hold supports too small for the lattice; and those that
+    are not `able`, where that is given.
 
     Returns:
         The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is
@@ -61,6 +63,7 @@ def pilot(
     """
     count = grid.windows.count
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
+    allowed = allowed if able is None else allowed & able
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
     # a slab is first marched at fewer rays, then at none: the second step is always the dearer, so never taken without the first
     steps = jnp.concatenate([found.subsampled_share * found.variance, (1 - found.subsampled_share) * found.variance])

@@ -57,7 +57,7 @@ def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) ->
     for weighted, own, of_entry in zip(several, covers, task.entry.references, strict=True):
         still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
         ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
-        near, far, share = intervals_of(ratio, inside, own, depth)
+        near, far, share = intervals_of(ratio, inside, own, depth, task.part)
         reference = of_entry[:, None, None]
         found.append(Intervals(reference + near, reference + far, share))
     return found

@@ -68,7 +68,7 @@ class Lines(NamedTuple):
 
     Attributes:
         u, v: lateral coordinates at the middle of the slab; `slope_u`, `slope_v`: a unit of depth.
-        middle: its depth; `front`, `back`: of the slab's borders relative to it.
+        middle: its depth; `front`, `back`: of the slab's borders relative to it or, where only a part counts, of that.
         inverse: 1 / (length of the rays a unit of depth, squared).
     """
 
@@ -90,17 +90,30 @@ class Lines(NamedTuple):
         slope_u, slope_v = (u, v) if task.perspective else (jnp.zeros_like(u), jnp.zeros_like(v))
         scale = middle if task.perspective else jnp.ones_like(middle)
         inverse = 1 / (1 + slope_u**2 + slope_v**2)
-        return cls(u * scale, v * scale, slope_u, slope_v, middle, first - middle, last - middle, inverse)
+        front, back = first, last
+        if task.part is not None:
+            shape = jnp.broadcast_shapes(u.shape, v.shape)
+            front, back = (end.reshape(shape) for end in lax.stop_gradient(task.part_ends()))
+        return cls(u * scale, v * scale, slope_u, slope_v, middle, front - middle, back - middle, inverse)
 
 
-def outer_pivot(inside: Bool[Array, "tasks samples rays"], depth: Float[Array, "tasks samples"]) -> Float[Array, "tasks rays"]:
-    """Depth of the outer sample that tells pieces of a ray apart: the first behind an inner one, else the last in front."""
+def outer_pivot(
+    inside: Bool[Array, "tasks samples rays"],
+    depth: Float[Array, "tasks samples"],
+    looked_at: Bool[Array, "tasks samples rays"] | None = None,
+) -> Float[Array, "tasks rays"]:
+    """Depth of the outer sample that tells pieces of a ray apart: the first behind an inner one, else the last in front.
+
+    Samples that are not `looked_at` are neither.
+    """
+    outside = ~inside if looked_at is None else ~inside & looked_at
+    inside = inside if looked_at is None else inside & looked_at
     samples = inside.shape[1]
     found = jnp.full(inside.shape[::2], jnp.inf, depth.dtype)
     met = jnp.zeros(inside.shape[::2], bool)
     done = met
     for k in range(samples):
-        outer = ~inside[:, k] & ~done
+        outer = outside[:, k] & ~done
         found = jnp.where(outer, depth[:, k, None], found)
         met = met | inside[:, k]
         done = done | (outer & met)
@@ -119,7 +132,7 @@ def cover_of(
     Args:
         label: `"quantity"`, or `"place"` for the number of a particle in the windows of its slab in place of that.
     """
-    pivot = outer_pivot(inside, task.depth)
+    pivot = outer_pivot(inside, task.depth, None if task.part is None else task.looked_at())
     tasks, rays = pivot.shape
     far = jnp.finfo(pivot.dtype).max
     several = label == "quantity" and len(task.entry.references) > 1
@@ -156,7 +169,8 @@ def over_groups(
     Args:
         function: `function(items, some, carry)`: numbers of slabs, one past the last for none, and those slabs.
     """
-    has_outer = ~inside.all((1, 2)) & (task.entry.count > 0)
+    outer = ~inside if task.part is None else ~inside & task.looked_at()
+    has_outer = outer.any((1, 2)) & (task.entry.count > 0)
     tasks = has_outer.shape[0]
     group = min(GROUP, tasks)
     place = jnp.where(has_outer, jnp.cumsum(has_outer, dtype=jnp.int32) - 1, tasks + group)

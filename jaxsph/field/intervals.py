@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.field.cover import Cover
+from jaxsph.field.tasks import Part
 from jaxsph.model.transfer import slope_in_middle
 from jaxsph.model.transfer_means import MeanTables, mean_emission, mean_extinction
 
@@ -40,17 +41,30 @@ class Intervals(NamedTuple):
     far: Float[Array, "tasks intervals rays"]
     share: Float[Array, "tasks intervals rays"]
 
+    def narrowed(self, ahead: Float[Array, "tasks intervals rays"], part: Part | None) -> Intervals:
+        """What is in a part of each interval; `ahead` is the share before the inner part, in which the field is linear."""
+        if part is None:
+            return self
+        begin, end = jnp.maximum(ahead, part.begin), jnp.minimum(ahead + self.share, part.end)
+        inverse = jnp.where(self.share > 0, 1 / jnp.where(self.share > 0, self.share, 1), 0)
+        near, far = (self.near + jnp.clip((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
+        hull = part.end - part.begin
+        filled = jnp.where(hull > 0, part.share / jnp.where(hull > 0, hull, 1), 0)
+        return Intervals(near, far, jnp.maximum(end - begin, 0) * filled)
+
 
 def intervals_of(
     quantity: Float[Array, "tasks samples rays"],
     inside: Bool[Array, "tasks samples rays"],
     cover: Cover,
     depth: Float[Array, "tasks samples"],
+    part: Part | None = None,
 ) -> Intervals:
     """Intervals between samples of slabs.
 
     Args:
         quantity: at samples, relative to what that of the cover is.
+        part: of each interval that counts; None where all does.
     """
     begin, end = depth[:, :-1, None], depth[:, 1:, None]
     length = end - begin
@@ -68,7 +82,8 @@ def intervals_of(
     share = jnp.where(hidden, 0, jnp.maximum(1 - ahead - past, 0))
     at_front = jnp.where(begins, of_front, jnp.where(second, quantity[:, 1:], 0))
     at_back = jnp.where(ends, of_back, jnp.where(first, quantity[:, :-1], 0))
-    return Intervals(jnp.where(first, quantity[:, :-1], at_front), jnp.where(second, quantity[:, 1:], at_back), share)
+    found = Intervals(jnp.where(first, quantity[:, :-1], at_front), jnp.where(second, quantity[:, 1:], at_back), share)
+    return found.narrowed(ahead, part)
 
 
 class Paired(NamedTuple):

@@ -82,6 +82,7 @@ class ParticleMedium(Medium):
     """
 
     at_points = False  # lists are of slabs
+    in_parts = True
     grid: Grid
     segments: tuple[Segments, ...]
     tables: tuple[MeanTables, ...] | None

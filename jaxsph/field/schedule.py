@@ -59,6 +59,18 @@ def full_rate(windows: SlabWindows, references: tuple[Float[Array, "slabs bundle
     return SlabSchedule(filled, level, windows.begin, windows.length, windows.count, references)
 
 
+def clipped(schedule: SlabSchedule, meets: Bool[Array, "slabs bundles"] | None) -> SlabSchedule:
+    """With only those slabs at level 0 that a clip may have anything in common with; None is everywhere.
+
+    Wider spaced samples are of cells that a clip holds all of.
+    """
+    if meets is None:
+        return schedule
+    meets = jnp.pad(meets, ((0, schedule.level.shape[0] - meets.shape[0]), (0, 0))) | (schedule.level > 0)
+    length, count = (jnp.where(meets, value, 0) for value in (schedule.length, schedule.count))
+    return dataclasses.replace(schedule, filled=schedule.filled & meets, length=length, count=count)
+
+
 def reference_quantities(
     windows: SlabWindows, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]
 ) -> Float[Array, "slabs bundles"]:

@@ -72,6 +72,19 @@ class RayPackets:
         return share if self.list_id is None else jnp.zeros(bundles, share.dtype).at[self.list_id].add(share)
 
 
+class Part(NamedTuple):
+    """What of each interval between samples counts, as shares of its length.
+
+    Attributes:
+        begin, end: where it begins and ends.
+        share: how much that is in all; less than what lies between where it has gaps.
+    """
+
+    begin: Float[Array, "tasks intervals rays"]
+    end: Float[Array, "tasks intervals rays"]
+    share: Float[Array, "tasks intervals rays"]
+
+
 @dataclasses.dataclass(frozen=True)
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
@@ -85,6 +98,7 @@ class SlabTask:
         perspective: whether rays spread with depth.
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether what is asked for are means of the intervals between samples, which then lie on borders.
+        part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
     """
 
     entry: SlabSchedule
@@ -97,6 +111,7 @@ class SlabTask:
     perspective: bool
     scattered: bool = False
     between: bool = False
+    part: Part | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -109,6 +124,20 @@ class SlabTask:
         """Tasks, intervals between borders, and rays."""
         tasks, _, rays = self.shape
         return tasks, self.border.shape[1] - 1, rays
+
+    def part_ends(self) -> tuple[Float[Array, "tasks rays"], Float[Array, "tasks rays"]]:
+        """Depths at which, of each ray, the first part that counts begins and the last one ends: of none, in wrong order."""
+        assert self.part is not None
+        begin, length = self.depth[:, :-1, None], (self.depth[:, 1:] - self.depth[:, :-1])[..., None]
+        counts, far = self.part.share > 0, jnp.finfo(self.depth.dtype).max
+        first, last = (begin + length * share for share in (self.part.begin, self.part.end))
+        return jnp.where(counts, first, far).min(1), jnp.where(counts, last, -far).max(1)
+
+    def looked_at(self) -> Bool[Array, "tasks samples rays"]:
+        """Samples at the ends of intervals of which any part counts."""
+        assert self.part is not None
+        counts = jnp.pad(self.part.share > 0, ((0, 0), (1, 1), (0, 0)))
+        return counts[:, 1:] | counts[:, :-1]
 
     def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """View coordinates x, y, z of all samples."""
@@ -165,7 +194,8 @@ class SlabTask:
     def _some(self, chosen: Any) -> SlabTask:
         entry = jax.tree.map(lambda leaf: leaf[..., chosen], self.entry)
         names = "slab", "bundle", "u", "v", "depth", "border"
-        return dataclasses.replace(self, entry=entry, **{name: getattr(self, name)[chosen] for name in names})
+        part = jax.tree.map(lambda leaf: leaf[chosen], self.part)
+        return dataclasses.replace(self, entry=entry, part=part, **{name: getattr(self, name)[chosen] for name in names})
 
     def refined(self, parts: int) -> SlabTask:
         """Slabs of so many times as many samples, on borders, evenly spaced in each of the intervals."""
@@ -213,6 +243,6 @@ class Turns(NamedTuple):
 jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])
 jax.tree_util.register_dataclass(
     SlabTask,
-    data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border"],
+    data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border", "part"],
     meta_fields=["perspective", "scattered", "between"],
 )

@@ -59,6 +59,7 @@ class VolumeMedium(Medium):
         tables: of the transfer function for means between samples; None where none are asked for.
     """
 
+    in_parts = True
     grid: VolumeGrid
     segments: Segments
     shown: Occupancy
@@ -135,7 +136,7 @@ class VolumeMedium(Medium):
         within = jnp.clip((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
         near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])
         far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
-        return Intervals(near, far, jnp.maximum(within - ahead, 0))
+        return Intervals(near, far, jnp.maximum(within - ahead, 0)).narrowed(ahead, task.part)
 
     def means(self, intervals: Intervals, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """See `Medium.means`: of the transfer function, over the range of the quantity in each interval."""

@@ -47,10 +47,13 @@ class Medium(abc.ABC):
         at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
+        in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
+            part of an interval.
     """
 
     at_points: ClassVar[bool] = True
     between_samples: ClassVar[bool] = False
+    in_parts: ClassVar[bool] = False
 
     @property
     def dtype(self) -> Any:

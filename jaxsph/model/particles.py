@@ -6,6 +6,7 @@ Flow: files, scenes -> [particles] -> access -> cast -> image.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model import kernels
+from jaxsph.model.clips import Box
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
@@ -46,6 +48,7 @@ class Particles:
         position_rest: what rounding float64 positions to `position` has left, length units; None where that is a negligible
             part of every support.
         extinction_quantity: the second carried quantity, by which extinction is looked up; None where there is one alone.
+        box: the period, if there is one: supports reach across its faces, and one period is shown. Positions may be outside.
     """
 
     position: Float[Array, "particles 3"]
@@ -56,6 +59,7 @@ class Particles:
     kernel: str = "poly6"
     position_rest: Float[Array, "particles 3"] | None = None
     extinction_quantity: Float[Array, " particles"] | None = None
+    box: Box | None = None
 
     @classmethod
     def from_arrays(
@@ -67,6 +71,7 @@ class Particles:
         kernel: str = "poly6",
         *,
         capacity: int | None = None,
+        box: Any = None,
     ) -> Particles:
         """Check and pack arrays of particles.
 
@@ -79,6 +84,7 @@ class Particles:
             kernel: name of the smoothing kernel.
             capacity: pad to this many entries; default the class of N, see `capacity_class`, so that sets of similar size
                 share compiled programs.
+            box: (Lx, Ly, Lz), the sides of a periodic box whose lower corner is the origin, or a `jaxsph.Box`; length units.
 
         Returns:
             Particles of dtype float64 if `position` is float64 and x64 is enabled, else float32. float16 and bfloat16
@@ -87,7 +93,7 @@ class Particles:
 
         Raises:
             ValueError: wrong shapes, non-finite values, supports <= 0, volumes < 0, unknown kernel, capacity < N, numbers that
-                the dtype cannot hold.
+                the dtype cannot hold, a periodic box with a side that is not > 0 or shorter than a support.
         """
         kernels.by_name(kernel)
         arrays = {"position": position, "support": support, **_quantities(quantity), "volume": volume}
@@ -116,7 +122,8 @@ class Particles:
         if not is_traced(*arrays.values()) and count:
             _require_representable(arrays, packed)
             rest = rest_of(arrays["position"], packed["position"], packed["support"])
-        return cls(**packed, valid=jnp.arange(capacity) < count, kernel=kernel, position_rest=rest)
+        valid = jnp.arange(capacity) < count
+        return cls(**packed, valid=valid, kernel=kernel, position_rest=rest, box=_period(box, arrays["support"], dtype))
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.
@@ -130,6 +137,12 @@ class Particles:
         valid = jnp.pad(self.valid, (0, capacity - self.capacity))
         rest = None if self.position_rest is None else _repeated("position", self.position_rest, capacity, jnp)
         return dataclasses.replace(self, **padded, valid=valid, position_rest=rest)
+
+    def at(self, entries: Any) -> Particles:
+        """The particles of those entries (integers or a slice), in as many."""
+        columns = {name: column[entries] for name, column in (self.columns | {"valid": self.valid}).items()}
+        rest = None if self.position_rest is None else self.position_rest[entries]
+        return dataclasses.replace(self, **columns, position_rest=rest)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """The particles that exist, without padding (host side): all `columns`."""
@@ -170,8 +183,10 @@ class Particles:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around every support, (3,) and (3,), float64, length units (host side).
 
-        An empty set has the box of zeros.
+        An empty set has the box of zeros, a periodic one its own.
         """
+        if self.box is not None:
+            return self.box.corners()
         valid = np.asarray(self.valid)
         if not valid.any():
             return np.zeros(3), np.zeros(3)
@@ -191,6 +206,28 @@ def _quantities(given: Any) -> dict[str, Any]:
             "colour is looked up by the first, extinction by the second"
         )
     return {"quantity": given[0], SECOND: given[1]}
+
+
+def _period(box: Any, support: Any, dtype: Any) -> Box | None:
+    """A periodic box as given, or by its sides."""
+    if box is None:
+        return None
+    if is_traced(box):
+        box = box if isinstance(box, Box) else Box(jnp.zeros(3, dtype), box)
+    else:
+        if not isinstance(box, Box):
+            for check in (functools.partial(require_shape, shape=(3,)), require_finite, require_positive):
+                check("box", box, remedy="give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`")
+        corners = box.corners() if isinstance(box, Box) else (np.zeros(3), np.asarray(box, np.float64))
+        box = Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in corners))
+    if not is_traced(box, support) and np.size(support):
+        shortest, largest = float(np.asarray(box.sides).min()), float(np.asarray(support).max())
+        if largest > shortest:
+            raise ValueError(
+                f"`box` must have no side shorter than the largest support, but {shortest:.6g} < {largest:.6g}: a particle would "
+                "overlap more than its neighbouring images; give a larger box, or smaller supports"
+            )
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), box)
 
 
 def _padded(name: str, value: Any, dtype: Any, capacity: int) -> Array:

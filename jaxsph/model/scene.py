@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxsph.model.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import NOTHING, Particles
 from jaxsph.model.points import Points
@@ -38,6 +39,7 @@ class Scene:
         points: a point set, or a tuple of several.
         mix: how parts that share a sample are mixed. Extinctions add up either way; "extinction" has colours weigh by extinction,
             "opacity" adds colours times opacities (Kaehler, Abel & Hege 2007, equations 1 to 4), see `model.mixture`.
+        within: where all of it is shown, by `jaxsph.Plane`, `Box` and `Sphere`; nothing is there elsewhere. None is everywhere.
     """
 
     particles: Particles | None = None
@@ -47,6 +49,7 @@ class Scene:
     volume_transfer: TransferFunction | tuple[TransferFunction, ...] | None = None
     points: Points | tuple[Points, ...] | None = None
     mix: str = "extinction"
+    within: Clip | None = None
 
     def __post_init__(self) -> None:
         if self.mix not in MIXES:
@@ -60,6 +63,8 @@ class Scene:
                 given = type(wrong[0] if wrong else value).__name__
                 more = ", or a tuple of them" if name in several else ""
                 raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`{more}, got {given}")
+        if isinstance(self.within, str | int | float | tuple | list | dict):
+            raise ValueError(f"`within` must be a `jaxsph.Plane`, `Box`, `Sphere` or made of these, got {self.within!r}")
         media = self.media if isinstance(self.media, tuple) else (self.media,)
         if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
@@ -84,6 +89,11 @@ class Scene:
         """float32, or float64 if any part is."""
         given = [part.dtype for part in (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets, *self.media)]
         return jnp.result_type(*given) if given else jnp.dtype(jnp.float32)
+
+    @property
+    def particles_within(self) -> Clip | None:
+        """Where particles are shown: of a periodic set in one period."""
+        return both(None if self.particles is None else self.particles.box, self.within)
 
     @property
     def formulas(self) -> Formulas:
@@ -127,6 +137,6 @@ def _all_of(part: Any) -> tuple[Any, ...]:
 
 jax.tree_util.register_dataclass(
     Scene,
-    data_fields=["particles", "transfer", "media", "volume", "volume_transfer", "points"],
+    data_fields=["particles", "transfer", "media", "volume", "volume_transfer", "points", "within"],
     meta_fields=["mix"],
 )

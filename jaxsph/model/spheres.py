@@ -8,6 +8,8 @@ to a point set all else is out of its range of numbers: each medium takes from a
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -26,7 +28,7 @@ def spheres_of(scene: Scene) -> Particles:
     if len(sets) == 1:
         return sets[0]
     dtype = scene.dtype
-    columns = {
+    columns: dict[str, Any] = {
         name: jnp.concatenate([one.columns.get(name, one.quantity).astype(dtype) for one in sets]) for name in sets[0].columns
     }
     rest = None

@@ -30,6 +30,8 @@ def snug(camera: Camera, particles: Particles) -> Camera:
     valid = np.asarray(particles.valid)
     if not valid.any():
         return camera
+    if particles.box is not None:
+        return snug_box(camera, *particles.bounds())
     depth = _depth(camera, particles.exact_position()[valid])
     support = np.asarray(particles.support, np.float64)[valid]
     return _between(camera, (depth - support).min(), (depth + support).max())

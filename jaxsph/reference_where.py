@@ -1,0 +1,90 @@
+"""Where a scene is shown, in float64 NumPy: clips at points and along rays, and periodic sets as explicit copies.
+
+Flow: scene -> [reference_where] -> reference, reference_media.
+
+Written apart from `model.clips` and `model.periodic`, which are judged by it: in world space, with all copies of all particles.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxsph.model.camera import Camera
+from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
+from jaxsph.model.particles import Particles
+
+
+def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
+    """Whether points in world space are in a clip; None is everywhere."""
+    if clip is None:
+        return np.ones(place.shape[:-1], bool)
+    if isinstance(clip, Outside):
+        return ~inside(clip.clip, place)
+    if isinstance(clip, Both):
+        return inside(clip.first, place) & inside(clip.second, place)
+    if isinstance(clip, Plane):
+        return (place - _exact(clip.point, clip.rest)) @ np.asarray(clip.normal, np.float64) >= 0
+    if isinstance(clip, Sphere):
+        return ((place - _exact(clip.center, clip.rest)) ** 2).sum(-1) <= float(clip.radius) ** 2
+    if isinstance(clip, Box):
+        lower, upper = clip.corners()
+        return np.asarray(np.all((place >= lower) & (place <= upper), axis=-1))
+    raise ValueError(f"`{type(clip).__name__}` is unknown to the reference, which has planes, boxes and spheres")
+
+
+def crossings(
+    clip: Clip, start: Float[np.ndarray, "rays 3"], direction: Float[np.ndarray, "rays 3"]
+) -> Float[np.ndarray, "rays faces"]:
+    """Depths at which rays through `start + depth * direction` may pass faces of a clip; NaN where they do not."""
+    if isinstance(clip, Outside):
+        return crossings(clip.clip, start, direction)
+    if isinstance(clip, Both):
+        return np.concatenate([crossings(part, start, direction) for part in (clip.first, clip.second)], 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if isinstance(clip, Plane):
+            normal = np.asarray(clip.normal, np.float64)
+            depth = ((_exact(clip.point, clip.rest) - start) @ normal / (direction @ normal))[:, None]
+        elif isinstance(clip, Sphere):
+            away, length = start - _exact(clip.center, clip.rest), (direction**2).sum(1)
+            foot = -(away * direction).sum(1) / length
+            nearest = ((away + foot[:, None] * direction) ** 2).sum(1)
+            half = np.sqrt((float(clip.radius) ** 2 - nearest) / length)
+            depth = np.stack([foot - half, foot + half], 1)
+        else:
+            assert isinstance(clip, Box)
+            depth = np.concatenate([(corner - start) / direction for corner in clip.corners()], 1)
+    return np.where(np.isfinite(depth), depth, np.nan)
+
+
+def columns_of(particles: Particles) -> tuple[np.ndarray, ...]:
+    """Positions, supports, volumes and each quantity in float64; of a periodic set with every copy that reaches into the box."""
+    valid = np.asarray(particles.valid)
+    arrays: tuple[Any, ...] = particles.exact_position(), particles.support, particles.volume, *particles.quantities
+    position, support, *others = (np.asarray(column, np.float64)[valid] for column in arrays)
+    if particles.box is None or not len(position):
+        return position, support, *others
+    lower, upper = particles.box.corners()
+    period = upper - lower
+    position = lower + (position - lower) % period
+    most = np.ceil(support.max() / period).astype(int) + 1
+    copies = [position + period * turns for turns in itertools.product(*(range(-k, k + 1) for k in most))]
+    away = [np.linalg.norm(np.maximum(np.maximum(lower - copy, copy - upper), 0), axis=1) for copy in copies]
+    reaching = [gap < support for gap in away]
+    stacked = (
+        np.concatenate([own[which] for own, which in zip(each, reaching, strict=True)])
+        for each in (copies, *([column] * len(copies) for column in (support, *others)))
+    )
+    return tuple(stacked)
+
+
+def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
+    """World coordinates of view coordinates."""
+    return place @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
+
+
+def _exact(near: Any, rest: Any) -> np.ndarray:
+    return np.asarray(np.asarray(near, np.float64) + np.asarray(rest, np.float64))
