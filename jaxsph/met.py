@@ -108,11 +108,11 @@ class Recording(Look):
         self.found: list[tuple[np.ndarray, ...]] = []
         self._asked: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, slant: np.ndarray) -> None:
+    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
         """See `Look`."""
         before = seen.extinction[:, which].copy(), seen.emission[:, :, which].copy()
-        super().add(seen, which, quantity, portions, slant)
-        self._asked.append((which, quantity, seen.extinction[:, which] - before[0], seen.emission[:, :, which] - before[1]))
+        super().add(seen, which, quantities, portions, slant)
+        self._asked.append((which, quantities[0], seen.extinction[:, which] - before[0], seen.emission[:, :, which] - before[1]))
 
     def weigh(self, path: np.ndarray, transmittance: np.ndarray) -> None:
         """Keep what was asked for since, with the path length of each node and the transmittance in front of it."""

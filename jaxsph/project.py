@@ -97,7 +97,8 @@ def project(
     if not traced:
         _raise_for(int(word), planned)
     image = _image(sums, held, camera)
-    described = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
+    described: tuple[tuple[str, str], ...] = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel))
+    described += (("jaxsph.kernel", particles.kernel),)
     if not traced:
         described += (("jaxsph.camera", camera.describe()),)
     return dataclasses.replace(image, faults=word, name=name or held.name, unit=unit, metadata=described)

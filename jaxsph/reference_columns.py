@@ -57,7 +57,7 @@ def project(
     if not held.is_mean:
         return Projection(means[..., 0], None, area, camera.is_perspective, name=held.name)
     weights = means[..., 1]
-    values = np.where(weights > 0, means[..., 0] / np.where(weights > 0, weights, 1), np.nan)
+    values: Any = np.where(weights > 0, means[..., 0] / np.where(weights > 0, weights, 1), np.nan)
     return Projection(values, weights, area, camera.is_perspective, name=held.name)
 
 

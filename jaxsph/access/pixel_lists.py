@@ -95,7 +95,11 @@ def footprints(placed: Placed, camera: Camera, wanted: Bool[Array, " particles"]
     sides = pixel_ranges(x, y, z, reach, live, camera, between)
     nothing, nowhere = jnp.zeros_like(x), jnp.zeros((1, 1), jnp.int32)  # of samples, which columns have none of
     index = jnp.arange(x.shape[0], dtype=jnp.int32)
-    return Ordered(x, y, z, reach, nothing, nothing, nothing, live, *sides, *[nowhere] * 4, index)
+    borders = dict(zip(("left", "right", "top", "bottom"), sides, strict=True))
+    windows = dict.fromkeys(("first_rank", "last_rank", "first_beside", "last_beside"), nowhere)
+    columns = {"x": x, "y": y, "z": z, "reach": reach, "live": live}
+    columns |= dict.fromkeys(("scale", "size", "quantity"), nothing)
+    return Ordered(**columns, **borders, **windows, index=index)
 
 
 def _camera_fault(camera: Camera) -> Int[Array, ""]:
