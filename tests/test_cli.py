@@ -207,7 +207,7 @@ def test_a_volume_is_rendered_described_and_cut_at_a_level(tmp_path, monkeypatch
     io.write_volume("ball.vti", js.Volume.from_array(ball, (-1, -1, -1), 0.25))
     code, out, err = run(capsys, "render", "ball.vti", "-o", "out.exr", "--colormap", "heat", *TINY)
     assert (code, err) == (0, [])
-    assert all(said in out for said in ("9 x 9 x 9 points", "uint8", "heat over 0 to", "--eye"))
+    assert all(said in out for said in ("9 x 9 x 9 points", "uint8", "heat over", "= 0 to", "--eye"))
     assert np.asarray(io.read_image("out.exr").alpha).max() > 0.3
     code, out, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
     assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}

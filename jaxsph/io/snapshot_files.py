@@ -43,8 +43,8 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
         raise DataError(f"{path}: is one of {len(files)} files of a snapshot; beside it {_some(missing)} cannot be found")
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
     chosen = min(found.part_type for found in tables if found.part_type is not None)
-    tables = [found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables]
-    return concatenated([found for found in tables if found is not None], len(files))
+    of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
+    return concatenated([found for found in of_type if found is not None], len(files))
 
 
 def files_of(path: Path, number: int) -> list[Path] | None:
