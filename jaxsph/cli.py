@@ -25,6 +25,7 @@ from jaxsph import (
     cli_options,
     cli_particles,
     cli_points,
+    cli_several,
     cli_sweep,
     cli_transfer,
     cli_volume,
@@ -113,9 +114,11 @@ def _parser() -> argparse.ArgumentParser:
 
     render = command("render", _render, "make an image", "What you do not say is chosen, and said.")
     render.epilog = f"Built-in scenes: {', '.join(SCENE + name for name in scenes.names())}."
-    cli_options.add_source(render, optional=True)
+    cli_options.add_source(render, optional=True, several=True)
     _add_parts(render)
-    render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
+    render.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help=".exr or .png; of several files a folder, or a name with {} in it"
+    )
     cli_options.add_picture(render)
     cli_options.add_control(render)
     cli_transfer.add_looks(render)
@@ -155,6 +158,10 @@ def _add_parts(parser: argparse.ArgumentParser) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
+    cli_several.render_each(options, _render_one)
+
+
+def _render_one(options: argparse.Namespace) -> None:
     settings = _settings(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")

@@ -16,7 +16,7 @@ INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registr
 
 def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
     """Options of the file or built-in scene, and what of it is shown."""
-    number: dict[str, Any] = {"nargs": "+" if several else "?"} if optional or several else {}
+    number: dict[str, Any] = {"nargs": ("*" if optional else "+") if several else "?"} if optional or several else {}
     what = "file of particles or of a volume, or built-in scene" + ("; --points or --volume may stand for it" if optional else "")
     parser.add_argument("source", metavar="FILE|scene:NAME", help=what, **number)
     add = parser.add_argument_group("particles of a file").add_argument

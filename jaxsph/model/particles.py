@@ -140,7 +140,7 @@ class Particles:
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
-        columns = {name: column[entries] for name, column in (self.columns | {"valid": self.valid}).items()}
+        columns: dict[str, Any] = {name: column[entries] for name, column in (self.columns | {"valid": self.valid}).items()}
         rest = None if self.position_rest is None else self.position_rest[entries]
         return dataclasses.replace(self, **columns, position_rest=rest)
 

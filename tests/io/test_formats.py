@@ -1,15 +1,17 @@
 import builtins
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxsph as js
 import jaxsph.io as io
 from jaxsph.io.damage import UNENDED_NOTE
-from jaxsph.io.formats import FORMATS, find_format
+from jaxsph.io.formats import FORMATS, READERS, find_format
 
 from_text = {"a.csv", "a.xyz", "extended.xyz"}
 NAMES = [
@@ -134,3 +136,45 @@ def test_a_missing_library_is_named_with_the_extra_that_brings_it(name, library,
 def test_optional_libraries_are_not_imported_before_they_are_needed():
     code = "import sys, jaxsph.io; assert not {'h5py', 'meshio', 'tqdm', 'OpenEXR'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+POINT = "extra"
+
+
+def bring(monkeypatch, tmp_path, loaded):
+    """One entry point that loads what is given, or raises it."""
+
+    class Point:
+        name, value = POINT, "package:FORMAT"
+
+        def load(self):
+            if isinstance(loaded, Exception):
+                raise loaded
+            return loaded
+
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Point()] if group == READERS else [])
+
+
+def test_a_format_of_another_package_is_read_by_its_reader(monkeypatch, tmp_path):
+    (tmp_path / "one_file_reader.py").write_text(
+        "import numpy as np\nimport jaxsph as js\n"
+        "def read(path):\n    return js.io.ParticleTable(np.loadtxt(path, skiprows=1, ndmin=2)[:, :3])\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    package = types.ModuleType("one_package")
+    package.__path__ = [str(tmp_path)]
+    monkeypatch.setitem(sys.modules, "one_package", package)
+    form = js.io.Format("mine", (".mine",), "one_package.one_file_reader", lambda start: start.startswith(b"MINE"))
+    bring(monkeypatch, tmp_path, form)
+    path = tmp_path / "a.mine"
+    path.write_text("MINE\n1 2 3\n4 5 6\n")
+    np.testing.assert_array_equal(js.io.read_table(path).position, [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize("loaded", [ImportError("no such module"), "not a format"])
+def test_a_reader_that_cannot_be_loaded_is_left_out_and_named(monkeypatch, tmp_path, loaded):
+    bring(monkeypatch, tmp_path, loaded)
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z\n1,2,3\n")
+    with pytest.warns(UserWarning, match=f"reader '{POINT}'.*left out"):
+        assert len(js.io.read_table(path)) == 1

@@ -1,6 +1,8 @@
 """Promises of the image: how it is shown."""
 
+import dataclasses
 import io
+import sys
 
 import numpy as np
 import pytest
@@ -37,3 +39,27 @@ def test_an_image_writes_itself_as_what_its_path_says(tmp_path, suffix):
 
 def test_alpha_is_what_is_not_transmitted():
     assert image(np.zeros((2, 2, 3))).alpha.tolist() == [[0, 0], [0, 0]]
+
+
+def test_a_notebook_shows_size_time_and_error_below_it():
+    shown = dataclasses.replace(image(np.full((3, 5, 3), 0.5)), stats={"seconds": {"grid": 0.25, "cast": 0.5}})
+    shown = dataclasses.replace(shown, error_bound=np.full((3, 5), 0.004), certified=False)
+    text = shown._repr_html_()
+    assert "5 &times; 3, 0.75 s, error at most 0.004, estimated" in text
+    assert text.count("data:image/png;base64,") == 1
+
+
+def test_labelled_arrays_hold_every_layer_and_where_they_are_from():
+    xarray = pytest.importorskip("xarray")
+    given = dataclasses.replace(image(np.full((3, 5, 3), 0.25)), metadata=(("jaxsph.tolerance", 0.004),))
+    found = given.to_xarray()
+    assert isinstance(found, xarray.Dataset) and dict(found.sizes) == {"row": 3, "column": 5, "channel": 3}
+    np.testing.assert_array_equal(found["color"].sel(channel="green"), np.full((3, 5), 0.25))
+    assert set(found.data_vars) == {"color", "transmittance", "depth", "error_bound", "evaluations"}
+    assert found.attrs["jaxsph.tolerance"] == 0.004 and found.attrs["certified"] == "true"
+
+
+def test_labelled_arrays_name_their_library_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ImportError, match=r"jaxsph\[xarray\]"):
+        image(np.zeros((2, 2, 3))).to_xarray()
