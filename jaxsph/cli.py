@@ -141,10 +141,10 @@ def _parser() -> argparse.ArgumentParser:
     movie = command("movie", _movie, "make a movie", cli_movie.MORE)
     cli_options.add_source(movie, several=True)
     _add_parts(movie)
-    cli_movie.add_options(movie)
     cli_transfer.add_looks(movie)
     cli_options.add_picture(movie)
     cli_options.add_control(movie)
+    cli_movie.add_options(movie)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument
     add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")

@@ -38,8 +38,8 @@ OneScene = Callable[[argparse.Namespace], tuple[Scene, Camera]]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of the command besides those of its source and picture."""
-    parser.set_defaults(size=None)
+    """Options of the command besides those of its source and picture, which are there already."""
+    parser.set_defaults(size=None)  # so that the size in a file of key frames is taken unless another is asked for
     more = "(default: named after the first source, here); frames are in OUT_frames"
     parser.add_argument("-o", "--output", type=Path, metavar="OUT.mp4", help=more)
     group = parser.add_argument_group("movie")
@@ -236,7 +236,7 @@ def _orbit(options: argparse.Namespace, camera: Camera, shown: Bounded, seconds:
 
 def _all_round(camera: Camera, shown: Bounded, up: Any) -> Camera:
     """A camera with the same line of sight, as far away as the side that needs it most asks for."""
-    forward = np.asarray(camera.axes, np.float64)[2]
+    forward = np.array(camera.axes, np.float64)[2]
     axis = np.asarray(up, np.float64) / np.linalg.norm(up)
     how = {"up": up, "fov_degrees": 2 * math.degrees(math.atan(float(camera.half_height)))}
     how |= {"width": camera.width, "height": camera.height}

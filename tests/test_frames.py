@@ -150,3 +150,20 @@ def test_an_iterable_that_ends_too_early_is_told_of_after_its_frames():
     next(frames), next(frames)
     with pytest.raises(ValueError, match="more `cameras` than the 2 `sources`"):
         next(frames)
+
+
+def test_a_camera_that_flies_close_is_foreseen_and_compiled_for_once(compiles):
+    closer = js.Camera.look_at((0, 0, 0.9), (0, 0, 0), width=24, height=16, near=0.1, far=2)
+    cameras = js.CameraPath.from_keys([(0, CAMERA)]).fly_to(closer, 1).cameras(9)
+    frames, before = 0, 0
+    for _ in js.render_frames(cloud(300), cameras, SETTINGS):
+        frames, before = frames + (len(compiles) > before), len(compiles)
+    assert frames <= 1
+
+
+def test_in_double_precision_all_is(tmp_path):
+    import jax
+
+    with jax.enable_x64(True):
+        path = js.CameraPath.orbit(center=(0, 0, 0), radius=2.0, degrees=30, width=8, height=8)
+        assert path.at(2.0).dtype == np.float64

@@ -72,12 +72,12 @@ class Leg:
         return made(eye, axes, half_height, near, far, self.cameras[0])
 
     @functools.cached_property
-    def _knots(self) -> np.ndarray:
+    def _key_times(self) -> np.ndarray:
         return np.asarray(self.times, np.float64)
 
     @functools.cached_property
     def _turning(self) -> Callable[[float], Rotation]:
-        return Turning.through(self._knots, self._rotations)
+        return Turning.through(self._key_times, self._rotations)
 
     @functools.cached_property
     def _rotations(self) -> Rotation:
@@ -89,11 +89,11 @@ class Leg:
         half, near, far = (
             np.array([float(getattr(one, name)) for one in self.cameras]) for name in ("half_height", "near", "far")
         )
-        zoom = monotone(self._knots, np.log(half))
+        zoom = monotone(self._key_times, np.log(half))
         if not self.cameras[0].is_perspective:
-            front, back = ordered(self._knots, near, far)
+            front, back = ordered(self._key_times, near, far)
             return lambda time: (math.exp(zoom(time)), float(front(time)), float(back(time)))
-        front, back = ordered(self._knots, np.log(near), np.log(far))
+        front, back = ordered(self._key_times, np.log(near), np.log(far))
         return lambda time: (math.exp(zoom(time)), math.exp(front(time)), math.exp(back(time)))
 
     def _eye(self, time: float, axes: np.ndarray) -> np.ndarray:
@@ -101,16 +101,16 @@ class Leg:
 
     @functools.cached_property
     def _eyes(self) -> Values:
-        return through(self._knots, np.array([one.exact_eye() for one in self.cameras]))
+        return through(self._key_times, np.array([one.exact_eye() for one in self.cameras]))
 
     @functools.cached_property
     def _seen(self) -> Values:
         """Where the point `around` is in view space: its depth geometrically, its place in the image smoothly."""
         place = np.array(self._places())
         if not self.cameras[0].is_perspective:
-            return through(self._knots, place)
-        depth = monotone(self._knots, np.log(place[:, 2]))
-        in_image = through(self._knots, place[:, :2] / place[:, 2:])
+            return through(self._key_times, place)
+        depth = monotone(self._key_times, np.log(place[:, 2]))
+        in_image = through(self._key_times, place[:, :2] / place[:, 2:])
         return lambda time: math.exp(depth(time)) * np.append(in_image(time), 1.0)
 
     def _places(self) -> list[np.ndarray]:

@@ -225,5 +225,5 @@ def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
 
 def _turned(camera: Camera, center: np.ndarray, axis: np.ndarray, degrees: float) -> Camera:
     turn = Rotation.from_rotvec(np.radians(degrees) * axis)
-    axes, eye = turn.apply(np.asarray(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
+    axes, eye = turn.apply(np.array(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
     return made(eye, axes, float(camera.half_height), float(camera.near), float(camera.far), camera)

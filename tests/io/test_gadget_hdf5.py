@@ -99,3 +99,11 @@ def test_a_snapshot_that_does_not_say_of_how_many_files_it_is_one_is_read(value,
         file["Header"].attrs["NumFilesPerSnapshot"] = value
     table = io.read_table(tmp_path / "a.hdf5")
     assert len(table) == 7 and not any("files of the snapshot" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("stored", [0.25, [0.25]])
+def test_the_time_in_the_header_is_that_of_the_snapshot(stored, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        file["Header"].attrs["Time"] = stored
+    assert io.read_table(tmp_path / "a.hdf5").time == 0.25

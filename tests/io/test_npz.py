@@ -121,3 +121,9 @@ def test_every_layout_of_an_array_is_read(order, dtype, tmp_path):
     table = io.read_table(tmp_path / "a.npz")
     np.testing.assert_array_equal(table.position, position)
     np.testing.assert_array_equal(table.columns["big"], position)
+
+
+@pytest.mark.parametrize("name", ["time", "t"])
+def test_the_time_of_a_snapshot_is_read(name, tmp_path):
+    np.savez(tmp_path / "a.npz", position=np.zeros((2, 3)), **{name: 0.25})
+    assert io.read_table(tmp_path / "a.npz").time == 0.25

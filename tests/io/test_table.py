@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from jaxsph.io.table import ParticleTable, table_from_columns
+from jaxsph.io.table import ParticleTable, table_from_columns, time_of
 
 
 def test_big_endian_arrays_become_native():
@@ -71,3 +71,11 @@ def test_a_smoothing_length_of_unknown_convention_is_kept_but_not_used():
 def test_columns_wider_than_any_or_of_no_width_are_refused(shape):
     with pytest.raises(ValueError, match=r"column `a` has shape \(., \d+\).* 1 to 65536 numbers a particle"):
         ParticleTable(np.zeros((shape[0], 3)), {"a": np.zeros(shape)})
+
+
+@pytest.mark.parametrize(
+    ("stored", "time"),
+    [(0.5, 0.5), (np.float32([0.25]), 0.25), (3, 3.0), ((), None), ([1, 2], None), (np.nan, None), ("late", None)],
+)
+def test_a_time_is_one_finite_number_or_not_known(stored, time):
+    assert time_of(stored) == time
