@@ -1,5 +1,7 @@
 """Column integrals of kernels against quadrature of the kernels themselves."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +20,7 @@ def quadrature(name, b, start, end):
     kernel, total = kernels.by_name(name), 0.0
     rings = [np.sqrt(max(c * c - b * b, 0)) for c in (0.5, 1)]
     breaks = sorted({start, end, *(t for t in (0, *rings, *(-r for r in rings)) if start < t < end)})
-    for low, high in zip(breaks[:-1], breaks[1:], strict=True):
+    for low, high in itertools.pairwise(breaks):
         t = (low + high) / 2 + (high - low) / 2 * NODES
         total += (high - low) / 2 * (WEIGHTS * kernel.norm * kernel.of_square(b * b + t * t, np)).sum()
     return total
