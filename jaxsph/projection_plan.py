@@ -25,7 +25,7 @@ from jaxsph.numerics.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.plan import MAX_CAPACITY
 
 PIXELS = ("mean", "ray")
-SUBRAYS = 3  # of a pixel on each axis in means, where there are no shares: good to 1e-4 of the peak from 3 pixels a support on
+SUBRAYS = 3  # of a pixel on each axis in means, where there are no shares: good to 3e-4 of the peak from 2 pixels a support on
 SHARES = 0
 """Number of rays that stands for shares instead."""
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
@@ -78,6 +78,12 @@ class ProjectionPlan:
         lists = self.shares if subrays == SHARES else self.rays
         return max(min(self.tuning.samples_at_once // (BLOCK * max(subrays, 1) ** 2), lists.num_bundles if lists else 1), 1)
 
+    def grown(self, needed: ProjectionPlan) -> ProjectionPlan:
+        """This plan where it has room for all that another was made for, else the other with at least the room of this."""
+        if dataclasses.replace(self, rays=None, shares=None) != dataclasses.replace(needed, rays=None, shares=None):
+            return needed
+        return dataclasses.replace(self, rays=_larger(self.rays, needed.rays), shares=_larger(self.shares, needed.shares))
+
     def check(self, particles: Particles, camera: Camera, pixel: str) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given."""
         given = {
@@ -94,12 +100,19 @@ class ProjectionPlan:
 
 
 def plan_projection(
-    particles: Particles, camera: Camera, *, pixel: str = "mean", memory_limit: int | None = None
+    particles: Particles,
+    camera: Camera,
+    *,
+    pixel: str = "mean",
+    like: ProjectionPlan | None = None,
+    memory_limit: int | None = None,
 ) -> ProjectionPlan:
     """Measure the room that a projection needs (host side; values must be concrete).
 
     Args:
         particles, camera, pixel: as for `jaxsph.project`.
+        like: a plan to grow: returned as it is where it has room, else with more; so that one plan, and what is compiled for it,
+            serves all frames of a sequence.
         memory_limit: bytes of working memory; default 4 GiB, or half of an accelerator's.
 
     Raises:
@@ -107,14 +120,19 @@ def plan_projection(
     """
     if is_traced(particles, camera):
         raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
-    rules = [(1, wanted_all)] if pixel == "ray" else [(SHARES, wanted_small), (SUBRAYS, wanted_large)]
-    placed = placed_by(particles, camera)
-    counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in rules]  # type: ignore[arg-type]
-    machine, limit = tuning_for(particles.support), memory_limit or memory_for(particles.support)
+    made = _measured(particles, camera, pixel, memory_limit or memory_for(particles.support))
+    return made if like is None else like.grown(made)
+
+
+def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> ProjectionPlan:
+    """The plan with as few bands as the limit allows."""
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
+    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support))
+    placed = placed_by(particles, camera)
+    counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in bare.rules]  # type: ignore[arg-type]
     while True:
         lists = [_lists(one, camera, bands) for one in counts]
-        made = ProjectionPlan(*size, pixel, bands, lists[-1], lists[0] if pixel == "mean" else None, machine)
+        made = dataclasses.replace(bare, bands=bands, rays=lists[-1], shares=lists[0] if pixel == "mean" else None)
         needed = _bytes(made)
         if needed <= limit and all(one is None or one.list_capacity <= MAX_CAPACITY for one in lists):
             return made
@@ -153,6 +171,13 @@ placed_by = jax.jit(place)
 @functools.partial(jax.jit, static_argnames="subrays")
 def _footprints(placed: Placed, camera: Camera, *, subrays: int) -> Ordered:
     return footprints(placed, camera, WANTED[subrays](placed), beside(subrays))
+
+
+def _larger(one: ListPlan | None, other: ListPlan | None) -> ListPlan | None:
+    if one is None or other is None:
+        return one or other
+    tiles, pairs = max(one.tile_capacity, other.tile_capacity), max(one.list_capacity, other.list_capacity)
+    return dataclasses.replace(one, tile_capacity=tiles, list_capacity=pairs)
 
 
 def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan | None:

@@ -41,7 +41,7 @@ def project(
         Values of float64 NumPy arrays.
     """
     held = held_by(particles, of, weight)
-    amounts = np.asarray(held.amounts, np.float64) * np.asarray(held.scales)
+    amounts = np.ldexp(np.asarray(held.amounts, np.float64), held.exponents)
     near, far = (float(depth) for depth in (depth_range or (camera.near, camera.far)))
     number = 1 if pixel == "ray" else subrays
     places, shares = np.polynomial.legendre.leggauss(number)

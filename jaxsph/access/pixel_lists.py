@@ -23,7 +23,10 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.numerics import faults
 
-SMALL = 3.0  # pixels that a support radius may have for shares where they are not exact: rays are then exact to 1e-4 of the peak
+SMALL = (
+    2.0  # pixels that a support radius may have for shares where they are not exact: with more, rays are good to 3e-4 of the peak
+)
+NARROW = 1 / 32  # of its depth that it may have in perspective, unless it is smaller than a pixel: larger ones are no ellipses
 LARGE = 256.0  # pixels beyond which differences of float32 corner integrals lose more than rays do
 RAY, SHARE = "ray", "share"
 
@@ -63,7 +66,7 @@ def place(particles: Particles, camera: Camera) -> Placed:
     live = particles.valid & usable & (z + still >= camera.near) & (z - still <= camera.far)
     pixel = 2 * height / camera.height
     if camera.is_perspective:
-        small = (z > 0) & (still < SMALL * pixel * z)
+        small = (z > 0) & (still < jnp.maximum(jnp.minimum(SMALL * pixel, NARROW), pixel) * z)
     else:
         whole = (z - still >= camera.near) & (z + still <= camera.far)
         small = (still < SMALL * pixel) | (whole & (still < LARGE * pixel))

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.lists import BUNDLE, BundleLists
@@ -95,20 +96,31 @@ def column_sums(method: ColumnMethod, inputs: ColumnInputs, lists: BundleLists) 
     return _sum(method, inputs, lists)
 
 
-@column_sums.defjvp
 def _differentiate(method: ColumnMethod, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    """Sums and their tangent, which is a linear map of the tangents with a transpose of its own."""
     inputs, lists = primals
-    structure = jax.tree.structure(inputs)
-    result = _sum(method, inputs, lists)
+    leaves, structure = jax.tree.flatten(inputs)
+    result = column_sums(method, inputs, lists)
+    moves = list(tangents[0])
+    moving = [i for i, move in enumerate(moves) if not isinstance(move, SymbolicZero)]
+    if not moving:
+        return result, jnp.zeros_like(result)
 
     def push(moves: list[Array]) -> Array:
-        moved = jax.tree.unflatten(structure, moves)
-        return jax.jvp(lambda inputs: _sum(method, inputs, lists), (inputs,), (moved,))[1]
+        def sums(parts: list[Array]) -> Array:
+            there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
+            return _sum(method, jax.tree.unflatten(structure, there), lists)
+
+        return jax.jvp(sums, ([leaves[i] for i in moving],), (moves,))[1]
 
     def pull(cotangent: Array) -> list[Array]:
-        return jax.tree.leaves(_pull(method, inputs, lists, cotangent))
+        cotangents = _pull(method, inputs, lists, cotangent)
+        return [cotangents[i] for i in moving]
 
-    return result, linear_map(push, pull, jax.tree.leaves(tangents[0]), result, jax.tree.leaves(inputs), TWICE)
+    return result, linear_map(push, pull, [moves[i] for i in moving], result, leaves, TWICE)
+
+
+column_sums.defjvp(_differentiate, symbolic_zeros=True)
 
 
 def pixels_of(sums: Float[Array, "bundles channels down across"], subrays: int) -> Float[Array, "bundles 8 8 channels"]:

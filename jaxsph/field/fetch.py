@@ -51,7 +51,8 @@ def particle_at(
 
 def quantities_of(ordered: Ordered) -> tuple[Float[Array, " particles"], ...]:
     """All that is summed up of particles besides their weights."""
-    return ordered.quantities
+    second = ordered.extinction_quantity
+    return (ordered.quantity,) if second is None else (ordered.quantity, second)
 
 
 def fetch(

@@ -24,14 +24,14 @@ class Held:
     """Amounts, or values times weights and weights.
 
     Attributes:
-        amounts: over `scales`, such that float32 holds them; 0 where there is no particle.
-        scales: of each channel, powers of two.
+        amounts: over powers of two, such that float32 holds them; 0 where there is no particle.
+        exponents: of those powers, of each channel.
         is_mean: whether there is a weight.
         name: of what was asked for.
     """
 
     amounts: Float[Array, "particles channels"]
-    scales: tuple[float, ...]
+    exponents: tuple[int, ...]
     is_mean: bool
     name: str
 
@@ -56,8 +56,8 @@ def held_by(particles: Particles, of: Any, weight: Any) -> Held:
 def emission(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0) -> Any:
     r"""Amounts whose projection is the integral of $A \rho^n$ along rays: $A_j \rho_j^{n-1} m_j$.
 
-    For n = 1 that is $A$ times the column density, exactly. For others it is the SPH sum of $A \rho^{n-1}$; each particle has the
-    density of its own; the power of the summed density at a point is another, and no sum over particles.
+    For n = 1 that is $A$ times the column density, exactly. For others it is the SPH sum of $A \rho^{n-1}$, each particle with
+    the density of its own; the power of the summed density at a point is another number, and no sum over particles.
 
     Args:
         mass, density: of particles, in the order of their arrays.
@@ -91,13 +91,13 @@ def _numbers(particles: Particles, name: str, given: Any) -> Any:
     return np.pad(value, (0, particles.capacity - value.shape[0]))
 
 
-def _scaled(particles: Particles, channels: list[Any]) -> tuple[Any, tuple[float, ...]]:
+def _scaled(particles: Particles, channels: list[Any]) -> tuple[Any, tuple[int, ...]]:
     """Channels side by side, over the power of two next to their largest number where that is known."""
     dtype = particles.dtype
     if is_traced(particles.valid, *channels):
-        return jnp.stack([jnp.where(particles.valid, one, 0).astype(dtype) for one in channels], 1), (1.0,) * len(channels)
+        return jnp.stack([jnp.where(particles.valid, one, 0).astype(dtype) for one in channels], 1), (0,) * len(channels)
     known = [np.where(np.asarray(particles.valid), one, 0) for one in channels]
     largest = [float(np.abs(one).max(initial=0)) for one in known]
-    scales = tuple(2.0 ** math.frexp(one)[1] if np.isfinite(one) and one > 0 else 1.0 for one in largest)
-    columns = [np.asarray(one / scale, dtype) for one, scale in zip(known, scales, strict=True)]
-    return jnp.asarray(np.stack(columns, 1)), scales
+    exponents = tuple(math.frexp(one)[1] if math.isfinite(one) else 0 for one in largest)
+    columns = [np.ldexp(one, -exponent).astype(dtype) for one, exponent in zip(known, exponents, strict=True)]
+    return jnp.asarray(np.stack(columns, 1)), exponents

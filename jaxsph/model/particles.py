@@ -108,11 +108,7 @@ class Particles:
             if arrays[name].ndim == 0:
                 arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
             require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
-        if not is_traced(*arrays.values()):
-            for name, value in arrays.items():
-                require_finite(name, value)
-            require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
-            require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
+        _require_usable(arrays)
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
         capacity = capacity_class(count) if capacity is None else capacity
         if capacity < max(count, 1):
@@ -193,6 +189,16 @@ class Particles:
         position = self.exact_position()[valid]
         support = np.asarray(self.support, np.float64)[valid, None]
         return (position - support).min(0), (position + support).max(0)
+
+
+def _require_usable(arrays: dict[str, Any]) -> None:
+    """Raise where values that are known are not finite, supports not positive, or volumes negative."""
+    if is_traced(*arrays.values()):
+        return
+    for name, value in arrays.items():
+        require_finite(name, value)
+    require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
+    require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
 
 
 def _quantities(given: Any) -> dict[str, Any]:
