@@ -71,7 +71,8 @@ def project(
         name, unit: what the values are called in files and figures, and their unit.
 
     Returns:
-        Values in the dtype of the particles, in units of `of`, over length squared without weight. What they are exact to is at the head of this module.
+        Values in the dtype of the particles, in units of `of`, over length squared without weight; for their accuracy see
+        the head of this module.
 
     Differentiation:
         By positions, supports, `of`, `weight` and the camera, depths included, in both modes. Which pixels a particle can touch
@@ -96,7 +97,7 @@ def project(
         _raise_for(int(word), planned)
     described = [("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)]
     described += [] if traced else [("jaxsph.camera", camera.describe())]
-    told = {"faults": word, "name": name or held.name, "unit": unit, "metadata": tuple(described)}
+    told: dict[str, Any] = {"faults": word, "name": name or held.name, "unit": unit, "metadata": tuple(described)}
     return dataclasses.replace(_image(sums, held, camera), **told)
 
 

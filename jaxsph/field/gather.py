@@ -62,4 +62,4 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
         w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
         return w, [quantity[:, k, None, None, None] for quantity in quantities]
 
-    return with_block(sums, (weighed(k) for k in range(BLOCK)))
+    return with_block(sums, [weighed(k) for k in range(BLOCK)])
