@@ -71,8 +71,7 @@ def project(
         name, unit: what the values are called in files and figures, and their unit.
 
     Returns:
-        Values in the dtype of the particles, in units of `of`, over length squared without weight; for their accuracy see
-        the head of this module.
+        Values in the dtype of the particles, in units of `of`, over length squared without weight; as exact as said above.
 
     Differentiation:
         By positions, supports, `of`, `weight` and the camera, depths included, in both modes. Which pixels a particle can touch

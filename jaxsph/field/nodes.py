@@ -140,7 +140,7 @@ def gather_nodes(
             w = smooth.weigh(along[:, :, None], across[:, None], block.size[k], jnp)
             return w, [quantity[k] for quantity in block.quantities]
 
-        return with_block(sums, (weighed(k) for k in range(BLOCK)))
+        return with_block(sums, [weighed(k) for k in range(BLOCK)])
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)
     start = sums_of([zero] * (1 + len(quantities_of(ordered))))
