@@ -6,6 +6,7 @@ from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
 from jaxsph.plan import Plan
@@ -36,6 +37,7 @@ __all__ = [
     "TransferFunction",
     "Volume",
     "__version__",
+    "along_axis",
     "coarse_bound",
     "coarsened",
     "emission",

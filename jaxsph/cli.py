@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxsph
-from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
+from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_project, cli_sweep, cli_volume, io, scenes
 from jaxsph.cli_progressive import render_in_stages
 from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
@@ -110,6 +110,9 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(info, optional=True)
     _add_parts(info)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
+    cli_project.add_options(
+        command("project", cli_project.run, "integrate along rays: column densities, means", cli_project.MORE)
+    )
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
     sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
     cli_options.add_source(sweep)

@@ -20,6 +20,7 @@ from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.points import PointsReport, points_from_table
+from jaxsph.io.projections import read_projection, write_projection
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
@@ -46,11 +47,13 @@ __all__ = [
     "read_image",
     "read_particles",
     "read_points",
+    "read_projection",
     "read_table",
     "read_volume",
     "read_volume_table",
     "volume_from_table",
     "write_image",
+    "write_projection",
     "write_volume",
 ]
 
