@@ -36,8 +36,9 @@ SUMMED = {
 
 TEXT = "integrate along rays: column densities, means, emission"
 MORE = (
-    "NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a column "
-    "density, number to a column number density, and the integral of any other quantity is taken along rays; nothing is normalised. What you do not say is chosen, and said."
+    "NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a "
+    "column density, number to a column number density, and the integral of any other quantity is taken along rays; nothing is "
+    "normalised. What you do not say is chosen, and said."
 )
 
 
@@ -48,9 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help=f"{suffixes} (default: FILE's name with .exr, here)")
     add = parser.add_argument_group("what is projected").add_argument
     add("--of", metavar="NAME", help="mass, number, volume or a quantity (default: mass where there are masses, else number)")
-    add(
-        "--weight", metavar="NAME", help="a mean of --of along rays, weighted by mass, number, volume, or a quantity times volume"
-    )
+    add("--weight", metavar="NAME", help="a mean of --of along rays, by mass, number, volume, or a quantity times volume")
     add("--emission", type=float, metavar="N", help="emission: the integral of density^N, times --of where that is given")
     add(
         "--pixel",
