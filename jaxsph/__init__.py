@@ -11,6 +11,7 @@ from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.clips import Box, Plane, Sphere
 from jaxsph.model.domains import control_values
+from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
 from jaxsph.plan import Plan
@@ -50,6 +51,7 @@ __all__ = [
     "Volume",
     "Within",
     "__version__",
+    "along_axis",
     "coarse_bound",
     "coarsened",
     "control_values",

@@ -25,6 +25,7 @@ from jaxsph import (
     cli_options,
     cli_particles,
     cli_points,
+    cli_project,
     cli_several,
     cli_sweep,
     cli_transfer,
@@ -132,6 +133,9 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(info, optional=True)
     _add_parts(info)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
+    cli_project.add_options(
+        command("project", cli_project.run, "integrate along rays: column densities, means", cli_project.MORE)
+    )
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
     sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
     cli_options.add_source(sweep)

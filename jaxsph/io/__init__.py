@@ -23,6 +23,7 @@ from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.labels import Labels, labels_of
 from jaxsph.io.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.points import PointsReport, points_from_table
+from jaxsph.io.projections import read_projection, write_projection
 from jaxsph.io.quantities import available_quantities
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
@@ -55,6 +56,7 @@ __all__ = [
     "read_image",
     "read_particles",
     "read_points",
+    "read_projection",
     "read_table",
     "read_transfer",
     "read_volume",
@@ -63,6 +65,7 @@ __all__ = [
     "write_camera_path",
     "write_image",
     "write_movie",
+    "write_projection",
     "write_transfer",
     "write_volume",
 ]

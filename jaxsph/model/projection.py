@@ -20,7 +20,8 @@ from jaxsph.model.colormaps import colormap as colors_of
 from jaxsph.model.colormaps import value_range
 
 NORMS = ("log", "linear")
-DECADES = 1.0  # positive values that span more are shown by their logarithm when nobody chose
+LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
+SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
 EMPTY = 0  # of a picture, where there is no value
 
 
@@ -105,12 +106,10 @@ class Projection:
             raise ValueError(f"`norm` must be {' or '.join(map(repr, NORMS))}, got {norm!r}")
         values: Any = np.asarray(self.values, np.float64)
         finite = values[np.isfinite(values)]
-        positive = finite[finite > 0]
-        some = positive if positive.size else np.ones(1)
-        logs = value_range(np.log10(some))
-        log = norm == "log" or (norm is None and bool((finite >= 0).all()) and logs[1] - logs[0] > DECADES)
+        ends = _ends(finite)
+        log = norm == "log" or (norm is None and bool((finite >= 0).all()) and ends[1] > LARGE_SPAN * ends[0])
         if value_span is None:
-            return log, ((10.0 ** logs[0], 10.0 ** logs[1]) if log else value_range(finite))
+            return log, (ends if log else value_range(finite))
         low, high = (float(value) for value in value_span)
         if not (math.isfinite(low) and math.isfinite(high) and low < high) or (log and low <= 0):
             more = ", above 0 for logarithms" if log else ""
@@ -153,6 +152,16 @@ class Projection:
         buffer = io.BytesIO()
         Pillow.fromarray(self.to_uint8()).save(buffer, format="PNG")
         return buffer.getvalue()
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    """Positive values between which nearly all lies that is in an image: its fringe is faint, and goes down to nothing."""
+    positive = np.sort(values[values > 0])
+    if not positive.size:
+        return 1.0, 2.0
+    shares = np.cumsum(positive / positive[-1])
+    low, high = (float(positive[np.searchsorted(shares, share * shares[-1])]) for share in SHARES)
+    return (low, high) if high > 1.001 * low else (0.5 * high, 2 * high)
 
 
 jax.tree_util.register_dataclass(
