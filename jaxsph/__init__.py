@@ -13,6 +13,7 @@ from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
+from jaxsph.slices import Slice, slice_of
 from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
 from jaxsph.version import __version__
@@ -31,6 +32,7 @@ __all__ = [
     "Progressive",
     "Scene",
     "Settings",
+    "Slice",
     "Sphere",
     "TransferFunction",
     "Volume",
@@ -48,6 +50,7 @@ __all__ = [
     "render",
     "resample",
     "scenes",
+    "slice_of",
     "splat_bound",
     "sweep",
 ]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jaxsph
-from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, io, scenes
+from jaxsph import cli_cache, cli_options, cli_particles, cli_points, cli_sweep, cli_volume, cli_where, io, scenes
 from jaxsph.cli_progressive import render_in_stages
 from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
 from jaxsph.model import Camera, Particles, Scene, Settings
@@ -103,6 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     render.epilog = f"Built-in scenes: {', '.join(SCENE + name for name in scenes.names())}."
     cli_options.add_source(render, optional=True)
     _add_parts(render)
+    cli_where.add_places(render)
     render.add_argument("-o", "--output", type=Path, metavar="OUT", help=".exr or .png (default: named after FILE, here)")
     cli_options.add_picture(render)
     cli_options.add_control(render)
@@ -124,19 +125,25 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_parts(parser: argparse.ArgumentParser) -> None:
+    cli_where.add_selection(parser)
     cli_volume.add_options(parser)
     cli_points.add_options(parser)
 
 
 def _render(options: argparse.Namespace) -> None:
     settings = _settings(options)
+    cli_where.settle(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
     _require_something(options)
     first = options.source or (options.volume or options.points)[0]
     output = options.output or Path(Path(first.removeprefix(SCENE)).stem + ".png")
-    _require_writable(output)
+    _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
     scene, camera = _scene(options)
+    scene = cli_where.shown(scene, options)
+    if options.slice is not None:
+        cli_where.save_slice(scene, camera, options, output)
+        return
     say("camera", camera_line(camera))
     started = time.perf_counter()
     if options.progressive:
@@ -145,6 +152,7 @@ def _render(options: argparse.Namespace) -> None:
         with progress("render") as show:
             image = jaxsph.render(scene, camera, settings, progress=show)
     elapsed = time.perf_counter() - started
+    image = cli_where.labelled(image, options)
     image.save(output)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
     if settings.tolerance is not None:
@@ -205,7 +213,7 @@ def _source(options: argparse.Namespace) -> tuple[Any, Any, Camera | None]:
     """Scene of the source, what there is to frame, and the camera where it has one."""
     if options.source is None:
         of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame", "colormap", "range", "opacity")
-        _refuse(options, of_source, "is for FILE or scene:NAME, and there is none")
+        _refuse(options, (*of_source, *cli_where.OF_PARTICLES), "is for FILE or scene:NAME, and there is none")
         return None, None, None
     if options.source.startswith(SCENE):
         scene, camera = _scene_of_name(options)
@@ -220,7 +228,8 @@ def _require_something(options: argparse.Namespace, also: str = "") -> None:
 
 
 def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    _refuse(options, ("quantity", "support", "kernel", "part_type", "iso"), "is for particle files, not for built-in scenes")
+    of_files = ("quantity", "support", "kernel", "part_type", "iso", *cli_where.OF_FILES)
+    _refuse(options, of_files, "is for particle files, not for built-in scenes")
     name = options.source.removeprefix(SCENE)
     width, height = getattr(options, "size", (512, 512))
     try:
@@ -240,7 +249,8 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
 def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Bounded]:
     _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
     if io.is_volume(options.source):
-        _refuse(options, ("support", "kernel", "part_type"), "is for particles, and this is a volume")
+        of_particles = ("support", "kernel", "part_type", *cli_where.OF_PARTICLES)
+        _refuse(options, of_particles, "is for particles, and this is a volume")
         return cli_volume.scene_of(options)
     _refuse(options, ("iso",), "is for volumes, and this is a particle file")
     return cli_particles.scene_of(options)
@@ -248,6 +258,7 @@ def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Bounded]:
 
 def _camera(shown: Bounded, options: argparse.Namespace) -> Camera:
     """The camera asked for; where only a part is given, the rest frames what there is."""
+    shown = cli_where.framed(shown, options)
     width, height = options.size
     up, fov = options.up or (0.0, 1.0, 0.0), 45.0 if options.fov is None else options.fov
     if options.target is not None and options.eye is None:
@@ -264,6 +275,7 @@ def _camera(shown: Bounded, options: argparse.Namespace) -> Camera:
 
 
 def _info(options: argparse.Namespace) -> None:
+    cli_where.settle(options)
     if options.cache:
         for what, text in cli_cache.described():
             say(what, text)
@@ -325,14 +337,14 @@ def _demo(options: argparse.Namespace) -> None:
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
     for name in names:
-        if getattr(options, name) is not None:
+        if getattr(options, name, None) is not None:
             raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
-def _require_writable(path: Path) -> None:
+def _require_writable(path: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> None:
     """Know before the work that the image can be written after it."""
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise UsageError(f"{path}: an image must be .exr or .png")
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"{path}: an image must be {' or '.join(suffixes)}")
     folder = path.parent
     if not folder.is_dir():
         raise ValueError(f"{path}: there is no folder {folder} to write it to; make it first")

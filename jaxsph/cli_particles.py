@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph import io, scenes
+from jaxsph import cli_where, io, scenes
 from jaxsph.console import UsageError, attributes, say, span
 from jaxsph.model import Particles, Scene
 
@@ -22,13 +22,14 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
         raise UsageError(f"--support must be > 0, got {options.support:g}")
     table = _table(options)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    particles, report = _particles(table, options)
     columns = particles.to_numpy()
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
     say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
     for note in report.notes:
         say("note", note)
+    particles = cli_where.centered(particles, options)
     return Scene(particles=particles, transfer=transfer(particles, options, report.quantity)), particles
 
 
@@ -51,12 +52,22 @@ def describe(options: argparse.Namespace) -> Particles:
     print(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
     print("\n`jaxsph render` would show")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    particles, report = _particles(table, options)
     columns = particles.to_numpy()
     say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
+    for note in report.notes:
+        if note not in table.conventions:
+            say("note", note)
     return particles
+
+
+def _particles(table: io.ParticleTable, options: argparse.Namespace) -> tuple[Particles, io.Report]:
+    """Those that are asked for."""
+    kernel = options.kernel or "poly6"
+    with cli_where.conditions():
+        return io.particles_from_table(table, options.quantity, options.support, kernel, **cli_where.selected(options))
 
 
 def _table(options: argparse.Namespace) -> io.ParticleTable:

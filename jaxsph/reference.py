@@ -24,8 +24,8 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference_integral import integral
 from jaxsph.reference_points import thickness
-from jaxsph.reference_where import columns_of, to_world
 from jaxsph.reference_where import inside as within
+from jaxsph.reference_where import places_of, to_world
 
 __all__ = ["field", "integral", "render", "sample_depths"]
 
@@ -116,7 +116,10 @@ def field(
 
 
 def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, ...]:
-    position, support, quantity, volume = columns_of(scene.particle_set)
+    particles = scene.particle_set
+    position, which = places_of(particles)
+    arrays = (particles.support, particles.quantity, particles.volume)
+    support, quantity, volume = (np.asarray(a, np.float64)[which] for a in arrays)
     view = (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     return view, support, quantity, volume
 

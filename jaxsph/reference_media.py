@@ -22,7 +22,7 @@ from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference_points import at_offset, kinks
 from jaxsph.reference_portions import Cuts, Lists, Portions, borders, lists
-from jaxsph.reference_where import columns_of, crossings, inside
+from jaxsph.reference_where import crossings, inside, places_of
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 
@@ -85,9 +85,11 @@ class AllParticles(Whole):
     """Particles; those of no volume are not there."""
 
     def __init__(self, particles: Particles, transfer: TransferFunction, camera: Camera):
-        columns = columns_of(particles)
-        position, self.support, self.quantity, volume = (column[columns[3] > 0] for column in columns)
-        center = to_view(position, camera)
+        position, which = places_of(particles)
+        there = np.asarray(particles.volume)[which] > 0
+        columns = particles.support, particles.quantity, particles.volume
+        self.support, self.quantity, volume = (np.asarray(column, np.float64)[which[there]] for column in columns)
+        center = to_view(position[there], camera)
         strength = volume / self.support**3
         self.strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
         self.spheres = Spheres(center, self.support, camera.is_perspective)

@@ -35,7 +35,7 @@ class ParticleTable:
         columns: the other data by the name the file gives them: (N,) scalars or (N, k) vectors. They may hold NaN.
         support: (N,) support radius $H > 0$ where the file defines one, or `None`. Length units of `position`.
         volume: (N,) particle volume $V > 0$ where the file defines one, or `None`.
-        box_size: edge lengths of a periodic box, or `None`. Particles are not repeated across its faces.
+        box_size: edge lengths of a periodic box whose lower corner is the origin, or `None`.
         source: name of the file format.
         path: the file, for messages; empty when the table was made in memory.
         conventions: sentences which say how supports and volumes were got, and what was left out.
