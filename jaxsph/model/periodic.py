@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.clips import Box
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_shape
 
@@ -108,14 +108,14 @@ def num_ghosts(particles: Particles, margin: Any = 0.0) -> int:
 
 
 def with_ghosts(particles: Particles) -> Particles:
-    """Particles of no period, with exactly the ghosts they have (host side); to be shown within their box.
+    """Particles of no period, with the ghosts they have (host side); to be shown within their box.
 
     Raises:
         ValueError: a box that is not usable.
     """
     if particles.box is None:
         return particles
-    found, word = unfolded(particles, num_ghosts(particles))
+    found, word = _unfolded(particles, room=capacity_class(num_ghosts(particles)))
     if int(word):
         raise ValueError(f"these particles cannot be repeated across the faces of their box: {faults.describe(int(word))}")
     return found
@@ -162,6 +162,9 @@ def densest(particles: Particles) -> np.ndarray:
     tree = scipy.spatial.KDTree(place, boxsize=period)
     number = tree.query_ball_point(place, support, return_length=True, workers=-1)
     return np.asarray(position[(number / support**3).argmax()])
+
+
+_unfolded = jax.jit(unfolded, static_argnames="room")
 
 
 @jax.jit

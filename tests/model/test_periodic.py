@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.periodic import num_ghosts, unfolded, with_ghosts, wrapped
+from jaxsph.model.periodic import _unfolded as unfolded
+from jaxsph.model.periodic import num_ghosts, with_ghosts, wrapped
 from jaxsph.numerics import faults
 
 SIDES = np.array([1.0, 1.5, 0.8])
@@ -43,7 +44,7 @@ def test_every_image_that_reaches_into_the_box_is_a_ghost(largest, margin):
     truth = images(given, margin)
     room = num_ghosts(given, margin)
     assert len(truth) <= room <= len(truth) + 2
-    found, word = unfolded(given, room, margin)
+    found, word = unfolded(given, room=room, margin=margin)
     assert int(word) == faults.NONE and found.box is None
     ghosts = found.to_numpy()["position"][given.num_particles :]
     distance = np.linalg.norm(ghosts[:, None] - truth[:, 1:], axis=-1)
@@ -68,13 +69,13 @@ def test_positions_outside_of_the_box_are_wrapped_with_all_their_digits():
 def test_too_little_room_is_a_fault_and_no_loss_goes_unsaid():
     given = particles()
     for room in (0, 1, num_ghosts(given) // 2):
-        assert int(unfolded(given, room)[1]) == faults.GHOST_OVERFLOW
-    assert int(unfolded(given, num_ghosts(given) + 7)[1]) == faults.NONE
+        assert int(unfolded(given, room=room)[1]) == faults.GHOST_OVERFLOW
+    assert int(unfolded(given, room=num_ghosts(given) + 7)[1]) == faults.NONE
 
 
 def test_a_period_that_shrinks_under_jit_is_a_fault():
     given = particles()
-    word = jax.jit(lambda upper: unfolded(dataclasses.replace(given, box=js.Box(jnp.zeros(3), upper)), 500)[1])
+    word = jax.jit(lambda upper: unfolded(dataclasses.replace(given, box=js.Box(jnp.zeros(3), upper)), room=500)[1])
     assert int(word(jnp.asarray(SIDES, jnp.float32))) == faults.NONE
     for upper in ([1, -1, 1], [1, 0.2, 1], [1, np.nan, 1]):
         assert int(word(jnp.asarray(upper, jnp.float32))) & faults.BAD_BOX
@@ -86,11 +87,11 @@ def test_derivatives_by_ghosts_are_those_by_the_particles_that_they_are_of(x64):
     weight = jnp.asarray(np.random.default_rng(2).normal(size=(given.capacity + room, 3)))
 
     def total(position):
-        found, _ = unfolded(dataclasses.replace(given, position=position), room)
+        found, _ = unfolded(dataclasses.replace(given, position=position), room=room)
         return jnp.where(found.valid[:, None], weight * found.position, 0).sum()
 
     gradient = np.asarray(jax.grad(total)(given.position))
-    found, _ = unfolded(given, room)
+    found, _ = unfolded(given, room=room)
     expected = np.array(weight[: given.capacity])
     expected[~np.asarray(given.valid)] = 0
     original = np.asarray(given.position)
@@ -122,7 +123,8 @@ def test_the_box_goes_with_the_particles_through_padding_and_preparation():
     given = particles()
     for other in (given.padded(200), js.prepare(given), given.at(slice(10))):
         assert other.box is not None and np.allclose(other.box.upper, SIDES)
-    assert with_ghosts(js.Particles.from_arrays(np.zeros((2, 3)), 0.1, 0.0)).capacity == 4
+    free = js.Particles.from_arrays(np.zeros((2, 3)), 0.1, 0.0)
+    assert with_ghosts(free) is free
 
 
 @pytest.mark.parametrize(
