@@ -21,6 +21,7 @@ from jaxsph.project import project
 from jaxsph.projection_plan import ProjectionPlan, plan_projection
 from jaxsph.render import CapacityError, render
 from jaxsph.resample import resample
+from jaxsph.slices import Slice, slice_of
 from jaxsph.snapshots import Snapshots
 from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
@@ -45,6 +46,7 @@ __all__ = [
     "ProjectionPlan",
     "Scene",
     "Settings",
+    "Slice",
     "Snapshots",
     "Sphere",
     "TransferFunction",
@@ -71,6 +73,7 @@ __all__ = [
     "render_frames",
     "resample",
     "scenes",
+    "slice_of",
     "splat_bound",
     "sweep",
     "transfer_figure",

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import jaxsph
 from jaxsph import (
@@ -23,23 +23,20 @@ from jaxsph import (
     cli_cache,
     cli_movie,
     cli_options,
-    cli_particles,
     cli_points,
     cli_project,
+    cli_scene,
     cli_several,
     cli_sweep,
     cli_transfer,
     cli_volume,
-    io,
+    cli_where,
     scenes,
 )
 from jaxsph.cli_progressive import render_in_stages
-from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, span, time_line
-from jaxsph.model import Camera, Particles, Scene, Settings
-from jaxsph.model.camera import Bounded
-from jaxsph.scenes.view import snug, snug_box
+from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, time_line
+from jaxsph.model import Camera, Settings
 
-SCENE = "scene:"
 IMAGE_SUFFIXES = (".exr", ".png")
 DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
 DEMO_TOLERANCE = 0.004
@@ -114,9 +111,10 @@ def _parser() -> argparse.ArgumentParser:
         return made
 
     render = command("render", _render, "make an image", "What you do not say is chosen, and said.")
-    render.epilog = f"Built-in scenes: {', '.join(SCENE + name for name in scenes.names())}."
+    render.epilog = f"Built-in scenes: {', '.join(cli_scene.SCENE + name for name in scenes.names())}."
     cli_options.add_source(render, optional=True, several=True)
     _add_parts(render)
+    cli_where.add_places(render)
     render.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help=".exr or .png; of several files a folder, or a name with {} in it"
     )
@@ -157,6 +155,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_parts(parser: argparse.ArgumentParser) -> None:
+    cli_where.add_selection(parser)
     cli_volume.add_options(parser)
     cli_points.add_options(parser)
 
@@ -167,14 +166,19 @@ def _render(options: argparse.Namespace) -> None:
 
 def _render_one(options: argparse.Namespace) -> None:
     settings = _settings(options)
+    cli_where.settle(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
-    _require_something(options)
+    cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0]
-    output = options.output or Path(Path(first.removeprefix(SCENE)).stem + ".png")
-    _require_writable(output)
+    output = options.output or Path(Path(first.removeprefix(cli_scene.SCENE)).stem + ".png")
+    _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
     cli_annotate.check(options, output)
-    scene, camera = _scene(options)
+    scene, camera = cli_scene.scene_of(options)
+    scene = cli_where.shown(scene, options)
+    if options.slice is not None:
+        cli_where.save_slice(scene, camera, options, output)
+        return
     say("camera", camera_line(camera))
     started = time.perf_counter()
     if options.progressive:
@@ -183,6 +187,7 @@ def _render_one(options: argparse.Namespace) -> None:
         with progress("render") as show:
             image = jaxsph.render(scene, camera, settings, progress=show)
     elapsed = time.perf_counter() - started
+    image = cli_where.labelled(image, options)
     if options.annotate:
         cli_annotate.save(image, scene, camera, options, output)
     else:
@@ -194,17 +199,18 @@ def _render_one(options: argparse.Namespace) -> None:
 
 
 def _movie(options: argparse.Namespace) -> None:
-    cli_movie.run(options, _settings(options), _scene)
+    cli_movie.run(options, _settings(options), cli_scene.scene_of)
 
 
 def _transfer(options: argparse.Namespace) -> None:
     output = cli_transfer.check_figure(options)
     if Path(options.source).suffix.lower() == ".json":
-        _refuse(options, ("quantity", "save", *cli_transfer.LOOKS), "is for FILE or scene:NAME, and this is a saved function")
+        of_scenes = ("quantity", "save", *cli_transfer.LOOKS)
+        cli_scene.refuse(options, of_scenes, "is for FILE or scene:NAME, and this is a saved function")
         cli_transfer.draw_file(options, output)
         return
-    scene, shown, camera = _source(options)
-    cli_transfer.draw(scene, camera or _camera(shown, options), options.labels, options, output)
+    scene, shown, camera = cli_scene.source_of(options)
+    cli_transfer.draw(scene, camera or cli_scene.camera_of(shown, options), options.labels, options, output)
 
 
 def _sweep(options: argparse.Namespace) -> None:
@@ -216,8 +222,8 @@ def _sweep(options: argparse.Namespace) -> None:
     views = []
     for moment in options.frames or [options.frame]:
         options.frame = moment
-        views.append((moment, *_scene(options)))
-    cli_sweep.run(views, settings, Path(options.source.removeprefix(SCENE)).stem, options)
+        views.append((moment, *cli_scene.scene_of(options)))
+    cli_sweep.run(views, settings, Path(options.source.removeprefix(cli_scene.SCENE)).stem, options)
 
 
 def _settings(options: argparse.Namespace) -> Settings:
@@ -239,114 +245,23 @@ def _settings(options: argparse.Namespace) -> Settings:
         raise UsageError(str(error)) from error
 
 
-def _scene(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    """The source, and what else shares its picture; a camera that frames all of it unless one is asked for."""
-    scene, shown, camera = _source(options)
-    if options.command == "sweep":
-        return scene, camera or _camera(shown, options)
-    volumes, points = cli_volume.beside(options), cli_points.points_of(options)
-    if volumes or points or options.mix:
-        scene = cli_points.with_parts(scene, volumes, [one for _, one in points], options.mix)
-    if not volumes and not points:
-        return scene, camera or _camera(shown, options)
-    named = [] if shown is None else [(options.source, shown)]
-    paths = [(path, volume) for path, (volume, _) in zip(options.volume or (), volumes, strict=True)]
-    parts = cli_points.Together([*named, *paths, *points])
-    cli_points.warn(parts, options.command)
-    return scene, _camera(parts, options)
-
-
-def _source(options: argparse.Namespace) -> tuple[Any, Any, Camera | None]:
-    """Scene of the source, what there is to frame, and the camera where it has one."""
-    if options.source is None:
-        of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame")
-        _refuse(options, (*of_source, *cli_transfer.LOOKS), "is for FILE or scene:NAME, and there is none")
-        return None, None, None
-    if options.source.startswith(SCENE):
-        scene, camera = _scene_of_name(options)
-        return scene, scene.particle_set, camera
-    return *_scene_of_file(options), None
-
-
-def _require_something(options: argparse.Namespace, also: str = "") -> None:
-    cli_points.check_usage(options)
-    if options.source is None and not options.points and not options.volume:
-        raise UsageError(f"a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE{also}")
-
-
-def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    _refuse(options, ("quantity", "support", "kernel", "part_type", "iso"), "is for particle files, not for built-in scenes")
-    name = options.source.removeprefix(SCENE)
-    width, height = getattr(options, "size", (512, 512))
-    try:
-        scene, camera = scenes.load(name, options.particles, options.frame, width=width, height=height)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-    particles = scene.particle_set
-    say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
-    if options.command != "info":
-        if cli_transfer.asked(options):
-            scene = dataclasses.replace(scene, transfer=cli_transfer.look(particles, options, "concentration"))
-        cli_annotate.label("concentration", options, "a built-in scene")
-        if any(getattr(options, part) is not None for part in ("eye", "target", "up", "fov")):
-            camera = _camera(particles, options)
-    return scene, camera
-
-
-def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Bounded]:
-    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
-    if io.is_volume(options.source):
-        _refuse(options, ("support", "kernel", "part_type"), "is for particles, and this is a volume")
-        return cli_volume.scene_of(options)
-    _refuse(options, ("iso",), "is for volumes, and this is a particle file")
-    return cli_particles.scene_of(options)
-
-
-def _camera(shown: Bounded, options: argparse.Namespace) -> Camera:
-    """The camera asked for; where only a part is given, the rest frames what there is."""
-    width, height = options.size
-    up, fov = options.up or (0.0, 1.0, 0.0), 45.0 if options.fov is None else options.fov
-    if options.target is not None and options.eye is None:
-        raise UsageError("--target needs --eye: from where should it be looked at?")
-    try:
-        if options.eye is None:
-            return Camera.framing(shown, up=up, fov_degrees=fov, width=width, height=height)
-        lower, upper = shown.bounds()
-        target = (lower + upper) / 2 if options.target is None else options.target
-        made = Camera.look_at(options.eye, target, up, fov, width, height, near=1e-3, far=1.0)
-        return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-
-
 def _info(options: argparse.Namespace) -> None:
+    cli_where.settle(options)
     if options.cache:
         for what, text in cli_cache.described():
             say(what, text)
         if options.source is None:
             return
-    _require_something(options, ", or --cache")
+    cli_scene.require_something(options, ", or --cache")
     parts, camera = [], None
     if options.source is not None:
-        shown, camera = _described(options)
+        shown, camera = cli_scene.described(options)
         parts.append((options.source, shown))
     parts += [(path, cli_volume.describe(path, options.volume_quantity)) for path in options.volume or ()]
     parts += cli_points.describe(options)
     together = cli_points.Together(parts)
     say("camera", camera_line(camera if camera is not None and len(parts) == 1 else Camera.framing(together)))
     cli_points.warn(together, options.command)
-
-
-def _described(options: argparse.Namespace) -> tuple[Bounded, Camera | None]:
-    """Say what the source holds; what there is to frame, and its camera where it has one."""
-    if options.source.startswith(SCENE):
-        scene, camera = _scene_of_name(options)
-        say("quantity", f"concentration, {span(scene.particle_set.to_numpy()['quantity'])}")
-        return scene.particle_set, camera
-    _refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
-    if io.is_volume(options.source):
-        return cli_volume.describe(options.source, options.quantity), None
-    return cli_particles.describe(options), None
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -379,16 +294,10 @@ def _demo(options: argparse.Namespace) -> None:
     say("time", time_line(image, elapsed))
 
 
-def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
-    for name in names:
-        if getattr(options, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')} {why}")
-
-
-def _require_writable(path: Path) -> None:
+def _require_writable(path: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> None:
     """Know before the work that the image can be written after it."""
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
-        raise UsageError(f"{path}: an image must be .exr or .png")
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"{path}: an image must be {' or '.join(suffixes)}")
     folder = path.parent
     if not folder.is_dir():
         raise ValueError(f"{path}: there is no folder {folder} to write it to; make it first")

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from jaxsph import cli_annotate, cli_transfer, io
+from jaxsph import cli_annotate, cli_transfer, cli_where, io
 from jaxsph.console import UsageError, attributes, say, span
 from jaxsph.model import Particles, Scene
 
@@ -21,7 +21,7 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
         raise UsageError(f"--support must be > 0, got {options.support:g}")
     table = _table(options)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    particles, report = _particles(table, options)
     columns = particles.to_numpy()
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
@@ -29,6 +29,7 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
     for note in report.notes:
         say("note", note)
     cli_annotate.label_file(table, report.quantity, columns["quantity"], options)
+    particles = cli_where.centered(particles, options)
     return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity)), particles
 
 
@@ -39,12 +40,22 @@ def describe(options: argparse.Namespace) -> Particles:
     attributes(table)
     cli_annotate.describe(table)
     print("\n`jaxsph render` would show")
-    particles, report = io.particles_from_table(table, options.quantity, options.support, options.kernel or "poly6")
+    particles, report = _particles(table, options)
     columns = particles.to_numpy()
     say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
+    for note in report.notes:
+        if note not in table.conventions:
+            say("note", note)
     return particles
+
+
+def _particles(table: io.ParticleTable, options: argparse.Namespace) -> tuple[Particles, io.Report]:
+    """Those that are asked for."""
+    kernel = options.kernel or "poly6"
+    with cli_where.conditions():
+        return io.particles_from_table(table, options.quantity, options.support, kernel, **cli_where.selected(options))
 
 
 def _table(options: argparse.Namespace) -> io.ParticleTable:

@@ -11,7 +11,7 @@ import itertools
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxsph.model.camera import Camera
 from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
@@ -62,11 +62,17 @@ def crossings(
 
 def columns_of(particles: Particles) -> tuple[np.ndarray, ...]:
     """Positions, supports, volumes and each quantity in float64; of a periodic set with every copy that reaches into the box."""
-    valid = np.asarray(particles.valid)
-    arrays: tuple[Any, ...] = particles.exact_position(), particles.support, particles.volume, *particles.quantities
-    position, support, *others = (np.asarray(column, np.float64)[valid] for column in arrays)
-    if particles.box is None or not len(position):
-        return position, support, *others
+    position, which = places_of(particles)
+    others = (particles.support, particles.volume, *particles.quantities)
+    return position, *(np.asarray(column, np.float64)[which] for column in others)
+
+
+def places_of(particles: Particles) -> tuple[Float[np.ndarray, "places 3"], Int[np.ndarray, " places"]]:
+    """Where particles are, and their entries; of a periodic set every copy that reaches into the box."""
+    entry = np.flatnonzero(np.asarray(particles.valid))
+    position, support = particles.exact_position()[entry], np.asarray(particles.support, np.float64)[entry]
+    if particles.box is None or not len(entry):
+        return position, entry
     lower, upper = particles.box.corners()
     period = upper - lower
     position = lower + (position - lower) % period
@@ -74,11 +80,8 @@ def columns_of(particles: Particles) -> tuple[np.ndarray, ...]:
     copies = [position + period * turns for turns in itertools.product(*(range(-k, k + 1) for k in most))]
     away = [np.linalg.norm(np.maximum(np.maximum(lower - copy, copy - upper), 0), axis=1) for copy in copies]
     reaching = [gap < support for gap in away]
-    stacked = (
-        np.concatenate([own[which] for own, which in zip(each, reaching, strict=True)])
-        for each in (copies, *([column] * len(copies) for column in (support, *others)))
-    )
-    return tuple(stacked)
+    places = np.concatenate([copy[which] for copy, which in zip(copies, reaching, strict=True)])
+    return places, np.concatenate([entry[which] for which in reaching])
 
 
 def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:

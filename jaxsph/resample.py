@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,10 +20,12 @@ import numpy as np
 
 from jaxsph.model import kernels
 from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.periodic import with_ghosts
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
 
 PAIRS = 1 << 19  # (particle, point) pairs of a chunk: its arrays stay in the caches
+ON_FACE = 1e-6  # of a spacing, that points may lie outside of a periodic box
 BEYOND = 4.0  # a squared distance in supports, at which every kernel is 0
 
 
@@ -30,7 +33,7 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
     r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid (host side, float64 sums).
 
     Args:
-        particles: whose quantity is resampled; of two, that of colours.
+        particles: whose quantity is resampled; of two, that of colours. Of a periodic set one period: there is nothing outside.
         lower: (3,) position of the point (0, 0, 0), length units.
         spacing: between neighbouring points, length units: a number, or (3,); > 0.
         shape: points along x, y and z, at least 2 each.
@@ -55,12 +58,24 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
-    grid = _Sums(lower, np.broadcast_to(spacing, 3), tuple(int(points) for points in shape), particles)
+    ghosted = with_ghosts(particles)
+    grid = _Sums(lower, np.broadcast_to(spacing, 3), tuple(int(points) for points in shape), ghosted)
     for box in grid.boxes():
         grid.add(*box)
-    inside = grid.weight > 0
+    inside = (grid.weight > 0) & _in_period(particles, lower, spacing, shape)
     quantity = np.where(inside, grid.weighted / np.where(inside, grid.weight, 1), fill)
     return Volume.from_array(quantity.reshape(shape).astype(particles.dtype), lower, spacing)
+
+
+def _in_period(particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+    """Points of a grid in the box of a periodic set; all where there is none. Of what rounding has moved over a face, too."""
+    if particles.box is None:
+        return np.ones(math.prod(shape), bool)
+    ends, steps = particles.box.corners(), np.broadcast_to(spacing, 3)
+    slack = ON_FACE * steps
+    axes = [corner + step * np.arange(points) for corner, step, points in zip(lower, steps, shape, strict=True)]
+    sides = [(at >= ends[0][k] - slack[k]) & (at <= ends[1][k] + slack[k]) for k, at in enumerate(axes)]
+    return np.asarray(sides[0][:, None, None] & sides[1][:, None] & sides[2]).ravel()
 
 
 @dataclasses.dataclass

@@ -11,8 +11,10 @@ from jaxsph.access.octree_build import OctreePlan, plan_octree
 from jaxsph.field.octree_particles import OctreeParticles
 from jaxsph.field.octree_points import OctreePoints
 from jaxsph.field.octree_sums import reach_of
+from jaxsph.field.within import Within
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import Particles
+from jaxsph.model.periodic import with_ghosts
 from jaxsph.model.registry import AT_POINTS
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -34,8 +36,8 @@ def in_octree(scene: Scene, plan: tuple[OctreePlan, ...] | None = None) -> Scene
         By all numbers of particles, transfer function and points; which leaf has which is held fixed.
 
     Raises:
-        ValueError: under a trace without a plan; for another number of plans; for points that are spread at "feet" or "centres",
-            or splats, which have no extinction at a point.
+        ValueError: under a trace without a plan, or of a periodic set; for another number of plans; for points that are spread
+            at "feet" or "centres", or splats, which have no extinction at a point.
     """
     scene.check()
     sets = _sets(scene)
@@ -46,7 +48,8 @@ def in_octree(scene: Scene, plan: tuple[OctreePlan, ...] | None = None) -> Scene
         raise ValueError(f"`plan` must have one for each of particles and point sets, {len(sets)}, got {len(plans)}")
     media: list[Medium] = []
     if scene.particles is not None and scene.transfer is not None:
-        media, plans = [OctreeParticles.from_particles(scene.particles, scene.transfer, plans[0])], plans[1:]
+        particles = OctreeParticles.from_particles(sets[0], scene.transfer, plans[0])
+        media, plans = [Within.of(particles, scene.particles.box)], plans[1:]
     media += [OctreePoints.from_points(points, how) for points, how in zip(scene.point_sets, plans, strict=True)]
     return dataclasses.replace(scene, particles=None, transfer=None, points=None, media=(*media, *scene.media))
 
@@ -64,6 +67,8 @@ def reachable(scene: Scene, settings: Settings) -> Scene:
 
 
 def _sets(scene: Scene) -> tuple[Particles, ...]:
-    """Particles and point sets, as spheres."""
-    of_particles = () if scene.particles is None else (scene.particles,)
+    """Particles, with ghosts where they are periodic, and point sets, as spheres."""
+    if is_traced(scene) and scene.particles is not None and scene.particles.box is not None:
+        raise ValueError("a periodic set cannot be put into an octree under jit, as its images are counted; do it outside")
+    of_particles = () if scene.particles is None else (with_ghosts(scene.particles),)
     return *of_particles, *(points.spheres() for points in scene.point_sets)

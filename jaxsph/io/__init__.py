@@ -30,12 +30,14 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.transfers import read_transfer, write_transfer
 from jaxsph.io.volume_table import VolumeTable
 from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
+from jaxsph.io.where import ConditionError
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
 from jaxsph.model.points import Points
 
 __all__ = [
     "FORMATS",
+    "ConditionError",
     "DataError",
     "Format",
     "Labels",
@@ -101,6 +103,9 @@ def read_particles(
     kernel: str = "poly6",
     part_type: int | None = None,
     progress: bool = False,
+    box: Any = "file",
+    where: str | None = None,
+    share: float | None = None,
 ) -> Particles:
     """Read a particle file, ready to render.
 
@@ -113,6 +118,9 @@ def read_particles(
         kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
+        box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.
+        where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`.
+        share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
 
     Returns:
         Particles with quantity, support and volume; `particles_from_table` also tells how they were found.
@@ -123,7 +131,7 @@ def read_particles(
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
     table = read_table(path, part_type=part_type, progress=progress)
-    return particles_from_table(table, quantity, support, kernel, progress=progress)[0]
+    return particles_from_table(table, quantity, support, kernel, progress=progress, box=box, where=where, share=share)[0]
 
 
 def read_points(

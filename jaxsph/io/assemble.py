@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,9 +18,13 @@ from .damage import DataError
 from .quantities import ROLES, choose_quantity
 from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from .table import ParticleTable
+from .where import select
 
 ROUNDING_NOTED = 1e-3
 """Rounding of positions to float32, in units of the smallest support, from which it is worth a note."""
+FROM_FILE = "file"
+OUTSIDE = 1e-3
+"""Of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then."""
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
 
@@ -67,6 +72,9 @@ def particles_from_table(
     kernel: str = "poly6",
     *,
     progress: bool = False,
+    box: Any = FROM_FILE,
+    where: str | None = None,
+    share: float | None = None,
 ) -> tuple[Particles, Report]:
     r"""Particles that carry one quantity of a table.
 
@@ -80,6 +88,10 @@ def particles_from_table(
         support: one support radius, or one a particle, in the table's length unit; overrides the table's.
         kernel: name of a kernel, for the particles and for kernel sums.
         progress: show progress bars; on a terminal large sets show them anyway.
+        box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the table, `None` for none.
+        where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"` (`jaxsph.io.where`);
+            what is derived (supports, volumes, densities) is of all particles.
+        share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
 
     Returns:
         The particles, and the report on what was settled. Particles are float32 unless the positions are float64 and
@@ -87,29 +99,51 @@ def particles_from_table(
 
     Raises:
         ValueError: an unknown quantity; values that are not finite; supports that are not positive; positions whose
-            float32 rounding exceeds a quarter of a support.
+            float32 rounding exceeds a quarter of a support; a condition that is not understood, or that no particle meets.
     """
     try:
-        return _assemble(table, quantity, support, kernel, progress)
+        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share))
     except DataError as error:
-        raise DataError(f"{table.path}: {error}" if table.path else str(error)) from error
+        raise type(error)(f"{table.path}: {error}" if table.path else str(error)) from error
+
+
+def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
+    """The table with the periodic box asked for, and a note on that."""
+    sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
+    if sides is None:
+        return dataclasses.replace(table, box_size=None), []
+    edges = " x ".join(f"{side:g}" for side in sides)
+    if not (len(sides) == 3 and all(np.isfinite(side) and side > 0 for side in sides)):
+        raise DataError(f"`box` must be three lengths > 0, got {edges}; give the sides of the period")
+    low, high = (table.position.min(0), table.position.max(0)) if len(table) else (np.zeros(3), np.zeros(3))
+    outside = (low < -OUTSIDE * np.array(sides)).any() or (high > (1 + OUTSIDE) * np.array(sides)).any()
+    if isinstance(box, str) and outside:
+        return dataclasses.replace(table, box_size=None), [f"not periodic: positions are outside of the file's box of {edges}"]
+    return dataclasses.replace(table, box_size=sides), [f"periodic box of {edges}: supports reach across its faces"]
 
 
 def _assemble(
-    table: ParticleTable, quantity: str | None, support: float | np.ndarray | None, kernel: str, progress: bool
+    table: ParticleTable,
+    notes: list[str],
+    quantity: str | None,
+    support: float | np.ndarray | None,
+    kernel: str,
+    progress: bool,
+    wanted: tuple[str | None, float | None],
 ) -> tuple[Particles, Report]:
     supports, support_origin = _supports(table, support, progress)
-    notes = [sentence for sentence in table.conventions if not sentence.startswith("support =")]
+    notes = [*(sentence for sentence in table.conventions if not sentence.startswith("support =")), *notes]
     mass_name = table.named(*ROLES["mass"])
     mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
-    number_density = functools.cache(lambda: kernel_sum(table.position, supports, kernel=kernel, progress=progress))
+    summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
+    number_density = functools.cache(summed)
 
     def density() -> np.ndarray:
         if mass is None:
             return number_density()
         if len(mass) and mass.min() == mass.max():
             return mass * number_density()
-        return kernel_sum(table.position, supports, mass, kernel=kernel, progress=progress)
+        return summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
     stored_density = table.named(*ROLES["density"])
@@ -128,18 +162,20 @@ def _assemble(
     if rounding:
         notes.append(rounding)
     dtype = table.position.dtype
+    kept, told = select(table, *wanted, density=density)
+    notes += told
+    own = {"support": supports, "quantity": values, "volume": _scaled(volumes)}
     with np.errstate(over="ignore"):
-        particles = Particles.from_arrays(
-            table.position, supports.astype(dtype), values.astype(dtype), _scaled(volumes).astype(dtype), kernel
-        )
+        columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items()}
+        particles = Particles.from_arrays(table.position[kept], **columns, kernel=kernel, box=table.box_size)
     report = Report(
         source=table.source,
         path=table.path,
-        num_particles=len(table),
+        num_particles=int(kept.sum()),
         quantity=name,
-        quantity_range=_range(values),
+        quantity_range=_range(values[kept]),
         support=support_origin,
-        support_range=_range(supports),
+        support_range=_range(supports[kept]),
         volume=volume_origin,
         notes=tuple(notes),
     )
@@ -163,7 +199,7 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
         origin = "1, as a single particle has no neighbours"
     elif 0 < len(table) <= NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
-    return nearest_neighbour_supports(table.position, progress=progress), origin
+    return nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
 
 
 def _positive(*columns: np.ndarray) -> bool:

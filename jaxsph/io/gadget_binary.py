@@ -2,7 +2,7 @@ r"""Gadget binary snapshots, format 1 and 2, of either byte order. One type of p
 
 A snapshot is a sequence of Fortran records: the length of the data as uint32, the data, the length again. Format 2 puts
 a record of 8 bytes with a name before each block; format 1 relies on the order POS VEL ID MASS U RHO (NE NH) HSML.
-The support is HSML itself (Gadget convention). Units are left as stored; a periodic box is noted, and not wrapped.
+The support is HSML itself (Gadget convention). Units are left as stored; a box is taken to be periodic.
 Source: Springel, User guide for GADGET-2, section 6.
 """
 
@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from .damage import DataError, NoParticlesError, explained
-from .gadget_hdf5 import PERIODIC_NOTE
 from .table import ParticleTable, time_of
 
 SOURCE = "Gadget binary"
@@ -64,8 +63,6 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
         edge = float(header["box"])
         box_size = (edge, edge, edge) if edge > 0 else None
-        if box_size:
-            said.append(f"periodic box of {edge:g}: {PERIODIC_NOTE}")
         more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
         more |= {"part_type": chosen, "num_files": max(int(header["files"]), 1)}
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)

@@ -8,7 +8,8 @@ What `SmoothingLength` means depends on the code:
 | SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel named in `HydroScheme` |
 
 Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
-`Masses`, or from `MassTable` in the header. A periodic box is noted, and not wrapped.
+`Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
+SWIFT in `Parameters`.
 Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
 """
 
@@ -36,7 +37,6 @@ SWIFT_GAMMA = {
 }
 """Support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
-PERIODIC_NOTE = "particles are not repeated across its faces"
 
 
 def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
@@ -75,9 +75,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     if smoothing is not None:
         support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
         said.append(sentence)
-    box_size = _box(header)
-    if box_size is not None:
-        said.append(f"periodic box of {' x '.join(f'{edge:g}' for edge in box_size)}: {PERIODIC_NOTE}")
+    box_size = _box(header) if _is_periodic(file) else None
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
     more |= {"part_type": chosen, "num_files": max(_num_files(header), 1)}
@@ -124,6 +122,14 @@ def _num_files(header: Any) -> int:
 def _table_mass(header: Any, chosen: int) -> float:
     masses = np.ravel(header.get("MassTable", ()))
     return float(masses[chosen]) if chosen < len(masses) else 0.0
+
+
+def _is_periodic(file: Any) -> bool:
+    """Whether the box of a snapshot is periodic, as far as it says: else it is."""
+    if "Config" in file and len(file["Config"].attrs):
+        return "PERIODIC" in file["Config"].attrs
+    told = file["Parameters"].attrs.get("InitialConditions:periodic") if "Parameters" in file else None
+    return told is None or text(told).strip() != "0"
 
 
 def _box(header: Any) -> tuple[float, float, float] | None:

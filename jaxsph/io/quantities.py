@@ -66,6 +66,15 @@ def choose_quantity(
     return _finite(values, full_name), full_name
 
 
+def quantity_named(table: ParticleTable, name: str, *, density: Gather | None = None) -> Float[np.ndarray, " particles"]:
+    """The same of one that has a name, as it is: values need not be finite.
+
+    Raises:
+        ValueError: no such quantity, or a vector without a component; the message lists those there are.
+    """
+    return _named(table, name.strip(), density)[0]
+
+
 def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     """Every name that `choose_quantity` takes for this table, `log10:` aside."""
     components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table.columns[name]))

@@ -20,6 +20,7 @@ from jaxsph.model import kernels
 
 from .damage import DataError
 
+Sides = tuple[float, float, float]
 NEIGHBOURS = 32
 """Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
 
@@ -35,7 +36,11 @@ SHOW_PROGRESS_FROM = 100_000
 
 
 def nearest_neighbour_supports(
-    position: Float[np.ndarray, "particles 3"], neighbours: int = NEIGHBOURS, *, progress: bool = False
+    position: Float[np.ndarray, "particles 3"],
+    neighbours: int = NEIGHBOURS,
+    *,
+    box: Sides | None = None,
+    progress: bool = False,
 ) -> Float[np.ndarray, " particles"]:
     r"""Distance to the `neighbours`-th nearest other particle.
 
@@ -44,8 +49,9 @@ def nearest_neighbour_supports(
     there is only one place, no length is known and every support is 1.
 
     Args:
-        position: (N, 3), any length unit; distances are computed in float64. Periodic boxes are not wrapped.
+        position: (N, 3), any length unit; distances are computed in float64.
         neighbours: $k \ge 1$.
+        box: sides of a periodic box, across whose faces neighbours are found; None for none.
         progress: show a progress bar; on a terminal large sets show one anyway.
 
     Returns:
@@ -56,7 +62,7 @@ def nearest_neighbour_supports(
     """
     if neighbours < 1:
         raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
-    position = np.asarray(position, dtype=np.float64)
+    position = _in_box(position, box)
     count = len(position)
     if count == 0:
         return np.zeros(0)
@@ -64,7 +70,7 @@ def nearest_neighbour_supports(
     if len(places) == 1:
         return np.ones(count)
     points, multiplicity = position[places], np.bincount(place_of)
-    tree = scipy.spatial.KDTree(points)
+    tree = scipy.spatial.KDTree(points, boxsize=box)
     reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
     support = np.empty(len(places))
     for rows in _slices(np.full(len(places), nearest), progress, "supports"):
@@ -83,6 +89,7 @@ def kernel_sum(
     weight: Float[np.ndarray, " particles"] | None = None,
     *,
     kernel: str = "poly6",
+    box: Sides | None = None,
     progress: bool = False,
 ) -> Float[np.ndarray, " particles"]:
     r"""The gather sum $\sum_j w_j W(|x_i - x_j|, H_i)$ at every particle, itself included.
@@ -91,10 +98,11 @@ def kernel_sum(
     uses its own $H_i$); without weights it is the number density, whose inverse is a volume.
 
     Args:
-        position: (N, 3); distances are computed in float64. Periodic boxes are not wrapped.
+        position: (N, 3); distances are computed in float64.
         support: (N,) support radii $H > 0$, same unit as `position`.
         weight: (N,) weights $w$; `None` means 1.
         kernel: name of a kernel of `jaxsph.model.kernels`.
+        box: sides of a periodic box, across whose faces sums go, to the nearest image of each particle; None for none.
         progress: show a progress bar; on a terminal large sets show one anyway.
 
     Returns:
@@ -104,14 +112,14 @@ def kernel_sum(
         ValueError: supports that reach so many particles that the sum would take hours.
     """
     chosen = kernels.by_name(kernel)
-    position = np.asarray(position, dtype=np.float64)
+    position = _in_box(position, box)
     support = np.asarray(support, dtype=np.float64)
     if len(position) == 0:
         return np.zeros(0)
     places, place_of = _distinct(position)
     askers, asker_of = _distinct(np.column_stack([position, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
-    tree, points, radii = scipy.spatial.KDTree(position[places]), position[askers], support[askers]
+    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), position[askers], support[askers]
     _refuse_too_many_pairs(tree, points, radii)
     total = np.empty(len(askers))
     reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
@@ -125,6 +133,15 @@ def kernel_sum(
         shape = chosen.of_square(q * q, np)
         total[rows] = (shape * weights[neighbour]).sum(axis=1)
     return chosen.norm * total[asker_of] / support**3
+
+
+def _in_box(position: np.ndarray, box: Sides | None) -> np.ndarray:
+    """Positions in float64, in a periodic box if there is one."""
+    position = np.asarray(position, dtype=np.float64)
+    if box is None:
+        return position
+    wrapped = np.mod(position, box)
+    return np.where(wrapped >= box, 0.0, wrapped)
 
 
 def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -37,7 +37,7 @@ class ParticleTable:
         columns: the other data by the name the file gives them: (N,) scalars or (N, k) vectors. They may hold NaN.
         support: (N,) support radius $H > 0$ where the file defines one, or `None`. Length units of `position`.
         volume: (N,) particle volume $V > 0$ where the file defines one, or `None`.
-        box_size: edge lengths of a periodic box, or `None`. Particles are not repeated across its faces.
+        box_size: edge lengths of a periodic box whose lower corner is the origin, or `None`.
         time: of the snapshot as the file says it, in the unit of its code (a scale factor where that is the code's time), or
             `None`.
         source: name of the file format.

@@ -186,6 +186,10 @@ class Box(Clip):
         rest = np.asarray(self.rest, np.float64)
         return np.asarray(self.lower, np.float64) + rest[0], np.asarray(self.upper, np.float64) + rest[1]
 
+    def of_dtype(self, dtype: Any) -> Box:
+        """The same in float32 or float64 (host side)."""
+        return Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in self.corners()))
+
     def _turned(self) -> TurnedBox:
         return TurnedBox(self.lower, jnp.eye(3, dtype=self.lower.dtype), self.sides)
 

@@ -140,6 +140,21 @@ class Particles:
         rest = None if self.position_rest is None else self.position_rest[entries]
         return dataclasses.replace(self, **columns, position_rest=rest)
 
+    def centered(self, at: Any) -> Particles:
+        """The same periodic set with the period moved such that a point is in its middle, and positions moved into it.
+
+        Coordinates stay what they are but for whole periods: the point is where it was.
+
+        Args:
+            at: (3,) length units, or `"densest"` for the particle around which most others are (host side).
+
+        Raises:
+            ValueError: a set without a box, or another point.
+        """
+        from jaxsph.model import periodic
+
+        return periodic.centered(self, at)
+
     def to_numpy(self) -> dict[str, np.ndarray]:
         """The particles that exist, without padding (host side): all `columns`."""
         valid = np.asarray(self.valid)
@@ -224,8 +239,8 @@ def _period(box: Any, support: Any, dtype: Any) -> Box | None:
         if not isinstance(box, Box):
             for check in (functools.partial(require_shape, shape=(3,)), require_finite, require_positive):
                 check("box", box, remedy="give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`")
-        corners = box.corners() if isinstance(box, Box) else (np.zeros(3), np.asarray(box, np.float64))
-        box = Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in corners))
+        given = box if isinstance(box, Box) else Box(np.zeros(3).tolist(), np.asarray(box, np.float64).tolist())
+        box = given.of_dtype(dtype)
     if not is_traced(box, support) and np.size(support):
         shortest, largest = float(np.asarray(box.sides).min()), float(np.asarray(support).max())
         if largest > shortest:

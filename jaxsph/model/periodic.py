@@ -17,16 +17,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.clips import Box
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.numerics import faults
+from jaxsph.numerics.checks import is_traced, require_finite, require_shape
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
 """Periods around the box, in which ghosts can lie."""
 ROUNDING = 16  # eps of coordinates and supports that a distance to a face may be off by
+VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
 COUNTED = 32  # eps: the same where ghosts are counted, such that never more are made
 
 
@@ -105,17 +108,63 @@ def num_ghosts(particles: Particles, margin: Any = 0.0) -> int:
 
 
 def with_ghosts(particles: Particles) -> Particles:
-    """Particles of no period, with exactly the ghosts they have (host side); to be shown within their box.
+    """Particles of no period, with the ghosts they have (host side); to be shown within their box.
 
     Raises:
         ValueError: a box that is not usable.
     """
     if particles.box is None:
         return particles
-    found, word = unfolded(particles, num_ghosts(particles))
+    found, word = _unfolded(particles, room=capacity_class(num_ghosts(particles)))
     if int(word):
         raise ValueError(f"these particles cannot be repeated across the faces of their box: {faults.describe(int(word))}")
     return found
+
+
+def centered(particles: Particles, at: Any) -> Particles:
+    """See `Particles.centered`."""
+    if particles.box is None:
+        raise ValueError("particles must have a periodic box to be centred; give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`")
+    if isinstance(at, str):
+        if at != "densest":
+            raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
+        at = densest(particles)
+    if is_traced(at, particles):
+        half = 0.5 * particles.box.sides
+        lower = jnp.asarray(at, particles.dtype) - half
+        return wrapped(dataclasses.replace(particles, box=Box(lower, lower + particles.box.sides)))
+    require_shape("at", at, (3,), "give x, y and z, or 'densest'")
+    require_finite("at", at, "give x, y and z, or 'densest'")
+    ends = particles.box.corners()
+    half = (ends[1] - ends[0]) / 2
+    corners = (np.asarray(at, np.float64) + sign * half for sign in (-1, 1))
+    return wrapped(dataclasses.replace(particles, box=Box(*corners).of_dtype(particles.dtype)))
+
+
+def densest(particles: Particles) -> np.ndarray:
+    """Where most particles lie within a support, for its volume, (3,) float64 (host side); across faces, too.
+
+    Raises:
+        ValueError: no particles.
+    """
+    valid = np.asarray(particles.valid)
+    if not valid.any():
+        raise ValueError("there are no particles, so none is the densest; give x, y and z")
+    position, support = particles.exact_position()[valid], np.asarray(particles.support, np.float64)[valid]
+    if support.max() > VARYING * support.min():  # codes adapt supports to the number density
+        return np.asarray(position[support.argmin()])
+    place, period = position, None
+    if particles.box is not None:
+        lower, upper = particles.box.corners()
+        period = upper - lower
+        place = np.mod(position - lower, period)
+        place = np.where(place >= period, 0, place)
+    tree = scipy.spatial.KDTree(place, boxsize=period)
+    number = tree.query_ball_point(place, support, return_length=True, workers=-1)
+    return np.asarray(position[(number / support**3).argmax()])
+
+
+_unfolded = jax.jit(unfolded, static_argnames="room")
 
 
 @jax.jit

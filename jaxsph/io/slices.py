@@ -1,0 +1,59 @@
+"""Slices as files: values as `.npy`, values with colours as OpenEXR, colours alone as `.png`.
+
+| channel of `.exr` | meaning |
+|---|---|
+| `value` | the quantity on the plane, NaN where there is none |
+| `R` `G` `B` `A` | its picture, where one is given |
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.model.image import Image
+
+from . import png
+from .optional import require
+from .replace import written_whole
+
+SUFFIXES = (".npy", ".exr", ".png")
+
+
+def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...]) -> None:
+    """Write a slice, whole or not at all.
+
+    Raises:
+        ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
+        ImportError: a library that is needed is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: slices are written as {', '.join(SUFFIXES)}, not as {path.suffix!r}")
+    if suffix == ".npy":
+        with written_whole(path) as temporary, open(temporary, "wb") as file:
+            np.save(file, values)
+        return
+    if suffix == ".png":
+        if picture is None:
+            raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy or .exr")
+        png.write(path, picture)
+        return
+    _write_exr(path, values, picture, metadata)
+
+
+def _write_exr(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...]) -> None:
+    openexr = require("OpenEXR", "writing EXR images")
+    layers = {"value": values}
+    if picture is not None:
+        layers |= {name: np.asarray(picture.color)[..., k] for k, name in enumerate("RGB")}
+        layers["A"] = 1 - np.asarray(picture.transmittance)
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **dict(metadata)}
+    with written_whole(path) as temporary:
+        try:
+            openexr.File(header, channels).write(str(temporary))
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"cannot write {path}: {error}") from error

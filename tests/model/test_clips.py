@@ -1,0 +1,151 @@
+"""Clips hold what planes, boxes and spheres say: points, ways through them, and boxes beside them, rounding included."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+
+PLANE, BOX, BALL = (
+    js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
+    js.Box((-0.5, -0.4, -0.9), (0.6, 0.7, 0.3)),
+    js.Sphere((0.2, 0, 0.1), 0.6),
+)
+CLIPS = {
+    "plane": PLANE,
+    "box": BOX,
+    "sphere": BALL,
+    "outside of a box": ~BOX,
+    "outside of a sphere": ~BALL,
+    "both": PLANE & BOX & ~BALL,
+    "either": BALL | ~PLANE,
+}
+WHERE = st.integers(0, 2**31)
+CAMERA = js.Camera.look_at(eye=(1.2, 2.1, -2.7), target=(0.1, 0, 0), width=8, height=8, near=1.0, far=5.0)
+
+
+def inside(clip, place):
+    """In float64, from the definition."""
+    name = next(name for name, one in CLIPS.items() if one is clip)
+    plane = (place - np.array([0.1, 0.2, -0.1])) @ np.array([1, 0.4, -2]) >= 0
+    box = ((place >= [-0.5, -0.4, -0.9]) & (place <= [0.6, 0.7, 0.3])).all(-1)
+    ball = ((place - np.array([0.2, 0, 0.1])) ** 2).sum(-1) <= 0.36
+    return {
+        "plane": plane,
+        "box": box,
+        "sphere": ball,
+        "outside of a box": ~box,
+        "outside of a sphere": ~ball,
+        "both": plane & box & ~ball,
+        "either": ball | ~plane,
+    }[name]
+
+
+def columns(place):
+    return tuple(jnp.asarray(place, jnp.float32).T)
+
+
+def near_faces(place):
+    """Points that rounding may take for those on the other side."""
+    away = [
+        (place - np.array([0.1, 0.2, -0.1])) @ np.array([1, 0.4, -2]) / np.linalg.norm([1, 0.4, -2]),
+        np.linalg.norm(place - np.array([0.2, 0, 0.1]), axis=-1) - 0.6,
+        *(place[..., k] - face for k in range(3) for face in ([-0.5, -0.4, -0.9][k], [0.6, 0.7, 0.3][k])),
+    ]
+    return np.min(np.abs(away), 0) < 1e-5
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_points_are_in_it_as_defined_in_the_world_and_in_a_view(name):
+    place = np.random.default_rng(0).uniform(-1, 1, (4000, 3))
+    clip, clear = CLIPS[name], ~near_faces(place)
+    truth = inside(clip, place)
+    assert 0 < truth.mean() < 1
+    assert np.array_equal(np.asarray(clip.contains(columns(place)))[clear], truth[clear])
+    view = (place - CAMERA.exact_eye()) @ np.asarray(CAMERA.axes, np.float64).T
+    assert np.array_equal(np.asarray(clip.seen_by(CAMERA).contains(columns(view)))[clear], truth[clear])
+
+
+@pytest.mark.parametrize("name", CLIPS)
+def test_ways_are_in_it_where_their_points_are(name):
+    rng = np.random.default_rng(1)
+    first, last = rng.uniform(-1.5, 1.5, (2, 300, 3))
+    clip = CLIPS[name]
+    begin, end = (np.asarray(part) for part in clip.spans(columns(first), columns(last)))
+    assert (begin <= end).all() and (begin >= 0).all() and (end <= 1).all()
+    assert (begin[1:] >= end[:-1]).all() or (begin[1:][begin[1:] < end[:-1]] == 1).all()
+    share = rng.uniform(0, 1, (64, 1, 1))
+    place = first + share * (last - first)
+    found = ((share[..., 0] >= begin[:, None]) & (share[..., 0] <= end[:, None])).any(0)
+    clear = ~near_faces(place)
+    assert np.array_equal(found[clear], inside(clip, place)[clear])
+
+
+@settings(max_examples=30)
+@given(WHERE, st.sampled_from(list(CLIPS)), st.sampled_from([1e-3, 0.1, 1.0]))
+def test_what_is_said_of_boxes_holds_for_each_of_their_points(seed, name, size):
+    """Drawn from their corners and faces as often as from inside, with all rounding of float32."""
+    rng = np.random.default_rng(seed)
+    lower = rng.uniform(-1.5, 1.5, (50, 3)).astype(np.float32)
+    upper = (lower + size * rng.uniform(0, 1, (50, 3))).astype(np.float32)
+    for clip in (CLIPS[name], CLIPS[name].seen_by(CAMERA)):
+        found = clip.over(columns(lower), columns(upper))
+        share = rng.choice([0, 1, rng.uniform()], (40, 50, 3)).astype(np.float32)
+        place = np.clip(lower + share * (upper - lower), lower, upper)
+        x, y, z = (jnp.asarray(place[..., k]) for k in range(3))
+        held = np.asarray(clip.contains((x, y, z)))
+        assert (held | ~np.asarray(found.holds)).all()
+        assert (~held | np.asarray(found.meets)).all()
+
+
+def test_a_corner_far_from_the_origin_keeps_the_digits_of_float64():
+    box = js.Box(np.array([1e7, 0, 0]), np.array([1e7 + 0.25, 1, 1]))
+    assert float(box.sides[0]) == 0.25
+    assert box.corners()[1][0] == 1e7 + 0.25
+    camera = js.Camera.look_at(eye=(1e7, 0.5, -3), target=(1e7, 0.5, 0), width=8, height=8, near=1.0, far=5.0)
+    assert float(box.seen_by(camera).sides[0]) == 0.25
+
+
+def test_clips_are_pytrees_of_arrays():
+    clip = PLANE & ~BALL
+    again = jax.tree.unflatten(jax.tree.structure(clip), jax.tree.leaves(clip))
+    assert jax.tree.structure(again) == jax.tree.structure(clip)
+    assert len(jax.tree.leaves(jax.tree.map(jnp.zeros_like, clip))) == 6  # a normal of zeros is no fault of JAX's own copies
+    moved = dataclasses.replace(PLANE, point=jnp.zeros(3))
+    assert np.allclose(moved.normal, PLANE.normal)
+    compiled = jax.jit(lambda point, normal: js.Plane(point, normal).normal)(jnp.ones(3), jnp.array([0.0, 2, 0]))
+    assert np.allclose(compiled, [0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: js.Plane((0, 0, 0), (0, 0, 0)), "`normal` must not be"),
+        (lambda: js.Plane((0, 0, 0), (0, np.nan, 0)), "`normal` must be finite"),
+        (lambda: js.Plane((0, 0), (1, 0, 0)), "`point` must have shape"),
+        (lambda: js.Box((0, 0, 0), (1, 0, 1)), "`lower` must be below `upper`"),
+        (lambda: js.Sphere((0, 0, 0), -1.0), "`radius` must be > 0"),
+        (lambda: js.Sphere((0, 0, 0), (1, 2)), "`radius` must have shape"),
+        (lambda: js.Scene(within=(1, 2)), "`within` must be"),
+    ],
+)
+def test_bad_clips_are_refused_by_name(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_a_normal_of_any_length_is_taken():
+    for length in (1e-200, 1.0, 1e200):
+        assert np.allclose(js.Plane((0, 0, 0), np.array([0, 3, 4]) * length).normal, [0, 0.6, 0.8])
+
+
+def test_what_is_no_clip_is_not_combined_with_one():
+    with pytest.raises(TypeError):
+        PLANE & 3
