@@ -25,7 +25,7 @@ from jaxsph.numerics import free_memory, memory_maps
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
 of its two emitters. Of the stages so compiled none runs for longer; the march would take four times as long."""
-MAX_PROGRAMS = 64  # those of about seven frames of different shapes: some 12,000 memory maps of 65,530, and 300 MB
+MAX_PROGRAMS = 128  # those of about fourteen frames of different shapes: some 20,000 memory maps of 65,530, and 600 MB
 
 Function = TypeVar("Function")
 
