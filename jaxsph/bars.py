@@ -87,15 +87,18 @@ class Axis:
 
 
 def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and extinction of values, float64."""
-    values, table = (np.asarray(part, np.float64) for part in (transfer.values, transfer.colors))
-    extinction = np.asarray(transfer.extinction, np.float64)
+    """Colours and extinction of values of one quantity, float64; of two, extinction is of values of the second."""
+    own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+    color = _read(np.asarray(transfer.values, np.float64), np.asarray(transfer.colors, np.float64), quantity)
+    return color, _read(np.asarray(own, np.float64), np.asarray(transfer.extinction, np.float64)[:, None], quantity)[..., 0]
+
+
+def _read(values: np.ndarray, table: np.ndarray, quantity: np.ndarray) -> np.ndarray:
     right = np.clip(np.searchsorted(values, quantity, "right"), 0, len(values) - 1)
     left = np.maximum(right - 1, 0)
     width = values[right] - values[left]
-    part = np.clip(np.divide(quantity - values[left], width, out=np.ones_like(width), where=width > 0), 0, 1)
-    color = table[left] * (1 - part[..., None]) + table[right] * part[..., None]
-    return color, extinction[left] * (1 - part) + extinction[right] * part
+    part = np.clip(np.divide(quantity - values[left], width, out=np.ones_like(width), where=width > 0), 0, 1)[..., None]
+    return np.asarray(table[left] * (1 - part) + table[right] * part)
 
 
 def raised(unit: str) -> str:

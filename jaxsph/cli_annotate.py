@@ -6,6 +6,7 @@ Flow: options, table, image -> [cli_annotate] -> labels -> annotated PNG.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any
@@ -66,8 +67,10 @@ def wanted(options: argparse.Namespace) -> bool:
     return bool(getattr(options, "annotate", hasattr(options, "labels")))
 
 
-def label_file(table: ParticleTable, quantity: str, values: np.ndarray, options: argparse.Namespace) -> None:
-    """Label a quantity of a file, where the command shows that; in code units, with a note, where unyt is missing.
+def label_file(
+    table: ParticleTable, quantity: str, values: np.ndarray, options: argparse.Namespace, opacity_by: str | None = None
+) -> None:
+    """Label a quantity of a file, and that of extinction, where the command shows that; in code units, with a note, without unyt.
 
     Raises:
         UsageError: a unit that does not agree, or that the file does not state.
@@ -81,7 +84,8 @@ def label_file(table: ParticleTable, quantity: str, values: np.ndarray, options:
     if stated and not can_name() and options.unit is None and options.length_unit is None:
         say("note", f"code units: {NEEDS}")
     try:
-        options.labels = labels_of(table, quantity, largest, unit=options.unit, length_unit=options.length_unit)
+        made = labels_of(table, quantity, largest, unit=options.unit, length_unit=options.length_unit)
+        options.labels = dataclasses.replace(made, opacity=opacity_by or made.opacity)
     except ValueError as error:
         raise UsageError(str(error)) from error
 

@@ -20,7 +20,10 @@ def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, sever
     what = "file of particles or of a volume, or built-in scene" + ("; --points or --volume may stand for it" if optional else "")
     parser.add_argument("source", metavar="FILE|scene:NAME", help=what, **number)
     add = parser.add_argument_group("particles of a file").add_argument
-    add("--quantity", metavar="NAME", help="an attribute, density, speed, x, y, z, or log10:NAME of any of these")
+    names = "an attribute, density, speed, x, y, z, or log10:NAME of any of these"
+    add("--quantity", "--color-by", metavar="NAME", help=names)
+    more = "the same for opacity alone (default: log density where it spreads over a decade, else as colour)"
+    add("--opacity-by", metavar="NAME", help=more)
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
     add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")

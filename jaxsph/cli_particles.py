@@ -14,6 +14,8 @@ from jaxsph import cli_annotate, cli_transfer, cli_where, io
 from jaxsph.console import UsageError, attributes, say, span
 from jaxsph.model import Particles, Scene
 
+COORDINATES = "x", "y", "z"
+
 
 def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
     """The particles of the source under a colour map; and what there is to frame."""
@@ -25,12 +27,13 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
     columns = particles.to_numpy()
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
-    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    _say_quantities(report, columns)
     for note in report.notes:
         say("note", note)
-    cli_annotate.label_file(table, report.quantity, columns["quantity"], options)
+    cli_annotate.label_file(table, report.quantity, columns["quantity"], options, report.opacity_by)
     particles = cli_where.centered(particles, options)
-    return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity)), particles
+    ramp = "steep" if report.opacity_by is not None else "even" if report.quantity in COORDINATES else None
+    return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity, ramp)), particles
 
 
 def describe(options: argparse.Namespace) -> Particles:
@@ -42,7 +45,7 @@ def describe(options: argparse.Namespace) -> Particles:
     print("\n`jaxsph render` would show")
     particles, report = _particles(table, options)
     columns = particles.to_numpy()
-    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    _say_quantities(report, columns)
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
     for note in report.notes:
@@ -55,7 +58,23 @@ def _particles(table: io.ParticleTable, options: argparse.Namespace) -> tuple[Pa
     """Those that are asked for."""
     kernel = options.kernel or "poly6"
     with cli_where.conditions():
-        return io.particles_from_table(table, options.quantity, options.support, kernel, **cli_where.selected(options))
+        return io.particles_from_table(
+            table, options.quantity, options.support, kernel, opacity_by=_opacity_by(options), **cli_where.selected(options)
+        )
+
+
+def _opacity_by(options: argparse.Namespace) -> str | None:
+    """What opacity is looked up by: nothing of its own where the whole transfer function is said."""
+    if options.opacity_by is not None:
+        return str(options.opacity_by)
+    said = any(getattr(options, name, None) is not None for name in ("transfer", "preset", "domain"))
+    return None if said else "auto"
+
+
+def _say_quantities(report: io.Report, columns: dict[str, np.ndarray]) -> None:
+    say("quantity", f"{report.quantity}, {span(columns['quantity'])}")
+    if report.opacity_by is not None:
+        say("opacity", f"by {report.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
 
 
 def _table(options: argparse.Namespace) -> io.ParticleTable:

@@ -6,6 +6,7 @@ Flow: options, particles or volume -> [cli_transfer] -> TransferFunction -> cli.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,8 @@ def asked(options: argparse.Namespace) -> bool:
     return any(getattr(options, name, None) is not None for name in LOOKS)
 
 
-def look(shown: Particles | Volume, options: argparse.Namespace, quantity: str) -> TransferFunction:
-    """What particles or a volume look like, by the options; and say so.
+def look(shown: Particles | Volume, options: argparse.Namespace, quantity: str, ramp: str | None = None) -> TransferFunction:
+    """What particles or a volume look like, by the options; and say so. For `ramp` see `scenes.default_transfer`.
 
     Raises:
         UsageError: options that exclude each other, or that the quantity does not suit.
@@ -62,7 +63,7 @@ def look(shown: Particles | Volume, options: argparse.Namespace, quantity: str) 
         say("colours", f"{path} over {span(made.values)}, extinction {span(made.extinction)} per unit length")
         return made
     try:
-        made, name = _made(shown, options, quantity)
+        made, name = _made(shown, options, quantity, ramp)
     except ValueError as error:
         raise UsageError(str(error)) from error
     say("colours", f"{name} over {quantity} = {span(made.values)}, extinction {span(made.extinction)} per unit length")
@@ -81,9 +82,14 @@ def _check(options: argparse.Namespace) -> None:
             raise UsageError(f"--{name} must be one of {', '.join(known)}, got {value!r}")
 
 
-def _made(shown: Particles | Volume, options: argparse.Namespace, quantity: str) -> tuple[TransferFunction, str]:
+def _made(
+    shown: Particles | Volume, options: argparse.Namespace, quantity: str, ramp: str | None
+) -> tuple[TransferFunction, str]:
     depth = scenes.appearance.OPTICAL_DEPTH if options.opacity is None else options.opacity
     domain, preset = getattr(options, "domain", None), getattr(options, "preset", None)
+    if isinstance(shown, Particles) and shown.extinction_quantity is not None and (preset or domain):
+        made, name = _made(dataclasses.replace(shown, extinction_quantity=None), options, quantity, ramp)
+        return scenes.opacity_by_second(made, shown, depth), name
     is_log = quantity.lower().startswith(LOG_PREFIX)
     if is_log and domain == "log":
         other = quantity[len(LOG_PREFIX) :]
@@ -97,7 +103,7 @@ def _made(shown: Particles | Volume, options: argparse.Namespace, quantity: str)
         return scenes.domain_transfer(shown, domain, name, options.range, depth), f"{name}, {domain},"
     if isinstance(shown, Volume):
         return scenes.default_volume_transfer(shown, name, options.range, depth), name
-    return scenes.default_transfer(shown, name, options.range, depth), name
+    return scenes.default_transfer(shown, name, options.range, depth, ramp=ramp), name
 
 
 def _say_domain(made: TransferFunction) -> None:

@@ -21,6 +21,7 @@ from jaxsph.model.transfer import TransferFunction
 SIZE, DOTS_AN_INCH = (8.0, 5.0), 110
 DARK, GRAY = "#222222", "#8a8a8a"
 MARGIN = 0.02  # of the axis, beyond the first and last value shown
+ABOVE_AXIS = 1.13  # of the height of the axes, where there are numbers above them
 MARKED = 32  # control points that are marked one by one
 
 
@@ -74,8 +75,11 @@ def transfer_figure(
     if found is not None:
         _draw_histogram(upper, axis, found)
     right = upper if found is None else upper.twinx()
-    _draw_extinction(right, axis, low, high)
-    _legend(upper, right, found is not None)
+    if scene is not None and scene.particles is not None and len(scene.particle_set.quantities) > 1:
+        right = _draw_extinction_alone(right, Axis(transfer.parts()[-1], labels.opacity))
+    else:
+        _draw_extinction(right, axis, low, high)
+    _legend(upper, right, found is not None, ABOVE_AXIS if right.xaxis.get_label_text() else 1)
     return figure
 
 
@@ -141,7 +145,19 @@ def _draw_extinction(right: Any, axis: Axis, low: float, high: float) -> None:
     right.tick_params(axis="x", labelbottom=False)
 
 
-def _legend(upper: Any, right: Any, with_bars: bool) -> None:
+def _draw_extinction_alone(right: Any, axis: Axis) -> Any:
+    """Over the quantity that it is looked up by, on an axis above, whose axes are returned."""
+    above = right.twiny()
+    low, high = (float(end) for end in axis.scale.values[[0, -1]])
+    axis.apply(above, "x", low, high)
+    _draw_extinction(above, axis, low, high)
+    right.set_ylabel(above.get_ylabel())
+    above.set_xlabel(f"extinction by {axis.title}")
+    above.tick_params(axis="x", labelbottom=False, labeltop=True)
+    return above
+
+
+def _legend(upper: Any, right: Any, with_bars: bool, height: float) -> None:
     """Above the axes, so that it hides nothing."""
     from matplotlib.patches import Patch
 
@@ -150,7 +166,7 @@ def _legend(upper: Any, right: Any, with_bars: bool) -> None:
         more, names = upper.get_legend_handles_labels()
         bars = Patch(facecolor="#c8c8c8", edgecolor=DARK, linewidth=0.5)
         handles, labels = [bars, *more, *handles], ["seen: light absorbed, in its colours", *names, *labels]
-    upper.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, fontsize="small")
+    upper.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, height), ncols=3, frameon=False, fontsize="small")
 
 
 TransferFunction.drawer = staticmethod(transfer_figure)

@@ -68,6 +68,18 @@ def test_the_picture_is_the_one_that_the_library_makes(file, tmp_path, capsys):
     assert differs.sum() <= 1  # one sample lies within rounding of a support's edge: in float32 it is outside
 
 
+def test_colour_and_opacity_are_by_the_quantities_asked_for(file, capsys):
+    names = ["--color-by", "temperature", "--opacity-by", "log10:pressure"]
+    code, out, _ = run(capsys, "render", file, "-o", "a.exr", *names, *TINY)
+    assert code == 0 and "by log10:pressure" in out and "viridis over temperature" in out
+    particles = io.read_particles(file, "temperature", opacity_by="log10:pressure")
+    scene = js.Scene(particles=particles, transfer=js.scenes.default_transfer(particles))
+    own = js.render(scene, js.Camera.framing(particles, width=24, height=16), js.Settings(samples=16))
+    np.testing.assert_allclose(io.read_image("a.exr").color, own.color, atol=1e-6)
+    code, _, err = run(capsys, "render", file, "--opacity-by", "dust", *TINY)
+    assert code == 1 and "no quantity 'dust'" in err[0]
+
+
 def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
     run(capsys, "render", file, "-o", "framed.exr", *TINY)
     _, out, _ = run(capsys, "render", file, "-o", "placed.exr", *TINY, "--eye", 0, 0, 9, "--target", 0, 0, 0, "--fov", 30)

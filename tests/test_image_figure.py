@@ -85,6 +85,13 @@ def test_look_up_is_the_transfer_function_jumps_included():
         np.testing.assert_allclose(own, theirs, atol=1e-6)
 
 
+def test_look_up_reads_extinction_at_its_own_control_points():
+    made = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 0, 0)], [0, 4, 1], extinction_values=[0, 0.5, 2])
+    asked = np.array([-1, 0, 0.25, 0.5, 1, 3])
+    for own, theirs in zip(look_up(made, asked), made(asked), strict=True):
+        np.testing.assert_allclose(own, theirs, atol=1e-6)
+
+
 def texts(figure):
     return [text.get_text() for text in figure.axes[0].texts]
 

@@ -49,6 +49,18 @@ def test_nothing_is_clipped_at_the_edges():
         assert extent.x0 >= whole.x0 and extent.x1 <= whole.x1 and extent.y0 >= whole.y0 and extent.y1 <= whole.y1
 
 
+def test_extinction_by_a_quantity_of_its_own_has_an_axis_of_its_own():
+    look = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 1, 1)], [0, 1, 9], extinction_values=[-3, -1, 1])
+    position = np.random.default_rng(0).random((20, 3)).astype(np.float32)
+    particles = js.Particles.from_arrays(position, 0.4, (position[:, 0], 4 * position[:, 1] - 3))
+    labels = js.io.Labels("temperature", opacity="log10:density")
+    figure = look.figure(js.Scene(particles=particles, transfer=look), CAMERA, labels=labels)
+    (own,) = [axes for axes in figure.axes if axes.get_xlabel().startswith("extinction by density")]
+    x, y = own.lines[0].get_data()
+    np.testing.assert_allclose(y, np.interp(np.log10(x), [-3, -1, 1], [0, 1, 9]), atol=1e-6)
+    assert own.get_xscale() == "log" and own.get_xlim() == pytest.approx((1e-3, 10))
+
+
 def test_a_scene_without_a_camera_or_without_a_quantity_is_refused():
     with pytest.raises(ValueError, match="go together"):
         LOOK.figure(scene())

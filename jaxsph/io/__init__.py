@@ -106,6 +106,7 @@ def read_particles(
     box: Any = "file",
     where: str | None = None,
     share: float | None = None,
+    opacity_by: str | None = None,
 ) -> Particles:
     """Read a particle file, ready to render.
 
@@ -121,6 +122,8 @@ def read_particles(
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.
         where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`.
         share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
+        opacity_by: a quantity for extinction alone; `"auto"` for log density where densities spread over a decade, see
+            `particles_from_table`.
 
     Returns:
         Particles with quantity, support and volume; `particles_from_table` also tells how they were found.
@@ -131,7 +134,8 @@ def read_particles(
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
     table = read_table(path, part_type=part_type, progress=progress)
-    return particles_from_table(table, quantity, support, kernel, progress=progress, box=box, where=where, share=share)[0]
+    which: dict[str, Any] = {"box": box, "where": where, "share": share, "opacity_by": opacity_by}
+    return particles_from_table(table, quantity, support, kernel, progress=progress, **which)[0]
 
 
 def read_points(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from jaxsph.model.particles import Particles
 
 from .damage import DataError
-from .quantities import ROLES, choose_quantity
+from .quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
 from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from .table import ParticleTable
 from .where import select
@@ -27,6 +28,9 @@ OUTSIDE = 1e-3
 """Of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then."""
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
+AUTO = "auto"
+DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
+"""Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +43,7 @@ class Report:
         num_particles: number of particles.
         quantity: name of the quantity.
         quantity_range: its smallest and largest value; NaN for an empty set.
+        opacity_by: name of the quantity that extinction is looked up by, where that was asked for, or chosen; it may be the same.
         support: one sentence on where the supports come from.
         support_range: smallest and largest support radius, length units; NaN for an empty set.
         volume: one sentence on where the volumes come from.
@@ -54,11 +59,13 @@ class Report:
     support_range: tuple[float, float]
     volume: str
     notes: tuple[str, ...]
+    opacity_by: str | None = None
 
     def __str__(self) -> str:
         lines = [
             f"{self.path or 'particles'}: {self.num_particles} particles ({self.source})",
             f"quantity  {self.quantity}: {self.quantity_range[0]:.6g} .. {self.quantity_range[1]:.6g}",
+            *([] if self.opacity_by is None else [f"opacity   by {self.opacity_by}"]),
             f"support   {self.support_range[0]:.6g} .. {self.support_range[1]:.6g}: {self.support}",
             f"volume    {self.volume}",
         ]
@@ -75,8 +82,9 @@ def particles_from_table(
     box: Any = FROM_FILE,
     where: str | None = None,
     share: float | None = None,
+    opacity_by: str | None = None,
 ) -> tuple[Particles, Report]:
-    r"""Particles that carry one quantity of a table.
+    r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
     Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
     those of the table, else mass over density, else $1 / \sum_j W(|x_i - x_j|, H_i)$. Where supports vary, a stored
@@ -92,6 +100,9 @@ def particles_from_table(
         where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"` (`jaxsph.io.where`);
             what is derived (supports, volumes, densities) is of all particles.
         share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
+        opacity_by: name of the quantity that extinction is looked up by, if that is another; `"auto"` for the logarithm of the
+            density where densities spread over more than a decade, as the normalised field would show gas of any density at
+            full strength. `jaxsph.scenes.default_transfer` makes a transfer function that suits.
 
     Returns:
         The particles, and the report on what was settled. Particles are float32 unless the positions are float64 and
@@ -102,7 +113,7 @@ def particles_from_table(
             float32 rounding exceeds a quarter of a support; a condition that is not understood, or that no particle meets.
     """
     try:
-        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share))
+        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share, opacity_by))
     except DataError as error:
         raise type(error)(f"{table.path}: {error}" if table.path else str(error)) from error
 
@@ -129,7 +140,7 @@ def _assemble(
     support: float | np.ndarray | None,
     kernel: str,
     progress: bool,
-    wanted: tuple[str | None, float | None],
+    wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
     supports, support_origin = _supports(table, support, progress)
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith("support =")), *notes]
@@ -146,27 +157,21 @@ def _assemble(
         return summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
-    stored_density = table.named(*ROLES["density"])
-    if table.volume is not None:
-        volumes, volume_origin = table.volume.astype(np.float64), "as the file has it"
-    elif mass is not None and stored_density is not None and _positive(mass, table.columns[stored_density]):
-        volumes = mass / table.columns[stored_density].astype(np.float64)
-        volume_origin = f"{mass_name} / {stored_density}"
-        if len(supports) and supports.min() < supports.max():
-            volume_origin += " (the stored density is the sum over the particle's own support)"
-    else:
-        volumes, volume_origin = 1 / number_density(), "1 / sum of kernels within the particle's own support"
-    if name.endswith("density") and stored_density is None:
+    volumes, volume_origin = _volumes(table, supports, mass_name, number_density)
+    if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
     rounding = rounding_note(table.position, supports)
     if rounding:
         notes.append(rounding)
     dtype = table.position.dtype
-    kept, told = select(table, *wanted, density=density)
+    kept, told = select(table, *wanted[:2], density=density)
     notes += told
-    own = {"support": supports, "quantity": values, "volume": _scaled(volumes)}
+    second, opacity_by = _opacity(table, name, wanted[2], volumes if mass is None else volumes / mass, density)
+    own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
-        columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items()}
+        columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
+        if second is not None:
+            columns["quantity"] = columns["quantity"], columns.pop("second")
         particles = Particles.from_arrays(table.position[kept], **columns, kernel=kernel, box=table.box_size)
     report = Report(
         source=table.source,
@@ -178,8 +183,46 @@ def _assemble(
         support_range=_range(supports[kept]),
         volume=volume_origin,
         notes=tuple(notes),
+        opacity_by=opacity_by,
     )
     return particles, report
+
+
+def _volumes(
+    table: ParticleTable, supports: np.ndarray, mass_name: str | None, number_density: Callable[[], np.ndarray]
+) -> tuple[np.ndarray, str]:
+    """Volumes, and one sentence on where they come from."""
+    density_name = table.named(*ROLES["density"])
+    if table.volume is not None:
+        return table.volume.astype(np.float64), "as the file has it"
+    if mass_name is None or density_name is None or not _positive(table.columns[mass_name], table.columns[density_name]):
+        return 1 / number_density(), "1 / sum of kernels within the particle's own support"
+    origin = f"{mass_name} / {density_name}"
+    if len(supports) and supports.min() < supports.max():
+        origin += " (the stored density is the sum over the particle's own support)"
+    return table.columns[mass_name].astype(np.float64) / table.columns[density_name].astype(np.float64), origin
+
+
+def _opacity(
+    table: ParticleTable, color_by: str, wanted: str | None, thinness: np.ndarray, density: Gather
+) -> tuple[np.ndarray | None, str | None]:
+    """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
+    if wanted == AUTO:
+        if not _spreads(thinness):
+            return None, None
+        wanted = LOG_PREFIX + (table.named(*ROLES["density"]) or "density")
+    if wanted is None:
+        return None, None
+    values, name = choose_quantity(table, wanted, density=density)
+    return None if name == color_by else values, name
+
+
+def _spreads(thinness: np.ndarray) -> bool:
+    usable = thinness[np.isfinite(thinness) & (thinness > 0)]
+    if not len(usable):
+        return False
+    low, high = np.percentile(usable, SPREAD_BETWEEN)
+    return bool(high > DENSITY_SPREAD * low)
 
 
 def _supports(table: ParticleTable, support: float | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:

@@ -27,6 +27,7 @@ class Labels:
         length: unit of positions as the file states it; `None` is code units.
         length_unit: the name of a unit that lengths are told in; `None` chooses by their size.
         moment: the time, in words.
+        opacity: full name of what extinction is looked up by, where that is another.
     """
 
     quantity: str = "quantity"
@@ -35,6 +36,7 @@ class Labels:
     length: CodeUnit | None = None
     length_unit: str | None = None
     moment: str = ""
+    opacity: str = "its own quantity"
 
     @classmethod
     def of(cls, given: Labels | str) -> Labels:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
 from jaxsph.scenes import appearance, cosmos, fields
-from jaxsph.scenes.appearance import colormap, default_transfer, default_volume_transfer
+from jaxsph.scenes.appearance import colormap, default_transfer, default_volume_transfer, opacity_by_second
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.dam_break import dam_break
 from jaxsph.scenes.flubber import flubber
@@ -44,6 +44,7 @@ __all__ = [
     "load",
     "mixer",
     "names",
+    "opacity_by_second",
     "preset",
     "radial",
 ]

@@ -5,21 +5,33 @@ Flow: Particles or Volume, colour map -> [appearance] -> TransferFunction.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from jaxsph.model import Particles, TransferFunction, Volume
 from jaxsph.model.colormaps import COLORMAPS, colormap, value_range
 
-__all__ = ["COLORMAPS", "colormap", "default_transfer", "default_volume_transfer", "value_range"]
+__all__ = ["COLORMAPS", "colormap", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
 OPTICAL_DEPTH = 3.0
 """Optical depth through the bulk of the particles: 5 % of the light behind gets through."""
 
 FAINTEST = 0.03
-"""Extinction at the low end of the range, over that at the high end: what is lowest is seen, but hides nothing."""
+"""Extinction at the low end of a range, over that at the high end: what is lowest is seen, but hides nothing."""
 
 STEEPNESS = 2
-"""Power with which extinction rises over the range: the middle, where most of a set tends to lie, stays translucent."""
+"""Power with which extinction rises over a range: the middle, where most of a set tends to lie, stays translucent."""
+
+RAMPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "even": np.ones_like,
+    "rising": lambda share: FAINTEST + (1 - FAINTEST) * share**STEEPNESS,
+    "steep": lambda share: share ** (2 * STEEPNESS),
+}
+"""How extinction depends on the place in a range: not at all; as above; from 0, so that what is low is clear."""
+
+POINTS = 33
+"""Control points of extinction, where it has its own."""
 
 CELLS = (4, 48)
 """Fewest and most cells along the longest edge when columns of the quantity are summed."""
@@ -33,10 +45,12 @@ def default_transfer(
     colormap_name: str = "viridis",
     values: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
+    *,
+    ramp: str | None = None,
 ) -> TransferFunction:
     r"""A transfer function that shows `particles` with a colour map.
 
-    Extinction rises with the square of the place in the range of values, from 3 % to all of a peak $\sigma$. The peak
+    Extinction rises to a peak $\sigma$ by one of `RAMPS`, over the range of values, or of the second of two quantities. The peak
     makes the optical depth $\tau$ of typical columns `optical_depth`: $\sum \tau^2 / \sum \tau$ over the columns of a
     coarse grid along the three axes, so that the bulk counts and not the fringe.
 
@@ -45,22 +59,50 @@ def default_transfer(
         colormap_name: as for `colormap`.
         values: low and high end of the colours, in units of the quantity; `None` chooses (`value_range`).
         optical_depth: larger is more opaque.
+        ramp: `"even"`; `"rising"` with the square of the place in the range, from 3 % of the peak; or `"steep"`, by the fourth
+            power from 0, as suits the logarithm of a density over decades. By default steep of particles that have a quantity for
+            extinction alone, else rising.
 
     Raises:
-        ValueError: an unknown colour map, values that do not ascend, an optical depth that is not positive.
+        ValueError: an unknown colour map or ramp, values that do not ascend, an optical depth that is not positive.
     """
+    if ramp is not None and ramp not in RAMPS:
+        raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
     colors = colormap(colormap_name)
     valid = np.asarray(particles.valid)
     quantity = np.asarray(particles.quantity, np.float64)[valid]
     low, high = _span(quantity, values, optical_depth)
-    share = np.linspace(0, 1, len(colors))
-    ramp = FAINTEST + (1 - FAINTEST) * share**STEEPNESS
-    depth = _typical_column(
-        particles.exact_position()[valid],
-        np.asarray(particles.support, np.float64)[valid],
-        np.interp(quantity, low + (high - low) * share, ramp),
-    )
-    return TransferFunction.from_points(low + (high - low) * share, colors, optical_depth / depth * ramp)
+    control = low + (high - low) * np.linspace(0, 1, len(colors))
+    if particles.extinction_quantity is not None:
+        colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
+        return opacity_by_second(colored, particles, optical_depth, ramp=ramp or "steep")
+    own = ramp not in (None, "rising")
+    at = np.linspace(low, high, POINTS) if own else control
+    shape = RAMPS[ramp or "rising"](np.linspace(0, 1, len(at)))
+    extinction = optical_depth / typical_depth(particles, at, shape) * shape
+    return TransferFunction.from_points(control, colors, extinction, at if own else None)
+
+
+def opacity_by_second(
+    transfer: TransferFunction, particles: Particles, optical_depth: float = OPTICAL_DEPTH, *, ramp: str = "steep"
+) -> TransferFunction:
+    """The colours of a transfer function, with an extinction over the second of two quantities.
+
+    Args:
+        transfer: whose colours are taken.
+        particles: with two quantities.
+        optical_depth, ramp: as for `default_transfer`.
+
+    Raises:
+        ValueError: particles of one quantity.
+    """
+    second = particles.extinction_quantity
+    if second is None:
+        raise ValueError("`particles` must have two quantities: give `quantity=(of_colour, of_extinction)`")
+    at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), POINTS)
+    shape = RAMPS[ramp](np.linspace(0, 1, POINTS))
+    extinction = optical_depth / typical_depth(particles, at, shape) * shape
+    return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
 
 
 def default_volume_transfer(
@@ -94,7 +136,7 @@ def typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.
     if isinstance(shown, Volume):
         return _columns_of_volume(shown, values, extinction)
     valid = np.asarray(shown.valid)
-    quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantity, shown.support))
+    quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
     return _typical_column(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
 
 

@@ -132,3 +132,32 @@ def test_the_report_cannot_be_changed():
     _, report = io.particles_from_table(ParticleTable(position))
     with pytest.raises(dataclasses.FrozenInstanceError):
         report.quantity = "z"
+
+
+def gas(decades):
+    """Fifty particles whose stored densities span so many decades."""
+    rho = 10 ** np.linspace(0, decades, 50)
+    return ParticleTable(position, {"rho": rho, "temperature": density, "mass": np.ones(50)}, support=np.full(50, 0.5))
+
+
+def test_opacity_is_by_log_density_where_densities_spread_over_a_decade():
+    particles, report = io.particles_from_table(gas(3), "temperature", opacity_by="auto")
+    assert report.opacity_by == "log10:rho" and "opacity   by log10:rho" in str(report)
+    np.testing.assert_allclose(there(particles.extinction_quantity), np.linspace(0, 3, 50), atol=1e-6)
+    np.testing.assert_allclose(there(particles.quantity), density, rtol=1e-6)
+
+
+def test_opacity_is_by_the_quantity_itself_of_fluids_and_unless_asked_for():
+    for table, wanted in ((gas(0.5), "auto"), (gas(3), None)):
+        particles, report = io.particles_from_table(table, "temperature", opacity_by=wanted)
+        assert particles.extinction_quantity is None and report.opacity_by is None
+
+
+def test_what_is_shown_by_log_density_anyway_carries_it_once():
+    particles, report = io.particles_from_table(gas(3), "log10:rho", opacity_by="auto")
+    assert particles.extinction_quantity is None and report.opacity_by == "log10:rho"
+
+
+def test_opacity_by_a_quantity_that_is_not_there_lists_those_that_are():
+    with pytest.raises(ValueError, match=r"no quantity 'dust'; there are rho"):
+        io.particles_from_table(gas(3), opacity_by="dust")

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsph import Camera, Particles, Scene, Settings, reference
-from jaxsph.scenes.appearance import COLORMAPS, FAINTEST, colormap, default_transfer, value_range
+from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
+from jaxsph.scenes.appearance import COLORMAPS, FAINTEST, colormap, default_transfer, opacity_by_second, value_range
 from jaxsph.scenes.sampling import scatter
 
 
@@ -70,3 +70,33 @@ def test_bad_arguments_are_named():
         default_transfer(block(10), values=(1, 0))
     with pytest.raises(ValueError, match="`optical_depth` must be > 0"):
         default_transfer(block(10), optical_depth=0)
+
+
+def pair(count=200):
+    density = np.geomspace(1e-3, 10, count)
+    position = scatter(np.zeros(3), np.ones(3), count).astype(np.float32)
+    return Particles.from_arrays(position, 2 * count ** (-1 / 3), (np.linspace(-1, 1, count), np.log10(density)))
+
+
+def test_of_two_quantities_colours_span_the_first_and_extinction_rises_from_nothing_over_the_second():
+    transfer = default_transfer(pair(), values=(-1.0, 1.0))
+    own, extinction = np.asarray(transfer.extinction_values), np.asarray(transfer.extinction)
+    assert np.asarray(transfer.values)[[0, -1]].tolist() == [-1.0, 1.0]
+    assert -3 <= own[0] < -2.9 and 0.9 < own[-1] <= 1 and extinction[0] == 0 and (np.diff(extinction) > 0).all()
+
+
+def test_colours_of_any_function_are_kept_where_extinction_is_by_the_second():
+    colored = TransferFunction.from_points([0, 1, 5], [(1, 0, 0), (0, 1, 0), (0, 0, 1)], np.full(3, 3.0))
+    made = opacity_by_second(colored, pair())
+    assert (made.values == colored.values).all() and (made.colors == colored.colors).all()
+    with pytest.raises(ValueError, match="two quantities"):
+        opacity_by_second(colored, block())
+
+
+def test_ramps_are_even_rising_or_steep_and_nothing_else():
+    low, high = (float(default_transfer(block(), ramp="even")(np.array([end]))[1][0]) for end in (0.1, 0.9))
+    assert low == pytest.approx(high) and low > 0
+    steep = default_transfer(block(), ramp="steep")
+    assert float(steep(np.array([0.0]))[1][0]) == 0
+    with pytest.raises(ValueError, match="even, rising, steep"):
+        default_transfer(block(), ramp="falling")
