@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import tipsy
+from . import nchilada, tipsy
 from .damage import DataError
 from .gadget_binary import looks_like
 from .snapshot_files import joined
@@ -36,6 +36,7 @@ class Format:
             package, or a whole name with a dot in it.
         sniff: whether a file with these first bytes is of this format; `None` where content does not tell.
         typed: whether its `read` takes `part_type`.
+        folder: whether a folder is a snapshot of this format; `None` where snapshots are files.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Format:
     module: str
     sniff: Callable[[bytes], bool] | None
     typed: bool = False
+    folder: Callable[[Path], bool] | None = None
 
 
 def _is_bgeo(start: bytes) -> bool:
@@ -69,6 +71,7 @@ FORMATS = (
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
     Format("Tipsy", (".tipsy", ".std", ".tip"), "tipsy", tipsy.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
+    Format("NChilada", (".nchilada",), "nchilada", None, typed=True, folder=nchilada.looks_like),
     Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
 )  # fmt: skip
 
@@ -97,15 +100,18 @@ def find_format(path: Path) -> Format:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is a folder, or neither its content nor its suffix is known; the message lists those that are.
+        ValueError: a folder that is no snapshot; neither content nor suffix are known, and the message lists those that are.
     """
-    if path.is_dir():
-        raise DataError(f"{path}: is a folder; give the name of a file in it")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
+    formats = (*added_formats(), *FORMATS)
+    if path.is_dir():
+        form = next((form for form in formats if form.folder is not None and form.folder(path)), None)
+        if form is None:
+            raise DataError(f"{path}: is a folder, and no snapshot of a format that is one; give the name of a file in it")
+        return form
     with path.open("rb") as file:
         start = file.read(SNIFFED_BYTES)
-    formats = (*added_formats(), *FORMATS)
     by_content = next((form for form in formats if form.sniff is not None and form.sniff(start)), None)
     by_name = next((form for form in formats if path.name.lower().endswith(form.suffixes)), None)
     found = by_content or by_name
