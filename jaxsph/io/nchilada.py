@@ -1,7 +1,7 @@
 """NChilada snapshots, of ChaNGa: a folder with a folder a kind of particles, and in that a file a column.
 
-Every file is big-endian (XDR): a magic number, time, number of particles in two halves, dimensions and a type code, then least and
-largest value of each dimension, then the values. Types are numbered as in Gadget files: 0 gas, 1 dark matter, 4 stars.
+Every file is big-endian (XDR): a magic number, time, number of particles in two halves, dimensions and a type code, then least
+and largest value of each dimension, then the values. Types are numbered as in Gadget files: 0 gas, 1 dark matter, 4 stars.
 What codes write as a smoothing length is not told by the file, so that supports are found from neighbours. Source: the field
 header of the NChilada library, University of Washington N-Body Shop.
 """
