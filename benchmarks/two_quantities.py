@@ -49,18 +49,14 @@ def seconds(scene: js.Scene, camera: js.Camera, settings: js.Settings) -> float:
 
 def measure(name: str, options: argparse.Namespace) -> list[dict[str, object]]:
     scene, camera = view(name, options.size)
-    scenes, rows = (scene, twice(scene)), []
+    scenes, rows, called = (scene, twice(scene)), [], pathlib.Path(name).name
     for asked, settings in SETTINGS.items():
         images = [js.render(each, camera, settings) for each in scenes]
         apart = float(np.abs(np.asarray(images[0].color) - np.asarray(images[1].color)).max())
         turns = [[seconds(each, camera, settings) for each in scenes] for _ in range(options.repeats)]
         one, two = (statistics.median(times) for times in zip(*turns, strict=True))
-        rows.append(
-            {"scene": pathlib.Path(name).name, "settings": asked, "one": one, "two": two, "ratio": two / one, "apart": apart}
-        )
-        print(
-            f"{pathlib.Path(name).name:20s} {asked:16s} {one:7.3f} s {two:7.3f} s  {two / one:.2f}  apart {apart:.1e}", flush=True
-        )
+        rows.append({"scene": called, "settings": asked, "one": one, "two": two, "ratio": two / one, "apart": apart})
+        print(f"{called:20s} {asked:16s} {one:7.3f} s {two:7.3f} s  {two / one:.2f}  apart {apart:.1e}", flush=True)
     return rows
 
 
