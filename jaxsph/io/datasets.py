@@ -22,8 +22,8 @@ BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
 
 
-def read_dataset(dataset: Any) -> np.ndarray:
-    """All of an `h5py.Dataset`.
+def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
+    """All of an `h5py.Dataset`, or some of its rows.
 
     Raises:
         ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold.
@@ -31,15 +31,15 @@ def read_dataset(dataset: Any) -> np.ndarray:
     if getattr(dataset, "shape", None) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
     _refuse_unwritten(dataset)
-    return np.asarray(dataset[()])
+    return np.asarray(dataset[() if rows is None else rows])
 
 
-def read_positions(dataset: Any) -> np.ndarray:
-    """The positions (N, 3) of an `h5py.Dataset`; other shapes are refused before they are read."""
+def read_positions(dataset: Any, rows: slice | None = None) -> np.ndarray:
+    """The positions (N, 3) of an `h5py.Dataset`, or some of them; other shapes are refused before they are read."""
     shape = getattr(dataset, "shape", None)
     if shape is None or len(shape) != 2 or shape[1] != 3 or dataset.dtype.kind not in "fiu":
         raise DataError(f"`{dataset.name}` must hold numbers of shape (N, 3), got {shape}; write three coordinates a particle")
-    return read_dataset(dataset)
+    return read_dataset(dataset, rows)
 
 
 def numeric_datasets(group: Any, count: int, skip: tuple[str, ...] = ()) -> dict[str, np.ndarray]:

@@ -16,6 +16,7 @@ Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -39,36 +40,39 @@ SWIFT_GAMMA = {
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
 
 
-def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
+def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
     """The particles of one type of an open `h5py.File`.
 
-    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`.
+    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`. Of those, `rows` are read, and
+    besides positions `only` the columns of those names (`plain`).
 
     Raises:
         ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
     chosen, group = _choose(file, part_type)
-    position = read_positions(group["Coordinates"])
-    count = len(position)
+    position = read_positions(group["Coordinates"], rows)
+    count = group["Coordinates"].shape[0]
     said = [f"particles of PartType{chosen}"]
     swift = _is_swift(file)
     columns, dropped = {}, []
     for name, dataset in group.items():
         if name == "Coordinates" or not hasattr(dataset, "shape") or dataset.ndim not in (1, 2):
             continue
+        if only is not None and plain(name) not in only:
+            continue
         if dataset.dtype.kind not in "fiub":
             dropped.append(name)
         elif dataset.shape[0] != count:
             raise DataError(f"PartType{chosen}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
         else:
-            columns[name] = read_dataset(dataset)
+            columns[name] = read_dataset(dataset, rows)
     if dropped:
         said.append(f"left out {', '.join(dropped)}: not numbers")
     header = file["Header"].attrs if "Header" in file else {}
     if not any(plain(name) in ("mass", "masses") for name in columns):
         mass = _table_mass(header, chosen)
         if mass:
-            columns["Masses"] = np.full(count, mass)
+            columns["Masses"] = np.full(len(position), mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
     smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
     support = None
