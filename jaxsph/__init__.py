@@ -25,6 +25,7 @@ from jaxsph.slices import Slice, slice_of
 from jaxsph.snapshots import Snapshots
 from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
+from jaxsph.tiles import merge, render_tile
 from jaxsph.version import __version__
 
 __all__ = [
@@ -61,6 +62,7 @@ __all__ = [
     "image_figure",
     "in_octree",
     "io",
+    "merge",
     "met",
     "octree_plans",
     "plan",
@@ -71,6 +73,7 @@ __all__ = [
     "reference",
     "render",
     "render_frames",
+    "render_tile",
     "resample",
     "scenes",
     "slice_of",

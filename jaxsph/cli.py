@@ -21,6 +21,7 @@ import jaxsph
 from jaxsph import (
     cli_annotate,
     cli_cache,
+    cli_merge,
     cli_movie,
     cli_options,
     cli_points,
@@ -122,6 +123,8 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_control(render)
     cli_transfer.add_looks(render)
     cli_annotate.add_options(render)
+    cli_merge.add_tile(render)
+    cli_merge.add_options(command("merge", _merge, "make one image of its parts", cli_merge.MORE))
     transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
     cli_options.add_source(transfer)
     cli_options.add_picture(transfer)
@@ -171,9 +174,10 @@ def _render_one(options: argparse.Namespace) -> None:
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0]
-    output = options.output or Path(Path(first.removeprefix(cli_scene.SCENE)).stem + ".png")
+    output = options.output or Path(Path(first.removeprefix(cli_scene.SCENE)).stem + cli_merge.suffix(options))
     _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
     cli_annotate.check(options, output)
+    cli_merge.check(options, settings, output)
     scene, camera = cli_scene.scene_of(options)
     scene = cli_where.shown(scene, options)
     if options.slice is not None:
@@ -185,7 +189,7 @@ def _render_one(options: argparse.Namespace) -> None:
         image = render_in_stages(scene, camera, settings, output)
     else:
         with progress("render") as show:
-            image = jaxsph.render(scene, camera, settings, progress=show)
+            image = cli_merge.render(scene, camera, settings, options, show)
     elapsed = time.perf_counter() - started
     image = cli_where.labelled(image, options)
     if options.annotate:
@@ -196,6 +200,10 @@ def _render_one(options: argparse.Namespace) -> None:
     if settings.tolerance is not None:
         say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
     say("time", time_line(image, elapsed))
+
+
+def _merge(options: argparse.Namespace) -> None:
+    cli_merge.run(options, _require_writable)
 
 
 def _movie(options: argparse.Namespace) -> None:

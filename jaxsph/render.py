@@ -109,7 +109,26 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         plan.check(scene, camera, settings)
         clock.mark("plan")
         seen = see(scene, camera, plan, clock)
-    draw = functools.partial(_draw, seen, camera, settings, plan, scene.formulas)
+    return drawn(seen, camera, settings, plan, scene.formulas, clock, progress, planned=planned)
+
+
+def drawn(
+    seen: Seen,
+    camera: Camera,
+    settings: Settings,
+    plan: Plan,
+    formulas: Formulas,
+    clock: Clock,
+    progress: Progress | None,
+    *,
+    planned: bool,
+    first_row: int = 0,
+) -> Image:
+    """The image of what is seen, or those of its rows, from `first_row` on, that the plan is for; faults raise.
+
+    `planned`: whether capacities were made for this very frame.
+    """
+    draw = functools.partial(_draw, seen, camera, settings, plan, formulas, first_row)
     clock.foresee(lambda known: draw(Forecast(known), None))
     bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
@@ -119,7 +138,7 @@ def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     if word & faults.TOLD:
         number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
         pixels = f"{number} of {image.error_bound.size} pixels"
-        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=3)
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -141,6 +160,7 @@ def _draw(
     settings: Settings,
     plan: Plan,
     formulas: Formulas,
+    first_row: int,
     run: Executor,
     progress: Progress | None,
 ) -> tuple[list[Band], Layers]:
@@ -150,7 +170,7 @@ def _draw(
     if plan.quadtree is not None:
         return refined(frame, run, progress)
     for band in range(plan.bands):
-        bands.append(frame.band(jnp.int32(band * plan.band_height), run))
+        bands.append(frame.band(jnp.int32(first_row + band * plan.band_height), run))
         if progress is not None:
             progress(band + 1, plan.bands)
     return bands, run.one(

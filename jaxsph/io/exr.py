@@ -8,6 +8,9 @@
 | `error.bound` | largest difference to the reference image that a pixel can have |
 | `work.evaluations` | kernel evaluations spent on the pixel |
 
+An image whose metadata say `jaxsph.first_row` and `jaxsph.rows` is some rows of a larger one: its data window is their place in
+the display window, so that EXR tools show it where it belongs.
+
 All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
 `jaxsph.version`, `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`, `jaxsph.estimator` (`segments` of that
 integrator) and `certified` (`true` or `false`).
@@ -30,6 +33,8 @@ from .replace import written_whole
 
 SOURCE = "OpenEXR"
 VERSION_KEY = "jaxsph.version"
+FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
+"""Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
 RESERVED = (
     "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "pixelAspectRatio",
     "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
@@ -54,7 +59,8 @@ def write(path: Path, image: Image) -> None:
         "work.evaluations": image.evaluations,
     }
     channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **_attributes(image)}
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    header |= {**_attributes(image), **_windows(image)}
     with written_whole(path) as temporary:
         try:
             openexr.File(header, channels).write(str(temporary))
@@ -108,6 +114,18 @@ def _attributes(image: Image) -> dict[str, Any]:
     attributes.setdefault("certified", _attribute(bool(image.certified)))
     attributes.setdefault("faults", int(image.faults))
     return attributes
+
+
+def _windows(image: Image) -> dict[str, Any]:
+    """Where rows of a larger image belong; nothing of a whole one."""
+    metadata, (height, width) = dict(image.metadata), image.shape
+    if FIRST_ROW not in metadata or ROWS not in metadata:
+        return {}
+    first = int(metadata[FIRST_ROW])
+    corners = {"dataWindow": (first, first + height - 1), "displayWindow": (0, int(metadata[ROWS]) - 1)}
+    return {
+        name: (np.array([0, top], np.int32), np.array([width - 1, bottom], np.int32)) for name, (top, bottom) in corners.items()
+    }
 
 
 def _attribute(value: Any) -> str | int | float:
