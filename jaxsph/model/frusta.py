@@ -1,0 +1,78 @@
+"""What of a world some rows of an image can see: which spheres and boxes, by planes (host side).
+
+Flow: camera, rows -> [frusta: Planes] -> which particles of a snapshot a part of a picture needs.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxsph.model.camera import Camera
+
+SLACK = 256 * float(np.finfo(np.float32).eps)
+"""Of coordinates and supports, that a distance may be off by where the camera's numbers are float32."""
+
+
+class Planes(NamedTuple):
+    """A convex region: points x with n . (x - origin) <= d for all planes.
+
+    Attributes:
+        origin: of the coordinates, float64.
+        normals: n, of any length.
+        offsets: d.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    normals: Float[np.ndarray, "planes 3"]
+    offsets: Float[np.ndarray, " planes"]
+
+    def meet(self, position: Float[np.ndarray, "places 3"], reach: Float[np.ndarray, " places"]) -> Bool[np.ndarray, " places"]:
+        """Whether spheres can reach into the region: never false where one does, seldom true where none does."""
+        offset = position - self.origin
+        slack = SLACK * (np.abs(offset).max(1, initial=0) + reach + np.abs(position).max(1, initial=0))
+        return self._meet(offset, reach + slack)
+
+    def meet_boxes(
+        self, lower: Float[np.ndarray, "boxes 3"], upper: Float[np.ndarray, "boxes 3"], reach: Float[np.ndarray, " boxes"]
+    ) -> Bool[np.ndarray, " boxes"]:
+        """Whether any sphere whose middle lies in a box can, none of which is larger than its `reach`."""
+        half, middle = (upper - lower) / 2, (upper + lower) / 2
+        inside = half @ np.abs(self.normals).T
+        slack = SLACK * (
+            np.abs(middle - self.origin).max(1, initial=0) + half.max(1, initial=0) + np.abs(middle).max(1, initial=0)
+        )
+        return self._meet(middle - self.origin, reach * (1 + SLACK) + slack, inside)
+
+    def _meet(self, offset: np.ndarray, reach: np.ndarray, inside: float | np.ndarray = 0.0) -> np.ndarray:
+        length = np.linalg.norm(self.normals, axis=1)
+        return np.asarray((offset @ self.normals.T - inside <= self.offsets + reach[:, None] * length).all(1))
+
+
+def seen_by_rows(camera: Camera, first: int, last: int) -> Planes:
+    """What the rays of rows `first` to `last - 1` of an image pass through, between near and far."""
+    right, up, forward = np.asarray(camera.axes, np.float64)
+    low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (first, last))
+    wide = float(camera.half_height) * camera.width / camera.height
+    near, far = float(camera.near), float(camera.far)
+    depths = [(-forward, -near), (forward, far)]
+    if camera.is_perspective:
+        sides = [
+            (up - high * forward, 0.0),
+            (low * forward - up, 0.0),
+            (right - wide * forward, 0.0),
+            (-right - wide * forward, 0.0),
+        ]
+    else:
+        sides = [(up, high), (-up, -low), (right, wide), (-right, wide)]
+    normals, offsets = zip(*sides, *depths, strict=True)
+    return Planes(camera.exact_eye(), np.stack(normals), np.array(offsets))
+
+
+def between_depths(camera: Camera) -> Planes:
+    """What lies between near and far."""
+    seen = seen_by_rows(camera, 0, camera.height)
+    return Planes(seen.origin, seen.normals[-2:], seen.offsets[-2:])
