@@ -72,7 +72,7 @@ def render_tile(
     rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
-    plan: Plan = fitted(_of_rows(measures, *rows), of_part, along, choose(measures, along))
+    plan: Plan = fitted(of_rows(measures, *rows), of_part, along, choose(measures, along))
     clock.mark("plan")
     image = drawn(seen, camera, settings, plan, scene.formulas, clock, progress, planned=True, first_row=first)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
@@ -102,7 +102,8 @@ def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
     return [*ends, len(weights)]
 
 
-def _of_rows(measures: Measures, first: int, last: int) -> Measures:
+def of_rows(measures: Measures, first: int, last: int) -> Measures:
+    """Of some rows of tiles alone."""
     return dataclasses.replace(
         measures, tile_pairs=measures.tile_pairs[first:last], bundle_pairs=measures.bundle_pairs[first:last]
     )
@@ -152,7 +153,7 @@ def merge(parts: Iterable[Image], *, names: Sequence[str] | None = None) -> Imag
     _require_all(told, called)
     order = sorted(range(len(given)), key=lambda place: told[place][PART])
     _require_rows([given[place] for place in order], [told[place] for place in order], [called[place] for place in order])
-    return _joined([given[place] for place in order])
+    return joined([given[place] for place in order])
 
 
 def _told(image: Image, name: str) -> dict[str, Any]:
@@ -207,14 +208,15 @@ def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[s
         raise ValueError(f"{names[0]} begins at row {begins[0]}, not 0; render it again")
 
 
-def _joined(parts: list[Image]) -> Image:
+def joined(parts: list[Image]) -> Image:
+    """The image of rows that follow on one another."""
     layers = ("color", "transmittance", "depth", "error_bound", "evaluations")
-    joined = {name: jnp.concatenate([getattr(part, name) for part in parts]) for name in layers}
+    whole = {name: jnp.concatenate([getattr(part, name) for part in parts]) for name in layers}
     of_cells = [part.levels for part in parts if part.levels is not None]
     levels = jnp.concatenate(of_cells, axis=1) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
-        **joined,
+        **whole,
         certified=all(bool(part.certified) for part in parts),
         faults=int(np.bitwise_or.reduce([int(part.faults) for part in parts])),
         stats=_summed([part.stats for part in parts]),

@@ -22,6 +22,7 @@ from .snapshot_rows import RUN, Snapshot, needed_columns, supports_and_volumes
 from .table import ParticleTable
 
 SUFFIX = ".jaxsph-index.npz"
+OF_RUNS = "run_"
 VERSION = 1
 Progress = Callable[[int, int], None]
 
@@ -35,7 +36,7 @@ class SnapshotIndex:
         part_type: kind of particles.
         file, begin, end: of each run, number of its file and rows.
         lower, upper: of each run, corners of the box around the positions, float64.
-        support: of each run, largest support.
+        support, least: of each run, largest and smallest support.
         widest, strongest: of each run, the row in its file of the largest support, and of the largest V / H^3.
         strength: of each run, the largest V / H^3.
         volume: of each run, least and largest.
@@ -49,6 +50,7 @@ class SnapshotIndex:
     lower: np.ndarray
     upper: np.ndarray
     support: np.ndarray
+    least: np.ndarray
     widest: np.ndarray
     strongest: np.ndarray
     strength: np.ndarray
@@ -65,7 +67,7 @@ class SnapshotIndex:
         return (self.lower - reach).min(0), (self.upper + reach).max(0)
 
 
-ARRAYS = "file", "begin", "end", "lower", "upper", "support", "widest", "strongest", "strength", "volume"
+ARRAYS = "file", "begin", "end", "lower", "upper", "support", "least", "widest", "strongest", "strength", "volume"
 
 
 def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> SnapshotIndex:
@@ -85,7 +87,7 @@ def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> Snapsho
     if kept is not None:
         return kept
     made = _made(snapshot, progress)
-    arrays = {name: getattr(made, name) for name in ARRAYS}
+    arrays = {OF_RUNS + name: getattr(made, name) for name in ARRAYS}
     try:
         with written_whole(index_path(snapshot)) as temporary:
             np.savez(temporary, identity=_marked(snapshot), **arrays)
@@ -108,7 +110,7 @@ def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
         with np.load(index_path(snapshot), allow_pickle=False) as kept:
             if str(kept["identity"]) != str(_marked(snapshot)):
                 return None
-            return SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[name] for name in ARRAYS})
+            return SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[OF_RUNS + name] for name in ARRAYS})
     except (OSError, ValueError, KeyError, EOFError):
         return None
 
@@ -127,8 +129,23 @@ def _made(snapshot: Snapshot, progress: Progress | None) -> SnapshotIndex:
 def _known(table: ParticleTable, begin: int) -> tuple[Any, ...]:
     """What is kept of a run."""
     support, volume = supports_and_volumes(table)
-    strength = volume / support**3
+    strength = _strength(support, volume)
     position = table.position.astype(np.float64)
     widest, strongest = int(support.argmax()), int(strength.argmax())
     corners = position.min(0), position.max(0)
-    return *corners, support[widest], begin + widest, begin + strongest, strength[strongest], (volume.min(), volume.max())
+    return (
+        *corners,
+        support[widest],
+        support.min(),
+        begin + widest,
+        begin + strongest,
+        strength[strongest],
+        (volume.min(), volume.max()),
+    )
+
+
+def _strength(support: np.ndarray, volume: np.ndarray) -> np.ndarray:
+    """V / H^3, rounded as float32 rounds it: so that it is largest where it will be largest in view."""
+    (long, long_exponent), (large, large_exponent) = (np.frexp(each) for each in (support, volume))
+    long, large = long.astype(np.float32), large.astype(np.float32)
+    return np.asarray(np.ldexp((large / (long * long * long)).astype(np.float64), large_exponent - 3 * long_exponent))

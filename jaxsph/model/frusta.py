@@ -53,10 +53,13 @@ class Planes(NamedTuple):
 
 
 def seen_by_rows(camera: Camera, first: int, last: int) -> Planes:
-    """What the rays of rows `first` to `last - 1` of an image pass through, between near and far."""
+    """What the rays of rows `first` to `last - 1` of an image pass through, between near and far, and a pixel around that.
+
+    So whatever a list of particles takes for touching by rounding is met here, too.
+    """
     right, up, forward = np.asarray(camera.axes, np.float64)
-    low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (first, last))
-    wide = float(camera.half_height) * camera.width / camera.height
+    low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (first - 1, last + 1))
+    wide = float(camera.half_height) * (camera.width + 2) / camera.height
     near, far = float(camera.near), float(camera.far)
     depths = [(-forward, -near), (forward, far)]
     if camera.is_perspective:
