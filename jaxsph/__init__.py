@@ -14,6 +14,7 @@ from jaxsph.model.domains import control_values
 from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
+from jaxsph.on_disk import OnDisk, render_from_disk
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
@@ -38,6 +39,7 @@ __all__ = [
     "Image",
     "IsoSurface",
     "Met",
+    "OnDisk",
     "Particles",
     "Plan",
     "Plane",
@@ -73,6 +75,7 @@ __all__ = [
     "reference",
     "render",
     "render_frames",
+    "render_from_disk",
     "render_tile",
     "resample",
     "scenes",

@@ -21,6 +21,7 @@ import jaxsph
 from jaxsph import (
     cli_annotate,
     cli_cache,
+    cli_disk,
     cli_merge,
     cli_movie,
     cli_options,
@@ -116,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(render, optional=True, several=True)
     _add_parts(render)
     cli_where.add_places(render)
+    cli_disk.add_options(render)
     render.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help=".exr or .png; of several files a folder, or a name with {} in it"
     )
@@ -134,6 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_source(info, optional=True)
     _add_parts(info)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
+    cli_disk.add_sort(command("sort", cli_disk.sort, "order a snapshot in space", "So that parts of it can be read alone."))
     cli_project.add_options(
         command("project", cli_project.run, "integrate along rays: column densities, means", cli_project.MORE)
     )
@@ -178,6 +181,10 @@ def _render_one(options: argparse.Namespace) -> None:
     _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
     cli_annotate.check(options, output)
     cli_merge.check(options, settings, output)
+    if options.from_disk is not None:
+        cli_disk.render(options, settings).save(output)
+        say("image", str(output))
+        return
     scene, camera = cli_scene.scene_of(options)
     scene = cli_where.shown(scene, options)
     if options.slice is not None:

@@ -23,7 +23,8 @@ from jaxsph import scenes
 from jaxsph.access.lists import TILE
 from jaxsph.along_rays import along_rays
 from jaxsph.field.in_octree import reachable
-from jaxsph.io.quantities import choose_quantity
+from jaxsph.io.assemble import opacity_of
+from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
 from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes
 from jaxsph.io.table import ParticleTable
@@ -61,6 +62,7 @@ class OnDisk:
         quantities: names of the quantity, and of that of extinction if there is another.
         kernel: name of the smoothing kernel.
         sample: some of the particles, evenly taken, with supports so large that they fill as much of space as all of them.
+        ramp: how extinction depends on its quantity by default, see `scenes.default_transfer`.
     """
 
     snapshot: Snapshot
@@ -68,6 +70,7 @@ class OnDisk:
     quantities: tuple[str, ...]
     kernel: str
     sample: Particles
+    ramp: str | None = None
 
     @classmethod
     def open(
@@ -99,8 +102,14 @@ class OnDisk:
         snapshot = Snapshot(path, part_type)
         index = index_of(snapshot, progress=progress)
         table = _sampled(snapshot, index)
-        names = [choose_quantity(table, name)[1] for name in (quantity, *([] if opacity_by is None else [opacity_by]))]
-        opened = cls(snapshot, index, tuple(dict.fromkeys(names)), kernel, Particles.from_arrays(np.zeros((0, 3)), 1.0, 0.0))
+        _, name = choose_quantity(table, quantity)
+        _, volume = supports_and_volumes(table)
+        mass = table.named(*ROLES["mass"])
+        _, second = opacity_of(table, name, opacity_by, volume if mass is None else volume / table.columns[mass], None)
+        names = tuple(dict.fromkeys((name, *([] if second is None else [second]))))
+        ramp = "even" if name in ("x", "y", "z") else None
+        nothing = Particles.from_arrays(np.zeros((0, 3)), 1.0, 0.0)
+        opened = cls(snapshot, index, names, kernel, nothing, ramp if second is None else "steep")
         position, support, volume, *values = opened.columns_of(table)
         thinned = np.cbrt(max(len(index), 1) / max(len(table), 1))
         sample = opened.particles((position, (support * thinned).astype(support.dtype), volume, *values))
@@ -115,7 +124,7 @@ class OnDisk:
 
     def transfer(self, colormap: str = "viridis", values: tuple[float, float] | None = None, **more: Any) -> TransferFunction:
         """What its particles look like by default, see `scenes.default_transfer`; chosen by the sample."""
-        return scenes.default_transfer(self.sample, colormap, values, **more)
+        return scenes.default_transfer(self.sample, colormap, values, **{"ramp": self.ramp, **more})
 
     @functools.cached_property
     def needed(self) -> list[str]:

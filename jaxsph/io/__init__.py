@@ -25,6 +25,7 @@ from jaxsph.io.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.projections import read_projection, write_projection
 from jaxsph.io.quantities import available_quantities
+from jaxsph.io.snapshot_sort import sort_snapshot
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.transfers import read_transfer, write_transfer
@@ -63,6 +64,7 @@ __all__ = [
     "read_transfer",
     "read_volume",
     "read_volume_table",
+    "sort_snapshot",
     "volume_from_table",
     "write_camera_path",
     "write_image",

@@ -166,7 +166,7 @@ def _assemble(
     dtype = table.position.dtype
     kept, told = select(table, *wanted[:2], density=density)
     notes += told
-    second, opacity_by = _opacity(table, name, wanted[2], volumes if mass is None else volumes / mass, density)
+    second, opacity_by = opacity_of(table, name, wanted[2], volumes if mass is None else volumes / mass, density)
     own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
@@ -203,8 +203,8 @@ def _volumes(
     return table.columns[mass_name].astype(np.float64) / table.columns[density_name].astype(np.float64), origin
 
 
-def _opacity(
-    table: ParticleTable, color_by: str, wanted: str | None, thinness: np.ndarray, density: Gather
+def opacity_of(
+    table: ParticleTable, color_by: str, wanted: str | None, thinness: np.ndarray, density: Gather | None
 ) -> tuple[np.ndarray | None, str | None]:
     """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
     if wanted == AUTO:

@@ -52,6 +52,9 @@ class Snapshot:
         if missing:
             raise DataError(f"{path}: is one of {len(self.files)} files of a snapshot; beside it {missing[0]} cannot be found")
 
+    def __len__(self) -> int:
+        return sum(end - begin for _, begin, end in self.runs())
+
     @property
     def identity(self) -> tuple[tuple[str, int, int], ...]:
         """Names, sizes in bytes and times of change of the files."""
