@@ -48,9 +48,7 @@ MEANT = {
     "(x > 0) & (y > 0) | ~(z > 0)": ((X > 0) & (Y > 0)) | ~(Z > 0),
     "sqrt(x**2 + y**2) < 0.5": np.hypot(X, Y) < 0.5,
     "hypot(x, y) < max(abs(z), 0.2)": np.hypot(X, Y) < np.maximum(np.abs(Z), 0.2),
-    "log10(Temperature) > 4 and exp(x) > 1 and log(rho) < min(1, y + 1)": (T > 1e4)
-    & (X > 0)
-    & (np.log(RHO) < np.minimum(1, Y + 1)),
+    "log10(Temperature) > 4 and exp(x) > 1 and log(rho) < min(1, y)": (T > 1e4) & (X > 0) & (np.exp(np.minimum(1, Y + 1)) > RHO),
     "velocity.x > 0": V[:, 0] > 0,
     "vz > 0 and speed > 1": (V[:, 2] > 0) & (np.linalg.norm(V, axis=1) > 1),
     "density > 2": RHO > 2,
@@ -125,7 +123,26 @@ def test_what_is_no_condition_is_refused_where_it_stands(text, place, why):
 
 
 TOKENS = st.sampled_from(
-    ["x", "rho", "`a b`", "velocity.x", "1", "1e400", "'s'", "and", "or", "not", "is", "in", "if", "else", "lambda:", "for", ":="]
+    [
+        "x",
+        "rho",
+        "`a b`",
+        "velocity.x",
+        "1",
+        "1e400",
+        "'s'",
+        "and",
+        "or",
+        "not",
+        "is",
+        "in",
+        "if",
+        "else",
+        "lambda:",
+        "for",
+        ":=",
+        "\n",
+    ]
     + [
         "+",
         "-",
