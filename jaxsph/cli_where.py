@@ -80,10 +80,12 @@ def settle(options: argparse.Namespace) -> None:
 
 def _numbers(given: list[str]) -> list[float]:
     try:
-        x, y, z = (float(value) for value in given)
+        numbers = [float(value) for value in given]
     except ValueError:
-        raise UsageError(f"--center must be X Y Z or {DENSEST}, got {' '.join(given)}") from None
-    return [x, y, z]
+        numbers = []
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise UsageError(f"--center must be X Y Z or {DENSEST}, got {' '.join(given)}")
+    return numbers
 
 
 class Selected(NamedTuple):
