@@ -54,7 +54,7 @@ def add_places(parser: argparse.ArgumentParser) -> None:
     add("--cut-box", nargs=6, metavar=corners, **clips, help="what is outside of it")
     add("--clip-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is inside of a sphere")
     add("--cut-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is outside of it")
-    more = "the quantity on a plane through (X, Y, Z), looked at along (NX, NY, NZ); OUT may be .npy, too"
+    more = "the quantity on a plane through (X, Y, Z), seen from where (NX, NY, NZ) points to; OUT may be .npy, too"
     add("--slice", nargs=6, type=float, metavar=(*vector, "NX", "NY", "NZ"), help=more)
 
 
@@ -80,10 +80,12 @@ def settle(options: argparse.Namespace) -> None:
 
 def _numbers(given: list[str]) -> list[float]:
     try:
-        x, y, z = (float(value) for value in given)
+        numbers = [float(value) for value in given]
     except ValueError:
-        raise UsageError(f"--center must be X Y Z or {DENSEST}, got {' '.join(given)}") from None
-    return [x, y, z]
+        numbers = []
+    if len(numbers) != 3 or not np.isfinite(numbers).all():
+        raise UsageError(f"--center must be X Y Z or {DENSEST}, got {' '.join(given)}")
+    return numbers
 
 
 class Selected(NamedTuple):

@@ -161,16 +161,17 @@ def wanted_small(placed: Placed) -> Bool[Array, " particles"]:
 
 def wanted_large(placed: Placed) -> Bool[Array, " particles"]:
     """Particles that are met by several rays a pixel."""
-    return placed.live & ~placed.small
+    return placed.live & placed.large
 
 
 WANTED: dict[int, Callable[[Placed], Array]] = {1: wanted_all, SHARES: wanted_small, SUBRAYS: wanted_large}
-placed_by = jax.jit(place)
+DOUBT = 2  # so that what is counted is never less than what a program finds that rounds in another way
+placed_by = jax.jit(functools.partial(place, doubt=DOUBT))
 
 
 @functools.partial(jax.jit, static_argnames="subrays")
 def _footprints(placed: Placed, camera: Camera, *, subrays: int) -> Ordered:
-    return footprints(placed, camera, WANTED[subrays](placed), beside(subrays))
+    return footprints(placed, camera, WANTED[subrays](placed), beside(subrays), DOUBT)
 
 
 def _larger(one: ListPlan | None, other: ListPlan | None) -> ListPlan | None:

@@ -2,7 +2,7 @@
 
 Flow: particles, plane -> orthographic camera of one sample -> render -> [slices] -> files, notebooks.
 
-A camera that looks along the plane's normal takes one sample a ray, on the plane. The transfer function is a straight line over
+A camera that looks against the plane's normal takes one sample a ray, on the plane. The transfer function is a straight line over
 the range of the quantity, and opaque, so that a pixel's red is the field itself; what rounding adds is an eps of that range.
 """
 
@@ -30,8 +30,7 @@ from jaxsph.render import render
 from jaxsph.version import __version__
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
-UPWARD = np.eye(3)[[1, 2]]  # directions that point upwards in the picture: the first that is not along the normal
-ALONG = 0.9  # cosine, from which a direction is
+ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Slice:
 
     Attributes:
         values: the quantity Q, float32 or float64; NaN outside of every support.
-        camera: orthographic, with its eye in the middle of the slice, looking along the plane's normal.
+        camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
         metadata: strings and numbers for the file header.
     """
 
@@ -96,10 +95,10 @@ def slice_of(
 
     Args:
         particles: whose quantity is shown; of a periodic set one period.
-        plane: a `jaxsph.Plane`, looked at along its normal.
+        plane: a `jaxsph.Plane`, seen from where its normal points to: of one along z, x is to the right and y upwards.
         within: where it is shown; default everywhere.
         center: (3,) what is in the middle, moved to the plane; default the middle of the particles.
-        up: (3,) direction that points upwards; default y, or z where the normal is along y.
+        up: (3,) direction that points upwards; default y, or z where the normal is along x or y.
         view_height: visible height, length units; default all of the particles.
         width, height: size in pixels.
 
@@ -109,18 +108,19 @@ def slice_of(
     if not isinstance(plane, Plane):
         raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
     normal = np.asarray(plane.normal, np.float64)
-    up = next(way for way in UPWARD if abs(way @ normal) < ALONG) if up is None else up
+    if up is None:
+        up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()
     middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
     require_shape("center", middle, (3,), "give x, y and z")
     foot = middle - ((middle - _point(plane)) @ normal) * normal
     if view_height is None:
-        axes = np.asarray(Camera.orthographic(foot, foot + normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
+        axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
         reach = np.abs(corners @ axes.T).max(0)
         view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
     deep = view_height / height
-    camera = Camera.orthographic(foot, foot + normal, up, view_height, width, height, near=-deep, far=deep)
+    camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
     said = ("jaxsph.slice", f"point={_point(plane).tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     return Slice(_field(particles, camera, within, deep), camera, metadata)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -119,6 +120,23 @@ def test_a_uniform_box_has_its_column_density_to_1e_4(kernel, spacings):
     np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=1e-4)
     part = js.project(particles, turned, plan=plan, depth_range=(4.6, 5.3)).values
     np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("spacings", "ends"), [(4.0, (1, 9)), (4.0, (4.25, 5.75))], ids=["pixels", "depths"])
+def test_a_plan_has_room_however_programs_round(spacings, ends, monkeypatch):
+    """Of a lattice, whole layers lie on borders of pixels and at the ends of depths: a plan without any slack still serves."""
+    monkeypatch.setattr(sys.modules["jaxsph.projection_plan"], "capacity_class", lambda count: count)
+    axis = (np.arange(12) - 6) / 8
+    position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    view = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=13 / 8, near=ends[0], far=ends[1], **SIZE)
+    particles = js.Particles.from_arrays(position, spacings / 8, 0.0, 1.0)
+    plan = js.plan_projection(particles, view)
+    eps, still = np.finfo(np.float32).eps, js.project(particles, view, plan=plan).values
+    for seed in range(3):
+        off = np.random.default_rng(seed).uniform(-3, 3, (2, len(position), 3)) * eps
+        moved = js.Particles.from_arrays(position + off[0], spacings / 8 * (1 + off[1][:, 0]), 0.0, 1.0)
+        image = js.project(moved, view, plan=plan)
+        np.testing.assert_allclose(image.values, still, rtol=1e-4, atol=1e-4)
 
 
 def test_small_points_seen_in_perspective_keep_their_mass():

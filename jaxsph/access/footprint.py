@@ -23,28 +23,32 @@ def pixel_ranges(
     live: Bool[Array, " particles"],
     camera: Camera,
     between: tuple[Float[Array, ""], Float[Array, ""]],
+    rounding: int = ROUNDING,
 ) -> tuple[Int[Array, " particles"], ...]:
     """First and last column, first and last row of pixels whose rays can meet each sphere `between` two depths.
 
     Where the whole sphere lies in front of the eye, the tangents of its silhouette in the (x, z) plane bound x / z exactly;
-    the box `[x - H, x + H] / [s_0, s_1]` bounds it always. The tighter is taken. Empty ranges have first > last.
+    the box `[x - H, x + H] / [s_0, s_1]` bounds it always. The tighter is taken. Empty ranges have first > last. With more
+    `rounding`, ranges hold all that others can be.
     """
     front = jnp.maximum(z - reach, between[0])
     back = jnp.minimum(z + reach, between[1])
-    left, right = _lateral(x, z, reach, (front, back), camera.is_perspective)
-    bottom, top = _lateral(y, z, reach, (front, back), camera.is_perspective)
+    left, right = _lateral(x, z, reach, (front, back), camera.is_perspective, rounding)
+    bottom, top = _lateral(y, z, reach, (front, back), camera.is_perspective, rounding)
     half_width = camera.half_height * (camera.width / camera.height)
-    columns = _pixels(0.5 * camera.width * (left / half_width + 1), 0.5 * camera.width * (right / half_width + 1), camera.width)
-    half_height = camera.half_height
-    rows = _pixels(0.5 * camera.height * (1 - top / half_height), 0.5 * camera.height * (1 - bottom / half_height), camera.height)
+    left, right = (0.5 * camera.width * (side / half_width + 1) for side in (left, right))
+    top, bottom = (0.5 * camera.height * (1 - side / camera.half_height) for side in (top, bottom))
+    columns, rows = _pixels(left, right, camera.width, rounding), _pixels(top, bottom, camera.height, rounding)
     last_column = jnp.where(live & (front <= back), columns[1], -1)
     return columns[0], last_column, rows[0], rows[1]
 
 
-def _lateral(x: Array, z: Array, reach: Array, between: tuple[Array, Array], perspective: bool) -> tuple[Array, Array]:
+def _lateral(
+    x: Array, z: Array, reach: Array, between: tuple[Array, Array], perspective: bool, rounding: int
+) -> tuple[Array, Array]:
     """Bounds of the ray coordinate (x / s, or x if orthographic) over the sphere `between` two depths."""
     front, back = between
-    eps = jnp.finfo(x.dtype).eps * ROUNDING
+    eps = jnp.finfo(x.dtype).eps * rounding
     low, high = x - reach, x + reach
     if not perspective:
         margin = eps * (jnp.abs(x) + reach)
@@ -60,9 +64,9 @@ def _lateral(x: Array, z: Array, reach: Array, between: tuple[Array, Array], per
     return low, high
 
 
-def _pixels(low: Array, high: Array, size: int) -> tuple[Array, Array]:
+def _pixels(low: Array, high: Array, size: int, rounding: int) -> tuple[Array, Array]:
     """Pixels whose centres lie in [low, high] (image-space units), clipped to the image."""
-    margin = jnp.finfo(low.dtype).eps * ROUNDING * size
+    margin = jnp.finfo(low.dtype).eps * rounding * size
     margin_low, margin_high = margin * (1 + jnp.abs(low) / size), margin * (1 + jnp.abs(high) / size)
     first = jnp.ceil(low - margin_low - 0.5)
     last = jnp.floor(high + margin_high - 0.5)

@@ -102,8 +102,9 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
     blurred = unresolved(view, distance, particles.support, camera, depths)
     word = faults.raised(faults.BAD_PARTICLES, particles.valid & ~usable)
     word |= faults.raised(faults.UNRESOLVED, live & blurred) | faults.raised(faults.WEAK_PARTICLES, vanishes)
-    seen, still = {name: lax.stop_gradient(columns[name]) for name in "xyz"}, lax.stop_gradient(camera)
-    left, right, top, bottom = pixel_ranges(**seen, reach=reach, live=live, camera=still, between=(depths[0], depths[-1]))
+    x, y, z = (lax.stop_gradient(columns[name]) for name in "xyz")
+    still, between = lax.stop_gradient(camera), (depths[0], depths[-1])
+    left, right, top, bottom = pixel_ranges(x, y, z, reach, live, still, between)
     return Viewed(
         **columns,
         reach=reach,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import functools
 import re
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -60,6 +61,9 @@ COMPARISONS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
+
+HINTS = {"=": "compare by ==", "&": "write and", "|": "write or", "!": "write not"}
+"""What is meant where a condition breaks off at such a character."""
 
 
 class ConditionError(DataError):
@@ -128,12 +132,13 @@ class Condition:
         if not text.strip():
             raise ConditionError("a condition is empty; give one such as 'Temperature > 1e4', or leave it out")
         self.text, self._table, self._density = re.sub(r"\s", " ", text), table, density
-        self._quoted: dict[str, str] = {}
-        self._code = re.sub(r"`([^`]+)`", self._placeholder, self.text)
+        self._code = re.sub(r"`[^`]+`", lambda quoted: "_" * len(quoted[0]), self.text)  # a Python name that is as long
         try:
-            self._root = ast.parse(self._code.lstrip(), mode="eval").body
+            with warnings.catch_warnings(action="ignore"):  # of Python's, on what looks odd to it
+                self._root = ast.parse(self._code.lstrip(), mode="eval").body
         except SyntaxError as error:
-            raise self._error(error.msg, self._place_of(error)) from error
+            place = self._place_of(error)
+            raise self._error(HINTS.get(self.text[place : place + 1], error.msg), place) from error
         except (ValueError, RecursionError, MemoryError) as error:
             raise ConditionError(f"the condition {text!r} cannot be read: {error or type(error).__name__}") from error
 
@@ -166,12 +171,6 @@ class Condition:
     @property
     def _indent(self) -> int:
         return len(self._code) - len(self._code.lstrip())
-
-    def _placeholder(self, found: re.Match[str]) -> str:
-        """A Python name that is as long as what is quoted."""
-        name = f"_{len(self._quoted)}".ljust(len(found[0]), "_")
-        self._quoted[name] = found[1]
-        return name
 
     def _start(self, node: Any) -> int:
         return self._characters(node.col_offset) + self._indent
@@ -213,7 +212,7 @@ class Condition:
             raise self._error("the number is too large", self._start(node), node) from None
 
     def _column(self, node: ast.Name | ast.Attribute) -> np.ndarray:
-        name = self.source(node).strip("`")
+        name = self.source(node).replace("`", "")
         base: ast.expr = node
         while isinstance(base, ast.Attribute):
             base = base.value
@@ -237,8 +236,16 @@ class Condition:
     def _operated(self, node: ast.expr, operator: ast.AST, operands: list[ast.expr]) -> np.ndarray:
         for table, truth in ((LOGIC, True), (ARITHMETIC, False)):
             if type(operator) in table:
+                self._refuse_loose(operator, operands)
                 return np.asarray(table[type(operator)](*(self._of_kind(one, truth) for one in operands)))
         raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
+
+    def _refuse_loose(self, operator: ast.AST, operands: list[ast.expr]) -> None:
+        """`a > 1 & b < 2` is read as `a > (1 & b) < 2`."""
+        loose = [one for one in operands if isinstance(operator, ast.BitAnd | ast.BitOr) and self._value(one).dtype != bool]
+        if loose:
+            why = "& and | come before comparisons: put those in brackets, or write and, or"
+            raise self._error(why, self._start(loose[0]), loose[0])
 
     def _compared(self, node: ast.Compare) -> np.ndarray:
         if not all(type(operator) in COMPARISONS for operator in node.ops):

@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,6 +25,38 @@ def test_the_support_is_the_distance_to_the_kth_neighbour():
 def test_with_few_particles_the_support_scales_as_in_a_uniform_set():
     position = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     np.testing.assert_allclose(nearest_neighbour_supports(position, 16), np.array([3, 2, 3]) * 2.0)
+
+
+SIDES = (1.0, 1.3, 0.7)
+
+
+def replicated(position):
+    """All 27 copies, those in the box first."""
+    turns = sorted(itertools.product((-1, 0, 1), repeat=3), key=any)
+    return np.concatenate([position + np.array(SIDES) * turn for turn in turns])
+
+
+@given(st.integers(0, 2**31), st.integers(2, 60), st.integers(1, 40), st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_in_a_periodic_box_neighbours_are_found_as_among_explicit_copies(seed, count, neighbours, outside):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(0, 1, (count, 3)) * SIDES
+    neighbours = min(neighbours, count - 1)
+    apart = np.linalg.norm(position[:, None] - replicated(position).reshape(27, 1, count, 3), axis=-1).min(0)  # the nearest image
+    given_position = position + outside * rng.integers(-2, 3, (count, 3)) * SIDES  # any period may be in a file
+    found = nearest_neighbour_supports(given_position, neighbours, box=SIDES)
+    np.testing.assert_allclose(found, np.sort(apart, 1)[:, neighbours], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", list(kernels.KERNELS))
+def test_in_a_periodic_box_kernel_sums_are_those_among_explicit_copies(kernel):
+    rng = np.random.default_rng(4)
+    position, support, weight = rng.uniform(0, 1, (50, 3)) * SIDES, rng.uniform(0.05, 0.35, 50), rng.random(50)
+    truth = brute_force_sum(replicated(position), np.tile(support, 27), np.tile(weight, 27), kernel)[:50]
+    np.testing.assert_allclose(kernel_sum(position, support, weight, kernel=kernel, box=SIDES), truth, rtol=1e-12)
+    upon_faces = np.where(position < 0.1, 0.0, np.where(position > 0.6, SIDES, position))
+    truth = brute_force_sum(replicated(upon_faces % SIDES), np.tile(support, 27), np.tile(weight, 27), kernel)[:50]
+    np.testing.assert_allclose(kernel_sum(upon_faces, support, weight, kernel=kernel, box=SIDES), truth, rtol=1e-12)
 
 
 def test_one_particle_or_none_has_a_support_too():
