@@ -16,14 +16,14 @@ EVERY = 5.0
 """Seconds between two lines on what is done, where no bar is shown."""
 
 
-def written(rendered: Iterator[FrameFile], frames: int, folder: Path) -> tuple[list[Path], FramesError | None]:
-    """The files of all frames, and what is missing; on the way, said how far it is."""
+def written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: int = 1) -> tuple[list[Path], FramesError | None]:
+    """The files of all frames, of which so many are rendered at once, and what is missing; on the way, said how far it is."""
     files: list[Path] = []
     failed: FramesError | None = None
     made, started = 0, time.perf_counter()
     try:
         with progress("render", " frames") as show:
-            pace = _Pace(frames, show)
+            pace = _Pace(frames, at_once, show)
             for frame in _until_failure(rendered):
                 if isinstance(frame, FramesError):
                     failed = frame
@@ -53,18 +53,18 @@ def _until_failure(rendered: Iterator[FrameFile]) -> Iterator[FrameFile | Frames
 class _Pace:
     """How long a frame takes, and how long all others will."""
 
-    def __init__(self, frames: int, show: Callable[[int, int], None] | None) -> None:
-        self._frames, self._show = frames, show
-        self._since = self._last = time.perf_counter()  # the first that is rendered compiles programs, and is left out
+    def __init__(self, frames: int, at_once: int, show: Callable[[int, int], None] | None) -> None:
+        self._frames, self._at_once, self._show = frames, at_once, show
+        self._since = self._last = time.perf_counter()  # the first of each process compiles programs, and is left out
 
     def tell(self, done: int, made: int) -> None:
         """Tell a bar, or say it every few seconds."""
         now = time.perf_counter()
-        self._since = now if made <= 1 else self._since
+        self._since = now if made <= self._at_once else self._since
         if self._show is not None:
             self._show(done, self._frames)
-        elif made > 1 and (now - self._last > EVERY or done == self._frames):
-            self._last, each = now, (now - self._since) / (made - 1)
+        elif made > self._at_once and (now - self._last > EVERY or done == self._frames):
+            self._last, each = now, (now - self._since) / (made - self._at_once)
             say("frame", f"{done} of {self._frames}, {each:.2f} s each, {_clock(each * (self._frames - done))} left")
 
 

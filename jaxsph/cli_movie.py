@@ -84,7 +84,9 @@ def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, o
     say("camera", camera_line(cameras[0]))
     folder = output.with_name(f"{output.stem}_frames")
     pattern = folder / f"{{:05d}}.{options.frame_format}"
-    files, failed = cli_frames.written(render_frames(sources, cameras, settings, client, output=pattern), frames, folder)
+    at_once = 1 if client is None else max(len(client.nthreads()), 1)
+    rendered = render_frames(sources, cameras, settings, client, output=pattern)
+    files, failed = cli_frames.written(rendered, frames, folder, at_once)
     if files:
         io.write_movie(output, files, options.fps)
         _say_movie(output, len(files), frames, options.fps, cameras[0])
