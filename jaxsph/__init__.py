@@ -6,7 +6,8 @@ from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
-from jaxsph.frames import FrameFile, render_frames
+from jaxsph.frame_task import FrameFile, FramesError
+from jaxsph.frames import render_frames
 from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.clips import Box, Plane, Sphere
@@ -36,6 +37,7 @@ __all__ = [
     "CapacityError",
     "Coarsened",
     "FrameFile",
+    "FramesError",
     "Image",
     "IsoSurface",
     "Met",

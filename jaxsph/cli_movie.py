@@ -8,31 +8,29 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph import cli_transfer, io, scenes
+from jaxsph import cli_cluster, cli_frames, cli_transfer, io, scenes
 from jaxsph.cli_points import Together
 from jaxsph.console import UsageError, camera_line, progress, say, span
-from jaxsph.frames import FrameFile, Source, Still, render_frames
+from jaxsph.frame_task import FramesError, Source, Still
+from jaxsph.frames import render_frames
 from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera import Bounded
 from jaxsph.model.camera_path import middle
 from jaxsph.snapshots import Snapshots
-from jaxsph.survey import Reading, Survey, surveyed
+from jaxsph.survey import Reading, Survey, UnreadFile, surveyed
 
 MORE = "Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped."
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
-EVERY = 5.0
-"""Seconds between two lines on what is done, where no bar is shown."""
 
 OneScene = Callable[[argparse.Namespace], tuple[Scene, Camera]]
 
@@ -51,18 +49,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=int, metavar="N", help="(default: as long as KEYS; else 10 s, or one a snapshot if those are more)")
     add("--frame-format", choices=("png", "exr"), default="png", help="of the frames (default png)")
     add("--gaps", action="store_true", help="go on where numbers are missing in the names of a sequence")
+    add(
+        "--strict",
+        action="store_true",
+        help="end where a file cannot be read (default: render the others)",
+    )
+    cli_cluster.add_options(parser)
 
 
 def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) -> None:
     """Say what is shown, render the frames that are not there, and write the movie."""
     output = _checked(options)
+    cli_cluster.check(options)
     io.movie.encoder()
     _choose_size(options)
+    with cli_cluster.client_of(options) as client:
+        _run(options, settings, one_scene, output, client)
+
+
+def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, output: Path, client: Any) -> None:
     if len(options.source) > 1:
         snapshots = _sequence(options)
         shown: Bounded = snapshots
         camera = _framed(shown, options)
-        number = len(snapshots.times)
+        number = len(snapshots.times) + len(snapshots.survey.unread)
     else:
         options.source = options.source[0]
         scene, camera = one_scene(options)
@@ -74,11 +84,28 @@ def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) ->
     say("camera", camera_line(cameras[0]))
     folder = output.with_name(f"{output.stem}_frames")
     pattern = folder / f"{{:05d}}.{options.frame_format}"
-    files = _render(render_frames(sources, cameras, settings, output=pattern), frames, folder)
-    io.write_movie(output, files, options.fps)
-    padded = " and a row or column to make both even" if cameras[0].width % 2 or cameras[0].height % 2 else ""
-    size = f"{cameras[0].width} x {cameras[0].height}{padded}"
-    say("movie", f"{output}, {frames} frames, {frames / options.fps:.4g} s at {options.fps:g} a second, {size}")
+    at_once = 1 if client is None else max(len(client.nthreads()), 1)
+    rendered = render_frames(sources, cameras, settings, client, output=pattern)
+    files, failed = cli_frames.written(rendered, frames, folder, at_once)
+    if files:
+        io.write_movie(output, files, options.fps)
+        _say_movie(output, len(files), frames, options.fps, cameras[0])
+    _require_all(failed, () if snapshots is None else snapshots.survey.unread)
+
+
+def _say_movie(output: Path, files: int, frames: int, fps: float, camera: Camera) -> None:
+    padded = " and a row or column to make both even" if camera.width % 2 or camera.height % 2 else ""
+    size = f"{camera.width} x {camera.height}{padded}"
+    count = f"{frames} frames" if files == frames else f"{files} of {frames} frames"
+    say("movie", f"{output}, {count}, {files / fps:.4g} s at {fps:g} a second, {size}")
+
+
+def _require_all(failed: FramesError | None, unread: Sequence[UnreadFile]) -> None:
+    """Raise what is missing in a movie, once it is written without."""
+    if failed is not None:
+        raise failed
+    if unread:
+        raise ValueError(f"{len(unread)} of the snapshots cannot be read: {'; '.join(file.why for file in unread)}")
 
 
 def _checked(options: argparse.Namespace) -> Path:
@@ -135,7 +162,7 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
 
 def _surveyed(options: argparse.Namespace, reading: Reading, show: Callable[[int, int], None] | None) -> Survey:
     try:
-        return surveyed(options.source, reading, gaps=options.gaps, progress=show)
+        return surveyed(options.source, reading, gaps=options.gaps, strict=options.strict, progress=show)
     except ValueError as error:
         if "missing" in str(error) and not options.gaps:
             raise ValueError(f"{error}; --gaps goes on without") from error
@@ -147,6 +174,8 @@ def _say_survey(survey: Survey) -> None:
     counts = span([file.num_particles for file in files])
     say("sequence", f"{len(files)} snapshots, {files[0].path} to {files[-1].path}, {counts} particles each")
     say("times", f"{span(times)}, {survey.order.told}")
+    for unread in survey.unread:
+        say("unread", f"{unread.why}; frames that need it are left out")
     for sentence in survey.told():
         say("between", sentence)
     say("support", survey.report.support)
@@ -253,33 +282,3 @@ def _all_round(camera: Camera, shown: Bounded, up: Any) -> Camera:
 def _moments(snapshots: Snapshots, frames: int) -> Sequence[Source]:
     """Evenly in time from the first snapshot to the last."""
     return snapshots.moments(np.linspace(snapshots.times[0], snapshots.times[-1], frames).tolist())
-
-
-def _render(rendered: Iterator[FrameFile], frames: int, folder: Path) -> list[Path]:
-    """The files of all frames; on the way, said how far it is."""
-    files: list[Path] = []
-    made, started = 0, time.perf_counter()
-    since = last = started  # the end of the first that was rendered, for which programs are compiled
-    try:
-        with progress("render", " frames") as show:
-            for frame in rendered:
-                files.append(frame.path)
-                made, now = made + frame.rendered, time.perf_counter()
-                since = now if made <= 1 else since
-                if show is not None:
-                    show(len(files), frames)
-                elif made > 1 and (now - last > EVERY or len(files) == frames):
-                    last, each = now, (now - since) / (made - 1)
-                    say("frame", f"{len(files)} of {frames}, {each:.2f} s each, {_clock(each * (frames - len(files)))} left")
-    except KeyboardInterrupt:
-        say("stopped", f"{len(files)} of {frames} frames are in {folder}; the same command goes on from there")
-        raise
-    there = "" if made == frames else f", {frames - made} of which were there already"
-    say("frames", f"{folder}, {frames} files{there}; {time.perf_counter() - started:.2f} s")
-    return files
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"

@@ -5,152 +5,38 @@ Flow: sources, cameras, settings -> [frames: FrameTask] -> plan -> render -> ima
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import hashlib
 import itertools
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, overload
 
-import jax
 import numpy as np
 
-from jaxsph import io
-from jaxsph.field.in_octree import reachable
+from jaxsph.frame_task import FrameFile, FramesError, FrameTask, GrowingPlan, Still, UnwritableError, rendered, unmade, written
 from jaxsph.model import Camera, CameraPath, Image, Scene, Settings
-from jaxsph.plan import Plan
-from jaxsph.planning import plan as make_plan
-from jaxsph.render import render
-from jaxsph.snapshots import Snapshots
-from jaxsph.version import __version__
+from jaxsph.snapshots import Snapshots, Unreadable
 
-Source = Scene | Callable[[], Scene]
-FINGERPRINT = "jaxsph.frame"
-"""Name of the metadata by which a frame that is there is told from one of other settings."""
-FIRST_HEADROOM, MORE_HEADROOM = 1.5, 3.0
-"""Room beyond need, of the first frame's plan and of those grown from it: where pairs grow tenfold there are three plans.
-
-Room costs no time that could be measured on CPUs (at 43,740 particles and 256 x 256 pixels, up to 25 times what was needed)."""
 AHEAD = 16
 """Cameras, evenly spread, that are measured with the first scene before anything is compiled: it takes milliseconds each."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FrameTask:
-    """All that one frame depends on; it can be done anywhere, and twice with the same result.
-
-    Attributes:
-        number: from 1 on.
-        source: a scene, or what gives one when it is called.
-        camera, settings: as for `jaxsph.render`.
-        output: `.png` or `.exr` to write; None makes an image.
-    """
-
-    number: int
-    source: Source
-    camera: Camera
-    settings: Settings
-    output: Path | None = None
-
-    def scene(self) -> Scene:
-        """The scene, read now if it is a file's."""
-        return self.source if isinstance(self.source, Scene) else self.source()
-
-    def fingerprint(self, scene: Scene | None = None) -> str:
-        """A digest of all that the picture depends on; of files, of their names, sizes and times of change."""
-        mark = getattr(self.source, "fingerprint", None) or digest_of(scene or self.scene())
-        settings = dataclasses.replace(self.settings, memory_limit=None)
-        parts = __version__, jax.config.read("jax_enable_x64"), settings, digest_of(self.camera), mark
-        return "f" + hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Still:
-    """One scene as the source of many frames, of which a digest is taken once."""
-
-    scene: Scene
-
-    def __call__(self) -> Scene:
-        """The scene."""
-        return self.scene
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """A digest of all of its arrays, and of what they are called."""
-        return digest_of(self.scene)
-
-
-def digest_of(tree: Any) -> str:
-    """A digest of a tree of arrays: structure, types, shapes and numbers."""
-    leaves, structure = jax.tree.flatten(tree)
-    digest = hashlib.sha256(repr(structure).encode())
-    for leaf in map(np.asarray, leaves):
-        digest.update(f"{leaf.dtype} {leaf.shape}".encode())
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()
-
-
-@dataclasses.dataclass(frozen=True)
-class FrameFile:
-    """A frame that is on disk.
-
-    Attributes:
-        number: from 1 on.
-        path: where.
-        rendered: False where it was there already.
-        stats: of its image; empty where it was there already.
-    """
-
-    number: int
-    path: Path
-    rendered: bool
-    stats: dict[str, Any]
-
-
-class GrowingPlan:
-    """One plan for all frames of a sequence, with the choices of the first frame and room for the largest so far.
-
-    Its first has room for the first scene from all of some cameras, `ahead`.
-    """
-
-    def __init__(self, ahead: Sequence[Camera] = ()) -> None:
-        self._plan: Plan | None = None
-        self._ahead = ahead
-
-    def fits(self, scene: Scene, camera: Camera, settings: Settings) -> Plan:
-        """The plan, grown if this frame asks for it."""
-        if self._plan is not None:
-            self._plan = make_plan(scene, camera, settings, like=self._plan, headroom=MORE_HEADROOM)
-            return self._plan
-        made = make_plan(scene, camera, settings, headroom=FIRST_HEADROOM)
-        for later in self._ahead:
-            made = make_plan(scene, later, settings, like=made, headroom=FIRST_HEADROOM)
-        self._plan = made
-        return made
-
-    @property
-    def is_made(self) -> bool:
-        """Whether there has been a frame."""
-        return self._plan is not None
-
-
 @overload
-def render_frames(sources: Any, cameras: Any, settings: Settings | None = None, client: None = None) -> Iterator[Image]: ...
+def render_frames(sources: Any, cameras: Any, settings: Settings | None = None, client: Any = None) -> Iterator[Image]: ...
 @overload
 def render_frames(
-    sources: Any, cameras: Any, settings: Settings | None = None, client: None = None, *, output: str | os.PathLike[str]
+    sources: Any, cameras: Any, settings: Settings | None = None, client: Any = None, *, output: str | os.PathLike[str]
 ) -> Iterator[FrameFile]: ...
 def render_frames(
     sources: Any,
     cameras: Any,
     settings: Settings | None = None,
-    client: None = None,
+    client: Any = None,
     *,
     output: str | os.PathLike[str] | None = None,
 ) -> Iterator[Image] | Iterator[FrameFile]:
-    """Render a sequence of frames, one after the other, as they are asked for.
+    """Render a sequence of frames: one after the other, as they are asked for, or on the workers of a cluster.
 
     All frames share one plan, which grows by more than a frame needs where it has to: so a few are compiled for, and all others
     are not. An image is the same bits whichever frames were rendered before it.
@@ -161,21 +47,41 @@ def render_frames(
             more than one frame is held; or one source for all frames.
         cameras: one a frame, from any iterable (`CameraPath.cameras`); or one for all frames.
         settings: as for `jaxsph.render`, for all frames.
-        client: None. Frames are rendered in this process.
+        client: a `distributed.Client`, whose workers render the frames: each reads what it renders, and writes it to `output`;
+            without `output` images come back. Frames come in order, two a worker are on the way; they are the same bits as
+            without a client. A worker that dies is replaced by its cluster, and its frames are tried again. None renders here.
         output: where to write frames instead: a folder, or a pattern such as `"frames/{:05d}.exr"` for numbers from 1 on.
             A frame whose file is there, of the same source, camera, settings and version, is not rendered again. Files are
             written whole or not at all.
 
     Yields:
-        Images; or with `output` what was written, as `FrameFile`.
+        Images; or with `output` what was written, as `FrameFile`: one with an `error` where a frame could not be made, as its
+        file is damaged. All others are made nevertheless.
 
     Raises:
-        ValueError: another `client`; more sources than cameras or the other way round; as `jaxsph.render`.
+        FramesError: with `output`, at the end: frames that could not be made. Without, an image that cannot be made raises when
+            it is its turn.
+        ValueError: another `client`; more sources than cameras or the other way round; a place that cannot be written to; as
+            `jaxsph.render`.
     """
+    _require_client(client)
+    tasks = _tasks(sources, cameras, settings or Settings(), _pattern(output))
+    ahead = _some(cameras)
     if client is not None:
-        raise ValueError(f"`client` must be None, got {type(client).__name__}; frames are rendered in this process")
-    tasks, plan = _tasks(sources, cameras, settings or Settings(), _pattern(output)), GrowingPlan(_some(cameras))
-    return _images(tasks, plan) if output is None else _files(tasks, plan)
+        from jaxsph.frames_on_cluster import files_on, images_on
+
+        return images_on(client, tasks, ahead) if output is None else files_on(client, tasks, ahead)
+    return _images(tasks, GrowingPlan(ahead)) if output is None else _files(tasks, GrowingPlan(ahead))
+
+
+def _require_client(client: Any) -> None:
+    """Dask's synchronous client, known without importing it: who has one has imported it."""
+    library = sys.modules.get("distributed")
+    if client is None or (library is not None and isinstance(client, library.Client) and not client.asynchronous):
+        return
+    raise ValueError(
+        f"`client` must be a `distributed.Client` that is not asynchronous, or None to render here, got {type(client).__name__}"
+    )
 
 
 def _some(cameras: Any) -> Sequence[Camera]:
@@ -191,39 +97,21 @@ def _images(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[Image]:
 
 
 def _files(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[FrameFile]:
-    """Write what is not there yet. The first frame is planned for, whether it is there or not: its choices are all frames'."""
-    first = None
+    """Write what is not there yet; what cannot be made is told of, and raised at the end."""
+    first, failed, last = None, [], 0
     for task in tasks:
-        first = first or task
-        scene = None if hasattr(task.source, "fingerprint") else task.scene()
-        mark = task.fingerprint(scene)
-        assert task.output is not None
-        if fingerprint_of(task.output) == mark:
-            yield FrameFile(task.number, task.output, False, {})
-            continue
-        if not plan.is_made and task is not first:
-            plan.fits(reachable(first.scene(), first.settings), first.camera, first.settings)
-        image = rendered(task, task.scene() if scene is None else scene, plan)
-        marked = dataclasses.replace(image, metadata=(*image.metadata, (FINGERPRINT, mark)))
-        task.output.parent.mkdir(parents=True, exist_ok=True)
-        marked.save(task.output)
-        yield FrameFile(task.number, task.output, True, image.stats)
-
-
-def rendered(task: FrameTask, scene: Scene, plan: GrowingPlan) -> Image:
-    """The image of a task."""
-    scene = reachable(scene, task.settings)
-    return render(scene, task.camera, task.settings, plan=plan.fits(scene, task.camera, task.settings))
-
-
-def fingerprint_of(path: Path) -> str | None:
-    """What a frame's file says that it was made of; None where there is none, or none that can be read to its end."""
-    if not path.exists():
-        return None
-    try:
-        return str(dict(io.read_image(path).metadata).get(FINGERPRINT))
-    except (ValueError, OSError):
-        return None
+        first, last = first or task, task.number
+        try:
+            frame = written(task, plan, first)
+        except UnwritableError:
+            raise
+        except Exception as error:
+            frame = unmade(task, error)
+            failed.append(frame)
+            first = None if first is task else first
+        yield frame
+    if failed:
+        raise FramesError(failed, last)
 
 
 def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int], Path] | None) -> Iterator[FrameTask]:
@@ -234,7 +122,7 @@ def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int
             raise ValueError(
                 f"`{name}` must be one of them for all frames or an iterable of one a frame, got {type(value).__name__}"
             )
-    sources = Still(sources) if isinstance(sources, Scene) else _read(sources)
+    sources = Still(sources) if isinstance(sources, Scene) else _read(sources, strict=output is None)
     one_source, one_camera = _is_one(sources), isinstance(cameras, Camera)
     if not one_source and not one_camera:
         _require_as_many(sources, cameras)
@@ -254,21 +142,28 @@ def _numbered(
         if source is ended or camera is ended:
             more, fewer = ("sources", "cameras") if camera is ended else ("cameras", "sources")
             raise ValueError(f"there are more `{more}` than the {number - 1} `{fewer}`, all of which were rendered")
-        yield FrameTask(number, _read(source), camera, settings, None if output is None else output(number))
+        yield FrameTask(number, _source(source), camera, settings, None if output is None else output(number))
 
 
 def _is_one(value: Any) -> bool:
     return isinstance(value, Scene | Camera | str | os.PathLike) or callable(value)
 
 
-def _read(sources: Any) -> Any:
+def _source(source: Any) -> Any:
+    """The source of one frame; of a file that cannot be read, what says so when it is its turn."""
+    try:
+        return _read(source, strict=True)
+    except (ValueError, OSError) as error:
+        return Unreadable(str(error))
+
+
+def _read(sources: Any, *, strict: bool) -> Any:
     """Files as moments of the sequence that they are; what else there is as it is."""
     paths = [sources] if isinstance(sources, str | os.PathLike) else sources
     if not isinstance(paths, list | tuple) or not paths or not all(isinstance(path, str | os.PathLike) for path in paths):
         return sources
-    snapshots = Snapshots.from_files(paths)
-    moments = snapshots.moments(snapshots.times)
-    return moments[0] if paths is not sources else moments
+    each = Snapshots.from_files(paths, strict=strict).each()
+    return each[0] if paths is not sources else each
 
 
 def _require_as_many(sources: Any, cameras: Any) -> None:

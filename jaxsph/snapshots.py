@@ -68,6 +68,7 @@ class Snapshots:
         transfer: TransferFunction | None = None,
         colormap: str = "viridis",
         gaps: bool = False,
+        strict: bool = True,
         progress: Callable[[int, int], None] | None = None,
     ) -> Snapshots:
         """Read all files once, for their times and the range of the quantity over all of them.
@@ -80,13 +81,15 @@ class Snapshots:
                 that suits the file in the middle.
             colormap: name of a colour map.
             gaps: whether numbers may be missing in the names of the files.
+            strict: whether files that cannot be read are refused. Else the sequence is that of all others, and times between
+                the two beside such a file have no scene.
             progress: called as `progress(done, total)` after every file.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: files that cannot be read, each by name; two of one time; a number that is missing.
+            ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        survey = surveyed(paths, Reading(quantity, support, kernel, part_type), gaps=gaps, progress=progress)
+        survey = surveyed(paths, Reading(quantity, support, kernel, part_type), gaps=gaps, strict=strict, progress=progress)
         if transfer is None:
             transfer = scenes.default_transfer(survey.middle, colormap, survey.span)
         return cls(survey, transfer)
@@ -115,6 +118,13 @@ class Snapshots:
         """Sources of frames at such times, each read when it is its turn."""
         return [Moment(self, float(time)) for time in times]
 
+    def each(self) -> list[Moment | Unreadable]:
+        """One source a file, in the order of time; of files that cannot be read, too."""
+        sources: list[Moment | Unreadable] = [*self.moments(self.times)]
+        for unread in reversed(self.survey.unread):
+            sources.insert(unread.before + 1, Unreadable(unread.why))
+        return sources
+
     def place(self, time: float) -> tuple[int, float]:
         """Which snapshot is before a time, and the share of the way to the next, in [0, 1)."""
         times = self.times
@@ -124,7 +134,14 @@ class Snapshots:
         if before == len(times) - 1:
             return before, 0.0
         share = (time - times[before]) / (times[before + 1] - times[before])
-        return (before + 1, 0.0) if share > 1 - ROUNDING else (before, share if share > ROUNDING else 0.0)
+        if share > 1 - ROUNDING:
+            return before + 1, 0.0
+        if share <= ROUNDING:
+            return before, 0.0
+        unread = [file.why for file in self.survey.unread if file.before == before]
+        if unread:
+            raise ValueError(f"there is no scene between times {times[before]:g} and {times[before + 1]:g}: {'; '.join(unread)}")
+        return before, share
 
     def fingerprint(self, time: float) -> str:
         """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
@@ -193,8 +210,25 @@ class Snapshots:
         return capacity_class(max(file.num_particles for file in self.survey.files))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what was read, so that a source can be sent to where its frame is rendered."""
-        return {**self.__dict__, "_loaded": {}, "_ways": {}}
+        """Without what was read, so that a source can be sent to where its frame is rendered, which may be in another folder."""
+        files = tuple(dataclasses.replace(file, path=file.path.absolute()) for file in self.survey.files)
+        survey = dataclasses.replace(self.survey, files=files)
+        return {**self.__dict__, "survey": survey, "_loaded": {}, "_ways": {}}
+
+
+@dataclasses.dataclass(frozen=True)
+class Unreadable:
+    """A file that cannot be read, as the source of a frame that cannot be made."""
+
+    why: str
+
+    def __call__(self) -> Scene:
+        """There is none.
+
+        Raises:
+            ValueError: why.
+        """
+        raise ValueError(self.why)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -66,6 +66,21 @@ class SnapshotFile:
 
 
 @dataclasses.dataclass(frozen=True)
+class UnreadFile:
+    """A file of a sequence that cannot be read.
+
+    Attributes:
+        path: the file.
+        why: what is wrong with it, and its name.
+        before: which of the files that can be read is before it in the order of time; -1 where none is.
+    """
+
+    path: Path
+    why: str
+    before: int
+
+
+@dataclasses.dataclass(frozen=True)
 class Step:
     """From one file to the next.
 
@@ -100,6 +115,7 @@ class Survey:
         box: edges of the periodic box that all files have, or None.
         wide: whether positions are float64 in any file.
         steps: from each file to the next, as they were read; none where times have another order than names.
+        unread: files that cannot be read, by their names in the sequence, as they do not say when they are.
     """
 
     files: tuple[SnapshotFile, ...]
@@ -112,6 +128,7 @@ class Survey:
     box: tuple[float, float, float] | None
     wide: bool
     steps: tuple[Step, ...]
+    unread: tuple[UnreadFile, ...] = ()
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around all particles of all files."""
@@ -144,6 +161,7 @@ def surveyed(
     reading: Reading,
     *,
     gaps: bool = False,
+    strict: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Survey:
     """Read all files once; see `Snapshots.from_files`."""
@@ -161,9 +179,10 @@ def surveyed(
         looking.look(path)
         if progress is not None:
             progress(number, len(named))
-    looking.refuse_unread(len(named))
-    order = in_order(named, [file.time for file in looking.files])
-    as_read = order.indices == tuple(range(len(named)))
+    if strict:
+        looking.refuse_unread(len(named))
+    order = in_order([file.path for file in looking.files], [file.time for file in looking.files])
+    as_read = order.indices == tuple(range(len(looking.files)))
     return Survey(
         files=tuple(looking.files[place] for place in order.indices),
         order=order,
@@ -175,6 +194,7 @@ def surveyed(
         box=looking.boxes[0] if len(set(looking.boxes)) == 1 else None,
         wide=looking.wide,
         steps=tuple(looking.steps) if as_read else (),
+        unread=tuple(UnreadFile(path, why, order.indices.index(read - 1) if read else -1) for path, why, read in looking.unread),
     )
 
 
@@ -203,7 +223,7 @@ class _Looking:
     def __init__(self, reading: Reading, quantity: str, support: float) -> None:
         self._reading, self._quantity, self._support = reading, quantity, support
         self._last: io.ParticleTable | None = None
-        self._unread: list[str] = []
+        self.unread: list[tuple[Path, str, int]] = []  # with the number of those that were read before it
         self.files: list[SnapshotFile] = []
         self.values: list[np.ndarray] = []
         self.boxes: list[Any] = []
@@ -211,12 +231,14 @@ class _Looking:
         self.wide = False
 
     def look(self, path: Path) -> None:
-        """Read a file; what cannot be read is kept for `refuse_unread`."""
+        """Read a file; what cannot be read is kept in `unread`."""
         try:
             table = self._reading.table(path)
             values = self._values(table)
         except (ValueError, OSError) as error:
-            self._unread.append(str(error) if str(path) in str(error) else f"{path}: {error}")
+            why = str(error) if str(path) in str(error) else f"{path}: {error}"
+            self.unread.append((path, why, len(self.files)))
+            self._last = None
             return
         reach = self._reach(table)
         position, known = table.position.astype(np.float64) if len(table) else np.zeros((1, 3)), path.stat()
@@ -232,10 +254,9 @@ class _Looking:
 
     def refuse_unread(self, number: int) -> None:
         """Raise `ValueError` that names every file that could not be read."""
-        if self._unread:
-            raise ValueError(
-                f"{len(self._unread)} of {number} snapshots cannot be read, so nothing is rendered: {'; '.join(self._unread)}"
-            )
+        if self.unread:
+            told = "; ".join(why for _, why, _ in self.unread)
+            raise ValueError(f"{len(self.unread)} of {number} snapshots cannot be read, so nothing is rendered: {told}")
 
     def _values(self, table: io.ParticleTable) -> np.ndarray:
         try:

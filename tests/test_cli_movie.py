@@ -1,6 +1,7 @@
 """The command `movie`: what it writes, that it goes on where it was stopped, and how it refuses."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph import cli
+from jaxsph import cli, cli_cluster
 
 TINY = ["--size", "24x16", "--samples", "16"]
 
@@ -125,6 +126,9 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, ca
         (["s_0.npz", "s_1.npz", "--progressive"], "--progressive"),
         (["s_0.npz", "s_1.npz", "--support", -1], "--support"),
         (["s_0.npz", "s_1.npz", "--iso", 1], "--iso"),
+        (["s_0.npz", "s_1.npz", "--workers", 0], "--workers must be at least 1"),
+        (["s_0.npz", "s_1.npz", "--workers", 2, "--client", "tcp://x:1"], "not allowed with"),
+        (["s_0.npz", "s_1.npz", "--client", "nonsense"], "no address of a scheduler"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
         ([], "required"),
     ],
@@ -142,9 +146,63 @@ def test_bad_files_are_told_in_one_line_before_anything_is_rendered(sequence, tm
     code, _, err = run(capsys, "s_0.npz", "s_2.npz", "s_3.npz", "s_4.npz", "--gaps", *TINY)
     assert code == 1 and "s_2.npz and s_3.npz are both of time 4" in err[0]
     (tmp_path / "s_3.npz").write_bytes((tmp_path / "s_2.npz").read_bytes()[:700])
-    code, _, err = run(capsys, "s_2.npz", "s_3.npz", "s_4.npz", *TINY)
+    code, _, err = run(capsys, "s_2.npz", "s_3.npz", "s_4.npz", "--strict", *TINY)
     assert code == 1 and len(err) == 1 and "1 of 3 snapshots cannot be read" in err[0] and "s_3.npz" in err[0]
     assert not list(tmp_path.glob("*_frames"))
+
+
+@pytest.mark.parametrize("where", [[], pytest.param(["--workers", 2], marks=pytest.mark.slow)], ids=["here", "workers"])
+def test_a_file_that_cannot_be_read_costs_its_frames_alone(sequence, tmp_path, capsys, where):
+    (tmp_path / "s_1.npz").write_bytes((tmp_path / "s_1.npz").read_bytes()[:700])
+    code, out, err = run(capsys, *sequence, "--frames", 5, "-o", "m.mp4", *TINY, *where)
+    assert code == 1 and len(err) == 1
+    assert (
+        "3 of 5 frames could not be made: frames 2 to 4: there is no scene between times 0 and 4" in err[0]
+        and "s_1.npz" in err[0]
+    )
+    assert "unread    s_1.npz" in out and "m.mp4, 2 of 5 frames" in out
+    assert sorted(path.name for path in (tmp_path / "m_frames").iterdir()) == ["00001.png", "00005.png"]
+    assert js.io.movie_info("m.mp4").frames == 2
+
+
+def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(sequence, tmp_path, capsys):
+    (tmp_path / "s_2.npz").write_bytes((tmp_path / "s_2.npz").read_bytes()[:700])
+    code, out, err = run(capsys, *sequence, "--frames", 2, "-o", "m.mp4", *TINY)
+    assert code == 1 and len(err) == 1 and "1 of the snapshots cannot be read: s_2.npz" in err[0]
+    assert "m.mp4, 2 frames" in out
+
+
+def test_a_scheduler_that_does_not_answer_is_told_of_before_files_are_read(sequence, capsys, monkeypatch):
+    monkeypatch.setattr(cli_cluster, "ANSWER", 0.3)
+    code, out, err = run(capsys, *sequence, "--client", "tcp://127.0.0.1:9", *TINY)
+    assert (code, out, len(err)) == (1, "", 1) and "no scheduler answers there within 0.3 s" in err[0]
+
+
+@pytest.mark.slow
+def test_an_interrupt_leaves_frames_and_no_processes(sequence, tmp_path):
+    command = [sys.executable, "-m", "jaxsph", "movie", *sequence, "--frames", "400", *TINY, "--workers", "2", "-o", "m.mp4"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    until = time.monotonic() + 300
+    while time.monotonic() < until and process.poll() is None and not (tmp_path / "m_frames" / "00003.png").exists():
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all of them
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.splitlines()[-1] == "jaxsph movie: interrupted", err
+    assert "stopped" in out and not (tmp_path / "m.mp4").exists()
+    assert not list((tmp_path / "m_frames").glob(".*"))
+    until = time.monotonic() + 30
+    while time.monotonic() < until and is_there(process.pid):
+        time.sleep(0.05)
+    assert not is_there(process.pid)
+
+
+def is_there(group):
+    """Whether any process of a group is."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 @pytest.mark.parametrize(

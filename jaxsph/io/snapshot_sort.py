@@ -2,8 +2,8 @@
 
 Flow: files -> [snapshot_sort: count cells, place rows] -> one file, with a table of its cells.
 
-Particles are moved to coarse cells of a box around all; in a cell they keep their order. Positions are read three times and all else
-once, run by run, and never more than a run is held. The cells are told as SWIFT tells them.
+Particles are moved to coarse cells of a box around all; in a cell they keep their order. Positions are read three times and all
+else once, run by run, and never more than a run is held. The cells are told as SWIFT tells them.
 """
 
 from __future__ import annotations
