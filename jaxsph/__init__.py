@@ -3,6 +3,7 @@
 from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
+from jaxsph.depth_slabs import DepthSlabs, render_slabs
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
@@ -33,6 +34,7 @@ __all__ = [
     "CameraPath",
     "CapacityError",
     "Coarsened",
+    "DepthSlabs",
     "FrameFile",
     "Image",
     "IsoSurface",
@@ -71,6 +73,7 @@ __all__ = [
     "reference",
     "render",
     "render_frames",
+    "render_slabs",
     "resample",
     "scenes",
     "slice_of",

@@ -21,6 +21,7 @@ import jaxsph
 from jaxsph import (
     cli_annotate,
     cli_cache,
+    cli_devices,
     cli_movie,
     cli_options,
     cli_points,
@@ -122,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_control(render)
     cli_transfer.add_looks(render)
     cli_annotate.add_options(render)
+    cli_devices.add_options(render)
     transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
     cli_options.add_source(transfer)
     cli_options.add_picture(transfer)
@@ -165,7 +167,7 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _render_one(options: argparse.Namespace) -> None:
-    settings = _settings(options)
+    settings, devices = _settings(options), cli_devices.devices_of(options)
     cli_where.settle(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
@@ -185,7 +187,7 @@ def _render_one(options: argparse.Namespace) -> None:
         image = render_in_stages(scene, camera, settings, output)
     else:
         with progress("render") as show:
-            image = jaxsph.render(scene, camera, settings, progress=show)
+            image = jaxsph.render(scene, camera, settings, progress=show, devices=devices)
     elapsed = time.perf_counter() - started
     image = cli_where.labelled(image, options)
     if options.annotate:

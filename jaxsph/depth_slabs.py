@@ -38,7 +38,7 @@ from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.along_rays import first_samples
 from jaxsph.depth_dealing import Parts, dealt_particles
 from jaxsph.frame import Frame
-from jaxsph.in_trace import Drawn, apart, over, over_bands
+from jaxsph.in_trace import Drawn, apart, on_each, over, over_bands
 from jaxsph.layers import OfShards, assemble, blank_if, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -105,7 +105,8 @@ class DepthSlabs:
 
     def with_particles(self, particles: Particles) -> DepthSlabs:
         """With other values of the same particles as `of` was given, each with those who hold it; differentiable."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, particles=self.parts.of(particles)))
+        dealt = on_each(self.mesh, lambda particles, parts: parts.of(particles), particles, self.parts)
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, particles=dealt))
 
 
 def render_slabs(slabs: DepthSlabs, camera: Camera, settings: Settings | None = None) -> Image:

@@ -75,7 +75,12 @@ def drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan
 
 
 def over(mesh: Mesh, function: Callable[..., Any], shared: Any, parts: Any = ()) -> Any:
-    """`function(shared, part)` of each device side by side along the first axis, which all then hold.
+    """`function(shared, part)` of each device side by side along the first axis, which all then hold; see `on_each`."""
+    return placed_on(on_each(mesh, function, shared, parts), mesh, Spec())
+
+
+def on_each(mesh: Mesh, function: Callable[..., Any], shared: Any, parts: Any = ()) -> Any:
+    """`function(shared, part)` of each device side by side along the first axis, of which each holds its own.
 
     Args:
         shared: what all hold before. What of it is no array is no argument: numbers that are known while tracing remain so.
@@ -92,7 +97,7 @@ def over(mesh: Mesh, function: Callable[..., Any], shared: Any, parts: Any = ())
     each = Spec(mesh.axis_names)
     mapped = jax.shard_map(of_arrays, mesh=mesh, in_specs=(Spec(), each), out_specs=each, check_vma=False)
     shared = [jnp.copy(leaves[nth]) for nth in given]  # whose tangents may be NumPy's, which `shard_map` takes for constants
-    return placed_on(mapped(shared, placed_on(parts, mesh, each)), mesh, Spec())
+    return mapped(shared, placed_on(parts, mesh, each))
 
 
 def placed_on(tree: Any, mesh: Mesh, where: Spec) -> Any:
