@@ -13,7 +13,7 @@ import jaxsph as js
 
 def made(**given):
     scene, camera = js.scenes.load("checker_board", 2000, width=72, height=64)
-    settings = js.Settings(samples=48, **given)
+    settings = js.Settings(samples=64, **given)
     return scene, camera, settings, js.plan(scene, camera, settings)
 
 def looked(scene, camera, settings, plan, **given):
