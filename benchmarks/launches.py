@@ -28,7 +28,7 @@ import workloads
 import jaxsph as js
 from jaxsph.frame import Frame
 from jaxsph.layers import develop
-from jaxsph.numerics.executors import HostStage
+from jaxsph.numerics.executors import AllShards, HostStage
 from jaxsph.numerics.tuning import ACCELERATOR, CPU, Tuning
 from jaxsph.planning import see
 from jaxsph.provenance import of_this_run
@@ -40,7 +40,7 @@ HOLDS = re.compile(r"(while|cond|conditional|call)\b")
 RESULTS = pathlib.Path(__file__).with_name("results") / "launches.json"
 
 
-class Counted:
+class Counted(AllShards):
     """Runs stages as they are and counts what each executes, by name."""
 
     def __init__(self) -> None:

@@ -3,6 +3,7 @@
 from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
+from jaxsph.depth_slabs import DepthSlabs, render_slabs
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
@@ -36,6 +37,7 @@ __all__ = [
     "CameraPath",
     "CapacityError",
     "Coarsened",
+    "DepthSlabs",
     "FrameFile",
     "FramesError",
     "Image",
@@ -78,6 +80,7 @@ __all__ = [
     "render",
     "render_frames",
     "render_from_disk",
+    "render_slabs",
     "render_tile",
     "resample",
     "scenes",

@@ -21,6 +21,7 @@ import jaxsph
 from jaxsph import (
     cli_annotate,
     cli_cache,
+    cli_devices,
     cli_disk,
     cli_merge,
     cli_movie,
@@ -125,6 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_options.add_control(render)
     cli_transfer.add_looks(render)
     cli_annotate.add_options(render)
+    cli_devices.add_options(render)
     cli_merge.add_tile(render)
     cli_merge.add_options(command("merge", _merge, "make one image of its parts", cli_merge.MORE))
     transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
@@ -171,7 +173,7 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _render_one(options: argparse.Namespace) -> None:
-    settings = _settings(options)
+    settings, devices = _settings(options), cli_devices.devices_of(options)
     cli_where.settle(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
@@ -196,7 +198,7 @@ def _render_one(options: argparse.Namespace) -> None:
         image = render_in_stages(scene, camera, settings, output)
     else:
         with progress("render") as show:
-            image = cli_merge.render(scene, camera, settings, options, show)
+            image = cli_merge.render(scene, camera, settings, options, show, devices)
     elapsed = time.perf_counter() - started
     image = cli_where.labelled(image, options)
     if options.annotate:

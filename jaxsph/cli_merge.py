@@ -45,7 +45,7 @@ def check(options: argparse.Namespace, settings: Settings, output: Path) -> None
     """Refuse what a part cannot be asked for."""
     if options.tile is None:
         return
-    for name in ("progressive", "annotate", "slice"):
+    for name in ("progressive", "annotate", "slice", "devices"):
         if getattr(options, name, None):
             raise UsageError(f"--{name} and --tile exclude each other; --tile is a part of one picture, as it is")
     if settings.screen == "quadtree":
@@ -54,10 +54,12 @@ def check(options: argparse.Namespace, settings: Settings, output: Path) -> None
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
 
 
-def render(scene: Scene, camera: Camera, settings: Settings, options: argparse.Namespace, show: Progress | None) -> Image:
+def render(
+    scene: Scene, camera: Camera, settings: Settings, options: argparse.Namespace, show: Progress | None, devices: Any = None
+) -> Image:
     """The picture, or the part of it that is asked for."""
     if options.tile is None:
-        return render_whole(scene, camera, settings, progress=show)
+        return render_whole(scene, camera, settings, progress=show, devices=devices)
     image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
     first = dict(image.metadata)[tiles.FIRST_ROW]
     say("part", f"{'/'.join(map(str, options.tile))}, rows {first} to {first + image.shape[0] - 1} of {camera.height}")

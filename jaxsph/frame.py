@@ -32,6 +32,7 @@ from jaxsph.stages import (
     Cast,
     Decided,
     Limits,
+    SlabRange,
     add_lattices,
     cast_shard,
     decide_by_bounds,
@@ -69,7 +70,7 @@ class Frame:
     """What all bands of a frame have in common; `shards` of each are cast side by side.
 
     `limits` are what rays keep to, of which each may take a share of what is `allowed` where pixels are interpolated too.
-    Particles are shown `within` a clip, or everywhere.
+    Particles are shown `within` a clip, or everywhere; slabs are marched of a range that is `own`, or all.
     """
 
     ordered: Ordered
@@ -83,6 +84,7 @@ class Frame:
     allowed: Float[Array, ""] | None
     min_transmittance: Float[Array, ""] | None
     within: Clip | None = None
+    own: SlabRange | None = None
 
     @classmethod
     def begun(
@@ -116,25 +118,31 @@ class Frame:
         sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "beside": self._beside}
         sizes["tuning"] = plan.cast.tuning
         made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
-        return made
+        return made if self.own is None else made.among(self.own)
 
     def cast(
-        self, grid: Grid, decided: list[Decided], lattice: Lattice | None, run: Executor, camera: Camera | None = None
+        self,
+        grid: Grid,
+        decided: list[Decided],
+        lattice: Lattice | None,
+        run: Executor,
+        camera: Camera | None = None,
+        front: Float[Array, "packets rows columns"] | None = None,
     ) -> list[Cast]:
-        """What the rays of all packets of a grid meet, shard by shard."""
+        """What the rays of all packets of a grid meet, shard by shard; behind what lets so much through in `front` of it."""
         plan = self.plan
-        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * self.shards
+        each = self._each(run)
+        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
         scene = (grid, camera or self.camera, self.transfer, self.media)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         how = lattice, self.min_transmittance, tolerance
-        inputs = [(*scene, schedule, *how, nth, self.within) for schedule, nth in zip(schedules, self._each, strict=True)]
+        inputs = [(*scene, schedule, *how, nth, self.within, front) for schedule, nth in zip(schedules, each, strict=True)]
         method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays
 
-    @property
-    def _each(self) -> list[Int[Array, ""]]:
-        return [jnp.int32(nth) for nth in range(self.shards)]
+    def _each(self, run: Executor) -> list[Int[Array, ""]]:
+        return run.own([jnp.int32(nth) for nth in range(self.shards)])
 
     @property
     def _halo(self) -> int:
@@ -151,21 +159,21 @@ class Frame:
 
     def decide(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice | None]:
         """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
-        if self.limits is None or self.plan.control is None:
-            return self.leave(grid, run, with_levels=False), None
         if isinstance(self.plan.control, PilotPlan):
             return self._ask_pilot(grid, self.plan.control, run)
-        return self._bound(grid, run), None
+        controlled = self.limits is not None and self.plan.control is not None
+        decided = self._bound(grid, run) if controlled else self.leave(grid, run, with_levels=False)
+        return decided if self.own is None else [one.among(self.own) for one in decided], None
 
     def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
-        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth, self.within) for nth in self._each]
+        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth, self.within) for nth in self._each(run)]
         static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
         return run.each("adapt", decide_full_rate, inputs, **static)
 
     def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
         view = (grid, self.camera, self.transfer)
-        inputs = [(*view, nth) for nth in self._each]
+        inputs = [(*view, nth) for nth in self._each(run)]
         static = {
             "shards": self.shards,
             "lists": self.plan.lists,
@@ -173,7 +181,7 @@ class Frame:
             "kernel": self.formulas.kernel,
             **self._cast,
         }
-        lattices = run.each("adapt", sum_shard, inputs, **static)
+        lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
         several, tuning = self.shards > 1, self.plan.cast.tuning
         lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
@@ -181,12 +189,13 @@ class Frame:
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
         static = {"shards": self.shards, "control": self.plan.control, **self._cast}
-        probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in self._each], **static)
-        pays, wanted = run.one("adapt", wanted_cells, (tuple(probes),), tuning=self.plan.cast.tuning)
+        each = self._each(run)
+        probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in each], **static)
+        pays, wanted = run.one("adapt", wanted_cells, (tuple(run.pooled(probes)),), tuning=self.plan.cast.tuning)
         if not run.may_hold(pays):
             return self.leave(grid, run, with_levels=True)
         view = (grid, self.camera, self.transfer, self.limits)
-        inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(wanted, self._each, strict=True)]
+        inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
         return run.each("adapt", decide_by_bounds, inputs, **static)
 
 

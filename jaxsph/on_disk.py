@@ -39,7 +39,7 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.executors import Clock
 from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
-from jaxsph.render import Progress, drawn
+from jaxsph.render import Progress, image_of
 from jaxsph.tiles import joined, of_rows
 from jaxsph.viewing import Seen
 
@@ -337,7 +337,7 @@ class _Renderer:
             self.plan = roomy
         self.plan = self.plan.grown(made)
         clock.mark("plan")
-        return drawn(seen, self.camera, self.settings, self.plan, scene.formulas, clock, None, planned=True, first_row=first)
+        return image_of(seen, self.camera, self.settings, self.plan, scene.formulas, clock, None, planned=True, first_row=first)
 
     @functools.cached_property
     def _classes(self) -> int:

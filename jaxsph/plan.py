@@ -92,6 +92,13 @@ class Plan:
             self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
         )
 
+    def dealt(self, shards: int) -> Plan:
+        """With columns of tiles beyond the image such that a band's bundles can be dealt to so many shards."""
+        rows, columns = self.lists.tile_rows, self.lists.tile_columns
+        while 4 * rows * columns % shards:
+            columns += 1
+        return dataclasses.replace(self, lists=dataclasses.replace(self.lists, tile_columns=columns))
+
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
         self.check_image(camera, along_rays(scene, settings))

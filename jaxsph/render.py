@@ -12,17 +12,16 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Band, Frame
-from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
+from jaxsph.in_trace import drawn, drawn_over_mesh
+from jaxsph.layers import Layers, assemble, blank_if, develop
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.registry import ESTIMATING
@@ -30,9 +29,12 @@ from jaxsph.model.scene import Formulas, Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.device_executors import OnDevices
+from jaxsph.numerics.devices import chosen_devices, mesh_of
 from jaxsph.numerics.executors import Clock, Executor, Forecast, Traced
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.numerics.tuning import shards_at_hand
+from jaxsph.over_devices import draw_over_devices
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
@@ -54,6 +56,7 @@ def render(
     *,
     plan: Plan | None = None,
     progress: Progress | None = None,
+    devices: Any = None,
 ) -> Image:
     """Render a scene.
 
@@ -67,6 +70,9 @@ def render(
         settings: samples, memory limit; default `Settings()`.
         plan: capacities from `jaxsph.plan`, for this scene or a similar one; particles are padded to it.
         progress: eager only; called as `progress(done, total)` after every band.
+        devices: what the work is shared among: `"all"`, a number, a sequence of `jax.Device`, or a `jax.sharding.Mesh`. Eagerly
+            the image is the same bit for bit, whatever the devices; under a trace a mesh of any axes, automatic or explicit,
+            makes the same image to rounding, and each device holds all particles. None is where the particles are.
 
     Returns:
         Image with dtype of the particles.
@@ -79,7 +85,8 @@ def render(
         derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
-        ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace.
+        ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,
+            more devices than there are.
         CapacityError: eager, when a given `plan` is too small for this frame.
 
     Warns:
@@ -96,23 +103,25 @@ def render(
             )
         plan.check(scene, camera, settings)
         PROGRAMS.make_room()
-        return _render_traced(scene, camera, settings, plan)
-    return _render_eager(scene, camera, settings, plan, progress)
+        return _render_traced(scene, camera, settings, plan, devices)
+    return _render_eager(scene, camera, settings, plan, progress, devices)
 
 
-def _render_eager(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, progress: Progress | None) -> Image:
-    clock, planned = Clock(), plan is None
-    scene = reachable(scene, settings)
+def _render_eager(
+    scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, progress: Progress | None, devices: Any
+) -> Image:
+    clock = Clock() if devices is None else OnDevices(chosen_devices(devices))
+    planned, scene = plan is None, reachable(scene, settings)
     if plan is None:
         plan, seen = PLANS.for_frame(scene, camera, settings, clock)
     else:
         plan.check(scene, camera, settings)
         clock.mark("plan")
         seen = see(scene, camera, plan, clock)
-    return drawn(seen, camera, settings, plan, scene.formulas, clock, progress, planned=planned)
+    return image_of(seen, camera, settings, plan, scene.formulas, clock, progress, planned=planned)
 
 
-def drawn(
+def image_of(
     seen: Seen,
     camera: Camera,
     settings: Settings,
@@ -128,9 +137,12 @@ def drawn(
 
     `planned`: whether capacities were made for this very frame.
     """
-    draw = functools.partial(_draw, seen, camera, settings, plan, formulas, first_row)
-    clock.foresee(lambda known: draw(Forecast(known), None))
-    bands, layers = draw(clock, progress)
+    if isinstance(clock, OnDevices):
+        bands, layers = draw_over_devices(seen, camera, settings, plan, formulas, clock, progress)
+    else:
+        draw = functools.partial(_draw, seen, camera, settings, plan, formulas, first_row)
+        clock.foresee(lambda known: draw(Forecast(known), None))
+        bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
     raise_for(word, planned)
     image = with_ended_rays(assemble(layers, word), settings)
@@ -149,7 +161,7 @@ def drawn(
     if layers.rays is not None:
         stats["rays"] = int(layers.rays)
     clock.mark("image")
-    certified = _certifies(plan) and (plan.control is None or float(settings.relax) == 0)
+    certified = certifies(plan) and (plan.control is None or float(settings.relax) == 0)
     metadata = metadata_of(camera, settings, certified)
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats, metadata=metadata)
 
@@ -178,37 +190,28 @@ def _draw(
     )
 
 
-def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
-    run = Traced()
-    seen = see(scene, camera, plan, run)
-    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
+def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan, devices: Any) -> Image:
     if plan.quadtree is not None:
-        return _refined_traced(frame, seen, settings, run)
-
-    def one_band(band: Int[Array, ""]) -> Any:
-        found = frame.band(band * plan.band_height, run)
-        return of_band(found.of_shards, plan=plan), found.faults, (found.filled, found.pairs)
-
-    bands = jnp.arange(plan.bands, dtype=jnp.int32)
-    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
-        kept = jax.checkpoint_policies.save_only_these_names(KEPT)
-        results = lax.map(jax.checkpoint(one_band, prevent_cse=False, policy=kept), bands)
+        if devices is not None:
+            raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
+        return _refined_traced(scene, camera, settings, plan)
+    if devices is None:
+        found = drawn(scene, camera, settings, plan)
     else:
-        results = jax.tree.map(lambda leaf: leaf[None], one_band(bands[0]))
-    layers, words, counts = results
-    word = functools.reduce(lambda a, b: a | b, [words[i] for i in range(plan.bands)]) | seen.viewed.faults
-    layers = crop(layers, plan)
+        found = drawn_over_mesh(scene, camera, settings, plan, mesh_of(devices))
+    layers, word = found.layers, found.faults
     image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
     word = word | missed(image, settings)
-    filled, pairs = (count.sum() for count in counts)
     spent = image.evaluations.sum()
-    stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": filled, "pairs": pairs}
-    certified = _certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
+    stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": found.filled, "pairs": found.pairs}
+    certified = certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
 
 
-def _refined_traced(frame: Frame, seen: Seen, settings: Settings, run: Traced) -> Image:
-    bands, layers = refined(frame, run, None)
+def _refined_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
+    run = Traced()
+    seen = see(scene, camera, plan, run)
+    bands, layers = refined(Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run), run, None)
     word = functools.reduce(operator.or_, [band.faults for band in bands]) | seen.viewed.faults
     image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
     counts = {"cells": sum(band.filled for band in bands), "pairs": sum(band.pairs for band in bands)}
@@ -233,7 +236,7 @@ def missed(image: Image, settings: Settings) -> Int[Array, ""]:
     return faults.raised(faults.TOLERANCE_MISSED, above.any())
 
 
-def _certifies(plan: Plan) -> bool:
+def certifies(plan: Plan) -> bool:
     """Whether the error can be bounded at all."""
     return not isinstance(plan.control, PilotPlan) and plan.quadtree is None and not plan.cast.doublings
 

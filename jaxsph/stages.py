@@ -97,6 +97,18 @@ def least_transmittance(settings: Settings) -> Any:
     return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
 
 
+class SlabRange(NamedTuple):
+    """Numbers of slabs, from the first up to the one past the last."""
+
+    first: Int[Array, ""]
+    end: Int[Array, ""]
+
+    def holds(self, slabs: int) -> Bool[Array, " slabs"]:
+        """Which of so many slabs are in it."""
+        number = jnp.arange(slabs, dtype=jnp.int32)
+        return (number >= self.first) & (number < self.end)
+
+
 class BandGrid(NamedTuple):
     """What a `Grid` holds besides the particles, which are the same for all bands; and how much that is.
 
@@ -111,6 +123,12 @@ class BandGrid(NamedTuple):
     half_steps: Float[Array, " two_samples_and_one"]
     filled: Int[Array, ""]
     pairs: Int[Array, ""]
+
+    def among(self, own: SlabRange) -> BandGrid:
+        """With nothing in slabs that are not in a range."""
+        inside = own.holds(self.windows.count.shape[0])[:, None]
+        windows = jax.tree.map(lambda value: jnp.where(inside, value, 0), self.windows)
+        return self._replace(windows=windows, filled=(windows.count > 0).sum())
 
     def of(self, ordered: Ordered) -> Grid:
         """The grid of those particles."""
@@ -136,6 +154,11 @@ class Decided(NamedTuple):
 
     schedule: SlabSchedule
     verdict: Verdict
+
+    def among(self, own: SlabRange) -> Decided:
+        """With nothing marched in slabs that are not in a range."""
+        filled = self.schedule.filled & own.holds(self.schedule.filled.shape[0])[:, None]
+        return self._replace(schedule=dataclasses.replace(self.schedule, filled=filled))
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -356,6 +379,7 @@ def cast_shard(
     tolerance: Float[Array, ""] | None,
     nth: Int[Array, ""],
     within: Clip | None = None,
+    front: Float[Array, "packets rows columns"] | None = None,
     *,
     shards: int,
     cast_plan: CastPlan,
@@ -372,7 +396,7 @@ def cast_shard(
     made = registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within, front)
     spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
     if rays.refined is not None:

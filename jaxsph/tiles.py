@@ -30,7 +30,7 @@ from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.numerics.executors import Clock
 from jaxsph.plan import Plan, choose, fitted
 from jaxsph.planning import measured, see, shape_of_scene, stride_of
-from jaxsph.render import Progress, drawn
+from jaxsph.render import Progress, image_of
 from jaxsph.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
@@ -74,7 +74,7 @@ def render_tile(
     of_part = dataclasses.replace(shape, height=last - first)
     plan: Plan = fitted(of_rows(measures, *rows), of_part, along, choose(measures, along))
     clock.mark("plan")
-    image = drawn(seen, camera, settings, plan, scene.formulas, clock, progress, planned=True, first_row=first)
+    image = image_of(seen, camera, settings, plan, scene.formulas, clock, progress, planned=True, first_row=first)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

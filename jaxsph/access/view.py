@@ -21,6 +21,7 @@ from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.numerics import exponents, faults
+from jaxsph.numerics.across import greatest_of_all
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
 DEAD_CLASS = 255
@@ -132,11 +133,11 @@ def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
 
 def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
     """The class of each particle, by octaves below the largest reach, and the largest reach of each class."""
-    largest = jnp.where(live, reach, 0).max(initial=0)
+    largest = greatest_of_all(jnp.where(live, reach, 0).max(initial=0))
     octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
     octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
     each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
-    return octave, jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
+    return octave, greatest_of_all(jnp.where(live & (octave == each), reach, 0).max(1, initial=0))
 
 
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
@@ -149,9 +150,10 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
     mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
     counts = live & (large > 0)
-    exponent -= jnp.where(counts, exponent, jnp.iinfo(jnp.int32).min).max(initial=jnp.iinfo(jnp.int32).min // 2)
+    lowest = jnp.iinfo(jnp.int32).min
+    exponent -= greatest_of_all(jnp.where(counts, exponent, lowest).max(initial=lowest // 2))
     strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
-    peak = lax.stop_gradient(strength.max(initial=0))
+    peak = greatest_of_all(lax.stop_gradient(strength.max(initial=0)))
     strength = strength / jnp.where(peak > 0, peak, 1)
     kernel = kernels.by_name(particles.kernel)
     lift = 2.0 ** (LIFT // kernel.degree)

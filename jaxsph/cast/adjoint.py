@@ -89,6 +89,7 @@ class NonDiffInputs:
     chosen: Any
     min_transmittance: Float[Array, ""] | None
     tolerance: Float[Array, ""] | None
+    front: Float[Array, "packets rows columns"] | None
 
 
 def cast(
@@ -103,8 +104,11 @@ def cast(
     min_transmittance: Float[Array, ""] | None = None,
     tolerance: Float[Array, ""] | None = None,
     within: Clip | None = None,
+    front: Float[Array, "packets rows columns"] | None = None,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
+
+    Rays that have something in `front` of the march, which lets so much through, are met as they then are: no derivatives.
 
     Differentiation:
         Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
@@ -118,8 +122,10 @@ def cast(
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
-    fixed = jax.tree.map(lax.stop_gradient, NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance))
-    return _cast(method, inputs, fixed)
+    if front is not None:
+        inputs = jax.tree.map(lax.stop_gradient, inputs)
+    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance, front)
+    return _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -133,7 +139,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
         how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance, fixed.tolerance
-        return march(grid, fixed.schedule, packets, *how)
+        return march(grid, fixed.schedule, packets, *how, fixed.front)
 
 
 def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:

@@ -56,8 +56,28 @@ class Executor(Protocol):
         """In how many turns `number` of at most `most` things are done, if so many are done together; and how many then are."""
         ...
 
+    def own(self, of_shards: Sequence[Any]) -> list[Any]:
+        """Of what there is for every shard of a band, what this executor is to run."""
+        ...
 
-class Clock:
+    def pooled(self, of_shards: Sequence[Any]) -> list[Any]:
+        """What was found for every shard, given what was found for the own."""
+        ...
+
+
+class AllShards:
+    """Of executors that run every shard of a band."""
+
+    def own(self, of_shards: Sequence[Any]) -> list[Any]:
+        """All."""
+        return list(of_shards)
+
+    def pooled(self, of_shards: Sequence[Any]) -> list[Any]:
+        """What is given."""
+        return list(of_shards)
+
+
+class Clock(AllShards):
     """Runs compiled programs and tells the seconds of each stage, compile time apart."""
 
     def __init__(self, programs: Programs = PROGRAMS) -> None:
@@ -127,7 +147,7 @@ class Unforeseen(Exception):
     """What follows depends on a flag that is not known yet."""
 
 
-class Forecast:
+class Forecast(AllShards):
     """Has programs compiled side by side that a frame will need, without running any: results are shapes.
 
     Args:
@@ -163,7 +183,7 @@ class Forecast:
         return 1, together
 
 
-class Traced:
+class Traced(AllShards):
     """Calls the functions that are jitted, as part of a larger program.
 
     Not as jitted functions: JAX would keep what it traced of them for as long as they live, for every shape.
