@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ class SnapshotIndex:
         part_type: kind of particles.
         file, begin, end: of each run, number of its file and rows.
         lower, upper: of each run, corners of the box around the positions, float64.
+        outer_lower, outer_upper: the same around the supports.
         support, least: of each run, largest and smallest support.
         widest, strongest: of each run, the row in its file of the largest support, and of the largest V / H^3.
         strength: of each run, the largest V / H^3.
@@ -49,6 +51,8 @@ class SnapshotIndex:
     end: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    outer_lower: np.ndarray
+    outer_upper: np.ndarray
     support: np.ndarray
     least: np.ndarray
     widest: np.ndarray
@@ -63,11 +67,11 @@ class SnapshotIndex:
         """Corners of the box around all supports, as for `Camera.framing`; of nothing, zeros."""
         if not len(self.file):
             return np.zeros(3), np.zeros(3)
-        reach = self.support[:, None]
-        return (self.lower - reach).min(0), (self.upper + reach).max(0)
+        return self.outer_lower.min(0), self.outer_upper.max(0)
 
 
-ARRAYS = "file", "begin", "end", "lower", "upper", "support", "least", "widest", "strongest", "strength", "volume"
+CORNERS = "lower", "upper", "outer_lower", "outer_upper"
+ARRAYS = "file", "begin", "end", *CORNERS, "support", "least", "widest", "strongest", "strength", "volume"
 
 
 def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> SnapshotIndex:
@@ -111,7 +115,7 @@ def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
             if str(kept["identity"]) != str(_marked(snapshot)):
                 return None
             return SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[OF_RUNS + name] for name in ARRAYS})
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
@@ -132,7 +136,8 @@ def _known(table: ParticleTable, begin: int) -> tuple[Any, ...]:
     strength = _strength(support, volume)
     position = table.position.astype(np.float64)
     widest, strongest = int(support.argmax()), int(strength.argmax())
-    corners = position.min(0), position.max(0)
+    reach = support[:, None]
+    corners = position.min(0), position.max(0), (position - reach).min(0), (position + reach).max(0)
     return (
         *corners,
         support[widest],
