@@ -28,6 +28,8 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.columns import depth_share
 from jaxsph.model.held import Held, held_by
 from jaxsph.model.particles import Particles
+from jaxsph.model.periodic import with_sources, wrapped
+from jaxsph.model.periodic_views import between_faces
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
@@ -58,7 +60,8 @@ def project(
     For emission $A \rho^n$ see `emission`.
 
     Args:
-        particles: kernel and supports are theirs; nothing is normalised.
+        particles: kernel and supports are theirs; nothing is normalised. Of a periodic set, parallel rays along an axis of its
+            box meet what that holds, supports across its faces included; other cameras see each particle once, with all of it.
         camera: where from, how large the image is, and the depths that rays begin and end at.
         of: numbers of all particles in their order, or the name of a column of them, `"volume"` or `"quantity"`. Without
             weight: the amounts $a_j$, default the volumes (which then must be true ones, and give the path length inside). With
@@ -161,6 +164,7 @@ def _sums(
     with barriers(plan.tuning.fusion_barriers):
         dtype = jnp.promote_types(particles.dtype, camera.dtype)
         camera = jax.tree.map(lambda leaf: leaf.astype(dtype), camera)
+        particles, amounts, camera, pixels, crowded = _shown(particles, amounts, camera, plan)
         placed = place(particles, camera)
         amounts = jnp.where(placed.live[:, None], amounts, 0).astype(dtype)
         word = placed.faults | faults.raised(faults.BAD_PARTICLES, ~jnp.isfinite(amounts).all())
@@ -177,10 +181,29 @@ def _sums(
             table = jnp.where(wanted[:, None], made(placed, amounts, camera, particles.kernel), 0)
             rules.append(_Rule(method, lists, table, footprints(placed, camera, wanted, beside(subrays))))
         found, word_of_lists = _in_bands(rules, camera, plan, amounts.shape[1])
-        return found, word | word_of_lists | faults.raised(faults.LIST_OVERFLOW, missing)
+        found = found if pixels is None else found * pixels[..., None]
+        return found, word | crowded | word_of_lists | faults.raised(faults.LIST_OVERFLOW, missing)
 
 
 _sums_at_once = functools.partial(jax.jit, static_argnames="plan")(_sums)
+
+
+class _Shown(NamedTuple):
+    """Of a periodic set what its box holds, and what share of each pixel that is; else all there is."""
+
+    particles: Particles
+    amounts: Float[Array, "particles channels"]
+    camera: Camera
+    pixels: Float[Array, "height width"] | None
+    faults: Int[Array, ""]
+
+
+def _shown(particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan) -> _Shown:
+    if plan.images is None or particles.box is None:
+        return _Shown(wrapped(particles), amounts, camera, None, jnp.int32(faults.NONE))
+    camera, pixels = between_faces(camera, particles.box, plan.pixel)
+    particles, source, word = with_sources(particles, plan.images)
+    return _Shown(particles, amounts[source], camera, pixels, word)
 
 
 def _in_bands(rules: list[_Rule], camera: Camera, plan: ProjectionPlan, channels: int) -> tuple[Array, Array]:

@@ -20,6 +20,8 @@ from jaxsph.field.column_sums import BLOCK, subrays_of
 from jaxsph.measures import Measures, measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.periodic import num_ghosts, unfolded, wrapped
+from jaxsph.model.periodic_views import between_faces, sees_images
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.plan import MAX_CAPACITY
@@ -42,6 +44,7 @@ class ProjectionPlan:
         bands: horizontal bands that are projected one after the other.
         rays, shares: lists of the particles of either rule in one band; None where there is none.
         tuning: for the machine.
+        images: entries for images of a periodic set; None where each particle is taken once.
     """
 
     width: int
@@ -52,6 +55,7 @@ class ProjectionPlan:
     rays: ListPlan | None
     shares: ListPlan | None
     tuning: Tuning = CPU
+    images: int | None = None
 
     def __post_init__(self) -> None:
         if self.pixel not in PIXELS:
@@ -80,12 +84,19 @@ class ProjectionPlan:
 
     def grown(self, needed: ProjectionPlan) -> ProjectionPlan:
         """This plan where it has room for all that another was made for, else the other with at least the room of this."""
-        if dataclasses.replace(self, rays=None, shares=None) != dataclasses.replace(needed, rays=None, shares=None):
+        bare = [dataclasses.replace(one, rays=None, shares=None, images=one.images and 0) for one in (self, needed)]
+        if bare[0] != bare[1]:
             return needed
-        return dataclasses.replace(self, rays=_larger(self.rays, needed.rays), shares=_larger(self.shares, needed.shares))
+        room = None if self.images is None else max(self.images, needed.images or 0)
+        rays, shares = _larger(self.rays, needed.rays), _larger(self.shares, needed.shares)
+        return dataclasses.replace(self, rays=rays, shares=shares, images=room)
 
     def check(self, particles: Particles, camera: Camera, pixel: str) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given."""
+        if self.images is not None and particles.box is None:
+            raise ValueError(
+                "`plan` was made for particles with a periodic box, and these have none; make one with `jaxsph.plan_projection`"
+            )
         given = {
             "camera.width": (camera.width, self.width),
             "camera.height": (camera.height, self.height),
@@ -127,7 +138,15 @@ def plan_projection(
 def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> ProjectionPlan:
     """The plan with as few bands as the limit allows."""
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
-    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support))
+    images = None
+    if particles.box is not None and sees_images(particles, camera):
+        beyond = BESIDE_FACES * float(particles.box.sides.min())
+        images = capacity_class(num_ghosts(particles, beyond))
+    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support), images)
+    if images is not None:
+        camera, particles = _of_box(particles, camera, beyond, room=images, pixel=pixel)
+    else:
+        particles = wrapped(particles)
     placed = placed_by(particles, camera)
     counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in bare.rules]  # type: ignore[arg-type]
     while True:
@@ -165,8 +184,16 @@ def wanted_large(placed: Placed) -> Bool[Array, " particles"]:
 
 
 WANTED: dict[int, Callable[[Placed], Array]] = {1: wanted_all, SHARES: wanted_small, SUBRAYS: wanted_large}
+BESIDE_FACES = 1e-4  # of the shortest side of a period, that images may be away from it to be counted: rounding may take them in
 DOUBT = 2  # so that what is counted is never less than what a program finds that rounds in another way
 placed_by = jax.jit(functools.partial(place, doubt=DOUBT))
+
+
+@functools.partial(jax.jit, static_argnames=("room", "pixel"))
+def _of_box(particles: Particles, camera: Camera, beyond: float, *, room: int, pixel: str) -> tuple[Camera, Particles]:
+    """What of a periodic set is projected, and what might be."""
+    assert particles.box is not None
+    return between_faces(camera, particles.box, pixel)[0], unfolded(particles, room, beyond)[0]
 
 
 @functools.partial(jax.jit, static_argnames="subrays")
@@ -200,4 +227,5 @@ def _bytes(plan: ProjectionPlan) -> int:
     pairs = sum(one.tile_capacity * BYTES_OF_TILE_PAIR + one.list_capacity * BYTES_OF_PAIR for one in lists)
     subrays = max((n for n, one in plan.rules if one is not None), default=1)
     of_band = plan.band_height * plan.width * BYTES_OF_PIXEL * max(subrays, 1) ** 2
-    return plan.num_particles * BYTES_OF_PARTICLE + pairs + of_band + plan.width * plan.height * BYTES_OF_PIXEL
+    of_particles = (plan.num_particles + (plan.images or 0)) * BYTES_OF_PARTICLE
+    return of_particles + pairs + of_band + plan.width * plan.height * BYTES_OF_PIXEL

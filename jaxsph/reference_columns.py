@@ -33,7 +33,8 @@ def project(
     """Integrals along rays as `jaxsph.project` has them.
 
     Args:
-        particles, camera, of, weight, pixel, depth_range: as for `jaxsph.project`; their numbers are taken as exact.
+        particles, camera, of, weight, pixel, depth_range: as for `jaxsph.project`; their numbers are taken as exact. No period is
+            known: give copies, and the depths of the faces.
         subrays: of means, rays a pixel on each axis, by Gauss-Legendre quadrature: too few for supports that are much smaller
             than a pixel.
 

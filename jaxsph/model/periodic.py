@@ -70,6 +70,15 @@ def wrapped(particles: Particles) -> Particles:
 def unfolded(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Particles, Int[Array, ""]]:
     """Particles of no period, with room for so many ghosts behind them; and a fault word.
 
+    As `with_sources` says it.
+    """
+    found, _, word = with_sources(particles, room, margin)
+    return found, word
+
+
+def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Particles, Int[Array, " entries"], Int[Array, ""]]:
+    """Particles of no period, with room for so many ghosts behind them; which entry each is of; and a fault word.
+
     Args:
         particles: with a box.
         room: entries for ghosts, static; `num_ghosts` says how many are needed.
@@ -84,10 +93,11 @@ def unfolded(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Partic
     usable = (period.sides > 0).all() & jnp.isfinite(period.sides).all()
     fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= period.sides.min()
     word = faults.raised(faults.BAD_BOX, ~(usable & fits))
-    if room == 0:
-        return bare, word | faults.raised(faults.GHOST_OVERFLOW, _near(home, margin, ROUNDING)[0].any())
     near, gaps = _near(home, margin, ROUNDING)
     capacity = particles.capacity
+    own = jnp.arange(capacity, dtype=jnp.int32)
+    if room == 0:
+        return bare, own, word | faults.raised(faults.GHOST_OVERFLOW, near.any())
     source = jnp.nonzero(near, size=room, fill_value=capacity)[0].astype(jnp.int32)
     inside = jnp.minimum(source, capacity - 1)
     of_images = jnp.stack([_reaches(Gaps(*(gap[inside] for gap in gaps)), image) for image in IMAGES], 1)
@@ -95,11 +105,13 @@ def unfolded(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Partic
     number = made.sum(dtype=jnp.int32)
     place = jnp.nonzero(made.ravel(), size=room, fill_value=0)[0].astype(jnp.int32)
     exists = jnp.arange(room, dtype=jnp.int32) < number
-    ghosts = bare.at(inside[place // len(IMAGES)])
+    origin = inside[place // len(IMAGES)]
+    ghosts = bare.at(origin)
     ghosts = _moved(ghosts, jnp.asarray(IMAGES, home.dtype)[place % len(IMAGES)], period)
     ghosts = dataclasses.replace(ghosts, valid=ghosts.valid & exists)
     word |= faults.raised(faults.GHOST_OVERFLOW, (number > room) | (near.sum(dtype=jnp.int32) > room))
-    return jax.tree.map(lambda own, more: jnp.concatenate([own, more]), bare, ghosts), word
+    together = jax.tree.map(lambda home, more: jnp.concatenate([home, more]), bare, ghosts)
+    return together, jnp.concatenate([own, origin]), word
 
 
 def num_ghosts(particles: Particles, margin: Any = 0.0) -> int:
