@@ -32,12 +32,16 @@ CACHE = (
 
 
 @contextlib.contextmanager
-def local_client(workers: int) -> Iterator[Any]:
+def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterator[Any]:
     """A client of so many processes of this machine, which end with the block.
 
     Cores are dealt out: each worker keeps to its own, as frames are independent, and programs of one frame that run side by side
     lose some of what two cores give. Accelerators are dealt out in turns. Processes are spawned, as forked ones would share JAX's
     threads and stop; so a script that calls this needs `if __name__ == "__main__":`.
+
+    Args:
+        workers: how many.
+        cores: numbers of the cores that are dealt out; all that this process may use.
 
     Raises:
         ImportError: distributed is not installed.
@@ -46,9 +50,12 @@ def local_client(workers: int) -> Iterator[Any]:
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
         raise ValueError(f"`workers` must be an integer of at least 1, got {workers!r}")
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several processes may share an accelerator
-    share = Share(workers, _cores(), _accelerators(), {name: getattr(jax.config, name) for name in CACHE})
-    how = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "memory_limit": 0}
-    cluster = distributed.LocalCluster(n_workers=workers, silence_logs=logging.CRITICAL, **how)
+    share = Share(
+        workers, _cores() if cores is None else cores, _accelerators(), {name: getattr(jax.config, name) for name in CACHE}
+    )
+    how = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "silence_logs": logging.CRITICAL}
+    no_pages = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # at any free port, as several may run
+    cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
     try:
         with distributed.Client(cluster) as client:
             client.register_plugin(share)

@@ -85,6 +85,32 @@ def test_all_files_that_are_cut_short_are_named(tmp_path):
     assert all(str(paths[number]) in str(error.value) for number in (1, 3)) and str(paths[0]) not in str(error.value)
 
 
+def test_where_files_may_be_unreadable_times_beside_them_have_no_scene_and_all_others_are_as_before(tmp_path):
+    paths = [write(tmp_path, number) for number in range(6)]
+    whole = js.Snapshots.from_files(paths, transfer=js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 1, 1)], [0, 1]))
+    for number in (0, 2, 3):
+        paths[number].write_bytes(paths[number].read_bytes()[:900])
+    rest = js.Snapshots.from_files(paths, transfer=whole.transfer, strict=False)
+    assert rest.times == (0.5, 2.0, 2.5)
+    assert [(file.path, file.before) for file in rest.survey.unread] == [(paths[0], -1), (paths[2], 0), (paths[3], 0)]
+    for time in (0.5, 2.0, 2.3, 2.5):
+        np.testing.assert_array_equal(rest.at(time).particles.position, whole.at(time).particles.position)
+        assert rest.fingerprint(time) == whole.fingerprint(time)
+    for time in (0.6, 1.0, 1.9):
+        with pytest.raises(ValueError, match=r"no scene between times 0\.5 and 2: .*s_02.*s_03"):
+            rest.at(time)
+        with pytest.raises(ValueError, match="no scene between"):
+            rest.fingerprint(time)
+    each = rest.each()
+    assert [getattr(source, "time", None) for source in each] == [None, 0.5, None, None, 2.0, 2.5]
+    with pytest.raises(ValueError, match="s_03"):
+        each[3]()
+    for path in paths:
+        path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(ValueError, match="none of 6 snapshots can be read"):
+        js.Snapshots.from_files(paths, strict=False)
+
+
 def test_a_missing_number_is_refused_unless_gaps_are_wanted(tmp_path):
     paths = [write(tmp_path, number) for number in (0, 1, 3)]
     with pytest.raises(ValueError, match="number 2 is missing"):
