@@ -37,8 +37,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.along_rays import first_samples
 from jaxsph.depth_dealing import Parts, dealt_particles
-from jaxsph.frame import Frame
-from jaxsph.in_trace import Drawn, apart, on_each, over, over_bands
+from jaxsph.frame import Drawn, Frame, over_bands
 from jaxsph.layers import OfShards, assemble, blank_if, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -51,6 +50,7 @@ from jaxsph.numerics.across import across
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.devices import mesh_of
 from jaxsph.numerics.executors import Executor, Traced
+from jaxsph.over_mesh import apart, on_each, over
 from jaxsph.plan import Plan
 from jaxsph.planning import see
 from jaxsph.render import certifies, metadata_of, missed, raise_for, with_ended_rays

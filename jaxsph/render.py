@@ -19,9 +19,8 @@ from jaxtyping import Array, Int
 
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.in_octree import reachable
-from jaxsph.frame import Band, Frame
-from jaxsph.in_trace import drawn, drawn_over_mesh
-from jaxsph.layers import Layers, assemble, blank_if, develop
+from jaxsph.frame import Band, Drawn, Frame
+from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.registry import ESTIMATING
@@ -35,6 +34,7 @@ from jaxsph.numerics.executors import Clock, Executor, Forecast, Traced
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.over_devices import draw_over_devices
+from jaxsph.over_mesh import drawn_over_mesh
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
@@ -176,7 +176,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan,
             raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
         return _refined_traced(scene, camera, settings, plan)
     if devices is None:
-        found = drawn(scene, camera, settings, plan)
+        found = _drawn(scene, camera, settings, plan)
     else:
         found = drawn_over_mesh(scene, camera, settings, plan, mesh_of(devices))
     layers, word = found.layers, found.faults
@@ -186,6 +186,14 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan,
     stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": found.filled, "pairs": found.pairs}
     certified = certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
+
+
+def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
+    run = Traced()
+    seen = see(scene, camera, plan, run)
+    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
+    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
+    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)
 
 
 def _refined_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
