@@ -71,8 +71,9 @@ def render(
         plan: capacities from `jaxsph.plan`, for this scene or a similar one; particles are padded to it.
         progress: eager only; called as `progress(done, total)` after every band.
         devices: what the work is shared among: `"all"`, a number, a sequence of `jax.Device`, or a `jax.sharding.Mesh`. Eagerly
-            the image is the same bit for bit, whatever the devices; under a trace a mesh of any axes, automatic or explicit,
-            makes the same image to rounding, and each device holds all particles. None is where the particles are.
+            the image is the same bit for bit (with segments for a tolerance, and where rays end, within the estimate); under a
+            trace a mesh of any axes, automatic or explicit, makes the same image to rounding. Each device holds all particles,
+            see `DepthSlabs` for another way. None is where the particles are.
 
     Returns:
         Image with dtype of the particles.
@@ -128,10 +129,7 @@ def _render_eager(
     raise_for(word, planned)
     image = with_ended_rays(assemble(layers, word), settings)
     word |= int(missed(image, settings))
-    if word & faults.TOLD:
-        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
-        pixels = f"{number} of {image.error_bound.size} pixels"
-        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=3)
+    tell(word, image, settings)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -222,6 +220,14 @@ def missed(image: Image, settings: Settings) -> Int[Array, ""]:
         return jnp.int32(faults.NONE)
     above = lax.stop_gradient(image.error_bound) > settings.tolerance
     return faults.raised(faults.TOLERANCE_MISSED, above.any())
+
+
+def tell(word: int, image: Image, settings: Settings) -> None:
+    """Warn the caller of who calls this of what is no reason to raise."""
+    if word & faults.TOLD:
+        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
+        pixels = f"{number} of {image.error_bound.size} pixels"
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
 
 
 def certifies(plan: Plan) -> bool:
