@@ -37,8 +37,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.along_rays import first_samples
 from jaxsph.depth_dealing import Parts, dealt_particles
-from jaxsph.frame import Frame
-from jaxsph.in_trace import Drawn, apart, on_each, over, over_bands
+from jaxsph.frame import Drawn, Frame, over_bands
 from jaxsph.layers import OfShards, assemble, blank_if, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
@@ -51,9 +50,10 @@ from jaxsph.numerics.across import across
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.devices import mesh_of
 from jaxsph.numerics.executors import Executor, Traced
+from jaxsph.over_mesh import apart, on_each, over
 from jaxsph.plan import Plan
 from jaxsph.planning import see
-from jaxsph.render import certifies, metadata_of, missed, raise_for, with_ended_rays
+from jaxsph.render import certifies, metadata_of, missed, raise_for, tell, with_ended_rays
 from jaxsph.stages import SlabRange
 from jaxsph.viewing import Seen, half_steps
 
@@ -133,11 +133,19 @@ def render_slabs(slabs: DepthSlabs, camera: Camera, settings: Settings | None = 
     slabs.plan.check_image(camera, _share_of(settings, slabs.mesh.size))
     if is_traced(slabs, camera, settings):
         return _traced(slabs, camera, settings)
+    return _eager(slabs, camera, settings)
+
+
+def _eager(slabs: DepthSlabs, camera: Camera, settings: Settings) -> Image:
+    given = {name: getattr(settings, name) for name in ("tolerance", "relax", "min_transmittance")}
+    numbers: dict[str, Any] = {name: None if value is None else float(value) for name, value in given.items()}
+    settings = dataclasses.replace(settings, **numbers)  # hashable, whatever they were
     begun = time.perf_counter()
     image = jax.block_until_ready(_program(settings)(slabs, camera))
     seconds = {"cast": time.perf_counter() - begun}
     word = int(image.faults)
     raise_for(word & ~faults.TOLD, False)
+    tell(word, image, settings)
     stats = {name: int(value) for name, value in image.stats.items()} | {"seconds": seconds}
     certified = bool(image.certified)
     return dataclasses.replace(
@@ -156,12 +164,12 @@ def _traced(slabs: DepthSlabs, camera: Camera, settings: Settings) -> Image:
     rest = dataclasses.replace(slabs.scene, particles=None, transfer=None)
 
     def of_device(shared: Any, part: tuple[Particles, Parts]) -> tuple[Image, Any, Drawn]:
-        (rest, transfer, camera), (particles, own) = shared, part
+        (rest, transfer, camera, share), (particles, own) = shared, part
         scene = dataclasses.replace(rest, particles=particles, transfer=transfer)
         return _part(scene, own, camera, share, plan, mesh)
 
     parts = slabs.scene.particles, slabs.parts
-    images, full, found = over(mesh, of_device, (rest, slabs.scene.transfer, camera), parts)
+    images, full, found = over(mesh, of_device, (rest, slabs.scene.transfer, camera, share), parts)
     word = functools.reduce(lambda a, b: a | b, [found.faults[nth] for nth in range(mesh.size)])
     image = blank_if(word & faults.UNUSABLE != 0, composited(apart(images, mesh.size)))
     word = word | missed(image, settings)

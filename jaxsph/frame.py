@@ -6,14 +6,19 @@ Flow: viewing, plan -> [frame: order -> make_grid -> decide -> cast_shard] -> la
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.access.grid import Grid
 from jaxsph.access.lists import ListPlan
 from jaxsph.access.ordering import Ordered
+from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
 from jaxsph.host_stages import MAKE_GRID, ORDER
@@ -65,6 +70,15 @@ class Band(NamedTuple):
     pairs: Int[Array, ""]
 
 
+class Drawn(NamedTuple):
+    """Layers of an image; its fault word, and how many cells and pairs its grids hold."""
+
+    layers: Any
+    faults: Int[Array, ""]
+    filled: Int[Array, ""]
+    pairs: Int[Array, ""]
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """What all bands of a frame have in common; `shards` of each are cast side by side.
@@ -109,6 +123,15 @@ class Frame:
         rays = self.cast(grid, decided, lattice, run)
         of_shards = OfShards(tuple(rays), tuple(one.verdict for one in decided))
         return Band(of_shards, made.lists.faults, made.filled, made.pairs)
+
+    def all_bands(self, run: Executor, kept: Callable[[Band], Any]) -> Drawn:
+        """All of them as part of a trace, see `over_bands`; of each, what is `kept`."""
+
+        def draw(first_row: Int[Array, ""]) -> Drawn:
+            found = self.band(first_row, run)
+            return Drawn(kept(found), found.faults, found.filled, found.pairs)
+
+        return over_bands(self.plan, draw)
 
     def grid(
         self, first_row: Int[Array, ""], run: Executor, camera: Camera | None = None, lists: ListPlan | None = None
@@ -202,3 +225,15 @@ class Frame:
 def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:
     """Whether any medium meets spheres between samples."""
     return registry.between_samples(plan.integrator) or any(medium.between_samples for medium in media)
+
+
+def over_bands(plan: Plan, draw: Callable[[Int[Array, ""]], Drawn]) -> Drawn:
+    """All bands one after the other, given what draws that of a first row; layers lie along a first axis."""
+    rows = jnp.arange(plan.bands, dtype=jnp.int32) * plan.band_height
+    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
+        policy = jax.checkpoint_policies.save_only_these_names(KEPT)
+        found = lax.map(jax.checkpoint(draw, prevent_cse=False, policy=policy), rows)
+    else:
+        found = jax.tree.map(lambda leaf: leaf[None], draw(rows[0]))
+    word = functools.reduce(lambda a, b: a | b, [found.faults[i] for i in range(plan.bands)])
+    return Drawn(found.layers, word, found.filled.sum(), found.pairs.sum())

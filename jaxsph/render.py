@@ -19,9 +19,8 @@ from jaxtyping import Array, Int
 
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.in_octree import reachable
-from jaxsph.frame import Band, Frame
-from jaxsph.in_trace import drawn, drawn_over_mesh
-from jaxsph.layers import Layers, assemble, blank_if, develop
+from jaxsph.frame import Band, Drawn, Frame
+from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.registry import ESTIMATING
@@ -35,6 +34,7 @@ from jaxsph.numerics.executors import Clock, Executor, Forecast, Traced
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.over_devices import draw_over_devices
+from jaxsph.over_mesh import drawn_over_mesh
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
@@ -71,8 +71,9 @@ def render(
         plan: capacities from `jaxsph.plan`, for this scene or a similar one; particles are padded to it.
         progress: eager only; called as `progress(done, total)` after every band.
         devices: what the work is shared among: `"all"`, a number, a sequence of `jax.Device`, or a `jax.sharding.Mesh`. Eagerly
-            the image is the same bit for bit, whatever the devices; under a trace a mesh of any axes, automatic or explicit,
-            makes the same image to rounding, and each device holds all particles. None is where the particles are.
+            the image is the same bit for bit (with segments for a tolerance, and where rays end, within the estimate); under a
+            trace a mesh of any axes, automatic or explicit, makes the same image to rounding. Each device holds all particles,
+            see `DepthSlabs` for another way. None is where the particles are.
 
     Returns:
         Image with dtype of the particles.
@@ -147,10 +148,7 @@ def image_of(
     raise_for(word, planned)
     image = with_ended_rays(assemble(layers, word), settings)
     word |= int(missed(image, settings))
-    if word & faults.TOLD:
-        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
-        pixels = f"{number} of {image.error_bound.size} pixels"
-        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
+    tell(word, image, settings)
     stats = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
@@ -196,7 +194,7 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan,
             raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
         return _refined_traced(scene, camera, settings, plan)
     if devices is None:
-        found = drawn(scene, camera, settings, plan)
+        found = _drawn(scene, camera, settings, plan)
     else:
         found = drawn_over_mesh(scene, camera, settings, plan, mesh_of(devices))
     layers, word = found.layers, found.faults
@@ -206,6 +204,14 @@ def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan,
     stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": found.filled, "pairs": found.pairs}
     certified = certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
     return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
+
+
+def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
+    run = Traced()
+    seen = see(scene, camera, plan, run)
+    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
+    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
+    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)
 
 
 def _refined_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Image:
@@ -234,6 +240,14 @@ def missed(image: Image, settings: Settings) -> Int[Array, ""]:
         return jnp.int32(faults.NONE)
     above = lax.stop_gradient(image.error_bound) > settings.tolerance
     return faults.raised(faults.TOLERANCE_MISSED, above.any())
+
+
+def tell(word: int, image: Image, settings: Settings) -> None:
+    """Warn the caller of who calls this of what is no reason to raise."""
+    if word & faults.TOLD:
+        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
+        pixels = f"{number} of {image.error_bound.size} pixels"
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
 
 
 def certifies(plan: Plan) -> bool:

@@ -8,6 +8,8 @@ one device, and so are the bits of an image.
 
 from __future__ import annotations
 
+import functools
+import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -66,10 +68,9 @@ class OnDevices(Clock):
 
     def absorb(self, others: Sequence[Clock]) -> None:
         """Book the seconds of executors that ran side by side meanwhile: of each stage those of the slowest."""
-        self.mark("plan")
-        waited = self.seconds
-        for stage in waited:
-            waited[stage] += max(other.seconds[stage] for other in others)
+        for stage in self.seconds:
+            self.seconds[stage] += max(other.seconds[stage] for other in others)
+        self._last = time.perf_counter()
 
     def _given(self, pairs: list[tuple[tuple[Any, ...], jax.Device]]) -> list[tuple[Any, ...]]:
         """Arguments where they are wanted; what several calls in a row are given is copied once."""
@@ -81,7 +82,7 @@ class OnDevices(Clock):
             self._copies[key] = made
             return made[1]
 
-        return [jax.tree.map(lambda leaf: put(leaf, device), some) for some, device in pairs]  # noqa: B023
+        return [jax.tree.map(functools.partial(put, device=device), some) for some, device in pairs]
 
 
 class ForecastOnDevices(Forecast):

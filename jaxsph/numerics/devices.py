@@ -34,6 +34,10 @@ def chosen_devices(devices: Any) -> tuple[jax.Device, ...]:
     if isinstance(given, str | bytes) or not isinstance(given, Sequence) or not all(isinstance(d, jax.Device) for d in given):
         raise ValueError(f'`devices` must be "all", a number, a sequence of `jax.Device` or a mesh, got {devices!r}')
     _number(len(given), len(jax.devices()) if isinstance(devices, Mesh) else len(here))
+    if any(device.process_index != jax.process_index() for device in given):
+        raise ValueError(
+            "`devices` of several processes work on one frame under `jax.jit` alone; jit the call, and give a `plan`"
+        )
     if len(set(given)) < len(given):
         raise ValueError(f"`devices` must be different ones, got {devices!r}")
     return tuple(given)

@@ -1,65 +1,44 @@
-"""The bands of a frame as part of a trace: one after the other, on one device or on each of a mesh for its own shards.
+"""A frame as part of a trace over a mesh of devices, each of which runs the same program for its own shards.
 
-Flow: seen -> [in_trace: Frame -> bands] -> layers.
+Flow: scene, mesh -> [over_mesh: Frame -> bands] -> layers.
 
-Over a mesh every device holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of
+Every device holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of
 one device, and each device decides and marches its own. Nothing is exchanged but what rays met, and with error control by bounds
 or the pilot what decisions for a whole band need. In reverse mode cotangents of what all devices share are added up.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
-from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
-from jaxsph.frame import Band, Frame
+from jaxsph.frame import Drawn, Frame
 from jaxsph.layers import Layers, OfShards, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.device_executors import OnMesh
-from jaxsph.numerics.executors import Executor, Traced
 from jaxsph.plan import Plan
 from jaxsph.planning import see
 
 
-class Drawn(NamedTuple):
-    """Layers of an image; its fault word, and how many cells and pairs its grids hold."""
-
-    layers: Any
-    faults: Int[Array, ""]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
-
-
-def drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
-    """On one device."""
-    run = Traced()
-    seen = see(scene, camera, plan, run)
-    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
-    found = over_bands(plan, functools.partial(drawn_band, frame, run, lambda band: of_band(band.of_shards, plan=plan)))
-    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)
-
-
 def drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan, mesh: Mesh) -> Drawn:
-    """The same on every device of a mesh, each for its own bundles; what is returned they all hold."""
+    """On every device of a mesh, each for its own bundles; what is returned they all hold."""
     plan = plan.dealt(mesh.size)
 
     def of_device(shared: tuple[Scene, Camera, Settings], _: Any) -> Drawn:
         (scene, camera, settings), run = shared, OnMesh(mesh)
         seen = see(scene, camera, plan, run)
         frame = Frame.begun(seen, camera, settings, plan, scene.formulas, mesh.size, run)
-        found = over_bands(plan, functools.partial(drawn_band, frame, run, lambda band: band.of_shards))
+        found = frame.all_bands(run, lambda band: band.of_shards)
         return found._replace(faults=found.faults | seen.viewed.faults)
 
     found = over(mesh, of_device, (scene, camera, settings))
@@ -112,21 +91,3 @@ def apart(tree: Any, number: int) -> tuple[Any, ...]:
     """The first so many along the first axis, one by one."""
     leaves, structure = jax.tree.flatten(tree)
     return tuple(jax.tree.unflatten(structure, [leaf[nth] for leaf in leaves]) for nth in range(number))
-
-
-def drawn_band(frame: Frame, run: Executor, kept: Callable[[Band], Any], first_row: Int[Array, ""]) -> Drawn:
-    """The band that begins at a row of pixels, and what is `kept` of it."""
-    found = frame.band(first_row, run)
-    return Drawn(kept(found), found.faults, found.filled, found.pairs)
-
-
-def over_bands(plan: Plan, draw: Callable[[Int[Array, ""]], Drawn]) -> Drawn:
-    """All bands one after the other, given what draws that of a first row; layers lie along a first axis."""
-    rows = jnp.arange(plan.bands, dtype=jnp.int32) * plan.band_height
-    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
-        policy = jax.checkpoint_policies.save_only_these_names(KEPT)
-        found = lax.map(jax.checkpoint(draw, prevent_cse=False, policy=policy), rows)
-    else:
-        found = jax.tree.map(lambda leaf: leaf[None], draw(rows[0]))
-    word = functools.reduce(lambda a, b: a | b, [found.faults[i] for i in range(plan.bands)])
-    return Drawn(found.layers, word, found.filled.sum(), found.pairs.sum())
