@@ -36,6 +36,7 @@ from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics import free_memory
 from jaxsph.numerics.executors import Clock
 from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
@@ -46,8 +47,10 @@ from jaxsph.viewing import Seen
 MEMORY = 1 << 30
 SAMPLED = 1 << 16
 """Particles, about, by which colours, plans and parts are chosen."""
-BYTES_A_PARTICLE = 320
-"""Of a particle of a part, at most: its columns as they are read, those of the next part, those in view, and of their lists."""
+READ_BYTES, BYTES_A_PARTICLE = 96, 430
+"""Of a particle of a part: of columns that are read, with those of the next part; and in all, with its place in lists."""
+FRAME_SHARE = 0.2
+"""Of the memory, that a frame takes whatever its particles."""
 CROWDED = 1.25
 """Times as many particles as the sample has it there is room for in a part."""
 Columns = tuple[np.ndarray, ...]
@@ -249,8 +252,9 @@ def render_from_disk(
     settings = settings or Settings()
     if settings.screen == "quadtree":
         raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
-    settings = dataclasses.replace(settings, memory_limit=settings.memory_limit or max(memory // 2, 1))
-    parts = cut(on_disk, camera, memory // 2)
+    parts = cut(on_disk, camera, memory)
+    left = max(memory - READ_BYTES * parts.capacity, 1)
+    settings = dataclasses.replace(settings, memory_limit=settings.memory_limit or left)
     renderer = _Renderer(on_disk, transfer, camera, settings, parts.capacity)
     always = on_disk.extremes(camera)
     planes = [seen_by_rows(camera, *ends) for ends in zip(parts.rows[:-1], parts.rows[1:], strict=True)]
@@ -262,6 +266,7 @@ def render_from_disk(
             if number + 1 < len(parts):
                 ahead = reader.submit(on_disk.seen_by, planes[number + 1], always)
             images.append(renderer.part(columns, first, end))
+            free_memory.give_back()
             most = max(most, len(columns[0]))
             if progress is not None:
                 progress(number + 1, len(parts))
@@ -277,11 +282,11 @@ def cut(on_disk: OnDisk, camera: Camera, memory: int) -> Parts:
     """
     tile_rows = -(-camera.height // TILE)
     each = _particles_of(on_disk, camera, tile_rows)
-    room = memory // BYTES_A_PARTICLE
+    room = int((1 - FRAME_SHARE) * memory) // BYTES_A_PARTICLE
     if max(each) > room:
-        least = 2 * BYTES_A_PARTICLE * max(each)
+        least = int(BYTES_A_PARTICLE * max(each) / (1 - FRAME_SHARE)) + 1
         raise ValueError(
-            f"`memory` = {2 * memory} bytes is too little: {TILE} rows of pixels see about {max(each):,} particles, "
+            f"`memory` = {memory} bytes is too little: {TILE} rows of pixels see about {max(each):,} particles, "
             f"which need {least:,}; give more, or look closer"
         )
     rows = 1

@@ -55,9 +55,8 @@ def project(
     r"""Integrate what particles hold along the rays of an image.
 
     Without a weight a pixel is $\sum_j a_j F_j$: an amount a unit of area, such as a column density where $a_j$ is a mass. $F_j$
-    is the integral of the kernel, whose integral over space is 1, along the part of the ray between two depths; it is in closed
-    form. With a weight a pixel is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, and NaN where no particle of any weight is.
-    For emission $A \rho^n$ see `emission`.
+    is the integral of the kernel, whose integral over space is 1, along the ray between two depths, in closed form. With a weight
+    it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see `emission`.
 
     Args:
         particles: kernel and supports are theirs; nothing is normalised. Of a periodic set, parallel rays along an axis of its
