@@ -106,7 +106,9 @@ def test_the_image_is_that_of_one_device_and_each_holds_its_part(integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [{"tolerance": 0.1}, {"tolerance": 0.1, "integrator": "segments", "samples": 128}], ids=["bounds", "segments"])
+@pytest.mark.parametrize(
+    "given", [{"tolerance": 0.1}, {"tolerance": 0.1, "integrator": "segments", "samples": 128}], ids=["bounds", "segments"]
+)
 def test_the_tolerance_holds_for_the_whole(given):
     told = ran(SCENE + IMAGES, json.dumps(given), "calm", quickly=False)
     assert 0 < told["bound"] <= given["tolerance"]
