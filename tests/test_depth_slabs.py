@@ -19,7 +19,10 @@ import jax, jax.numpy as jnp, numpy as np
 import jaxsph as js
 
 scene, camera = js.scenes.load("checker_board", 2000, width=72, height=64)
-settings = js.Settings(samples=96, **json.loads(sys.argv[1]))
+if sys.argv[2:] == ["calm"]:  # such that bounds save something
+    calm = 0.4 + 0.01 * scene.particles.quantity
+    scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=calm))
+settings = js.Settings(**{"samples": 96, **json.loads(sys.argv[1])})
 slabs = js.DepthSlabs.of(scene, camera, settings, 4)
 plan = js.plan(scene, camera, settings)
 """
@@ -103,10 +106,12 @@ def test_the_image_is_that_of_one_device_and_each_holds_its_part(integrator):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [{"tolerance": 0.2}, {"tolerance": 0.02, "integrator": "segments"}], ids=["bounds", "segments"])
+@pytest.mark.parametrize(
+    "given", [{"tolerance": 0.1}, {"tolerance": 0.1, "integrator": "segments", "samples": 128}], ids=["bounds", "segments"]
+)
 def test_the_tolerance_holds_for_the_whole(given):
-    told = ran(SCENE + IMAGES, json.dumps(given), quickly=False)
-    assert told["bound"] <= given["tolerance"]
+    told = ran(SCENE + IMAGES, json.dumps(given), "calm", quickly=False)
+    assert 0 < told["bound"] <= given["tolerance"]
     if "integrator" not in given:
         assert told["within"] and told["certified"] and told["saved"] > 0
 

@@ -53,6 +53,8 @@ CONTROLLED = """
 given = made(**json.loads(sys.argv[1]))
 mesh = jax.make_mesh((4,), ("a",), axis_types=(AxisType.Auto,))
 scene, camera, settings, plan = given
+calm = 0.4 + 0.01 * scene.particles.quantity  # such that bounds save something
+scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=calm))
 one, other = (jax.jit(lambda s: js.render(s, camera, settings, plan=plan, devices=devices))(scene) for devices in (None, mesh))
 told = {n: float(np.abs(np.asarray(getattr(one, n)) - np.asarray(getattr(other, n))).max())
         for n in ("color", "transmittance", "error_bound", "evaluations")}
