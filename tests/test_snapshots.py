@@ -114,7 +114,11 @@ def periodic(folder, number, shift):
     """Half of the particles across the faces of a unit box from where they were, and every other hot."""
     rng = np.random.default_rng(5)
     position = np.mod(rng.uniform(0, 1, (200, 3)) + (shift, 0, 0), 1)
-    columns = {"temperature": np.where(np.arange(200) % 2, 1e3, 1e5) + 500.0 * (np.arange(200) % 7), "support": np.full(200, 0.2), "id": np.arange(200)}
+    columns = {
+        "temperature": np.where(np.arange(200) % 2, 1e3, 1e5) + 500.0 * (np.arange(200) % 7),
+        "support": np.full(200, 0.2),
+        "id": np.arange(200),
+    }
     order = np.random.default_rng(number).permutation(200)
     path = folder / f"p_{number:02d}.npz"
     np.savez(path, position=position[order], time=0.5 * number, **{name: column[order] for name, column in columns.items()})
