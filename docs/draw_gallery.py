@@ -1,4 +1,4 @@
-"""Draws the sheets of docs/gallery.md: every particle file of a folder as `jaxsph render FILE` shows it, and what else can be asked.
+"""Draws the sheets of docs/gallery.md: every particle file of a folder as `jaxsph render FILE` shows it, and what else is asked.
 
 python docs/draw_gallery.py FOLDER
 """
@@ -24,7 +24,7 @@ ASKED = (
     ("mean of energy by mass", DENSE, ["project", "--of", "InternalEnergy", "--weight", "mass", "--norm", "log"]),
     ("--clip-plane", FLUID, ["render", "--clip-plane", "0", "0", "0", "0.4", "0", "-1"]),
     ("--slice", FLUID, ["render", "--slice", "0", "0", "0", "0", "0", "-1"]),
-    ("--where 'concentration_checker > 0.5'", FLUID, ["render", "--where", "concentration_checker > 0.5"]),
+    ("--where 'hypot(x, z) > 0.5'", FLUID, ["render", "--where", "hypot(x, z) > 0.5"]),
     ("--annotate: bar, scale, axes, time", DENSE, ["render", "--annotate"]),
 )
 """What it says below, file, command and options."""
@@ -55,6 +55,7 @@ def sheet(pictures: list[tuple[str, Image.Image]], path: pathlib.Path) -> None:
 
 
 def main() -> None:
+    """Draw both."""
     data = pathlib.Path(sys.argv[1])
     files = sorted(file for file in data.iterdir() if file.suffix != ".md" and not file.name.startswith(REFUSED))
     with tempfile.TemporaryDirectory() as folder:

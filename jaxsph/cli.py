@@ -154,6 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_transfer.add_looks(movie)
     cli_options.add_picture(movie)
     cli_options.add_control(movie)
+    cli_where.add_places(movie, slices=False)
     cli_movie.add_options(movie)
     demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
     add = demo.add_argument

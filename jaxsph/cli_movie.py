@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph import cli_cluster, cli_frames, cli_transfer, io, scenes
+from jaxsph import cli_cluster, cli_frames, cli_transfer, cli_where, io, scenes
 from jaxsph.cli_points import Together
 from jaxsph.console import UsageError, camera_line, progress, say, span
 from jaxsph.frame_task import FramesError, Source, Still
@@ -61,6 +61,7 @@ def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) ->
     """Say what is shown, render the frames that are not there, and write the movie."""
     output = _checked(options)
     cli_cluster.check(options)
+    cli_where.settle(options)
     io.movie.encoder()
     _choose_size(options)
     with cli_cluster.client_of(options) as client:
@@ -70,13 +71,14 @@ def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) ->
 def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, output: Path, client: Any) -> None:
     if len(options.source) > 1:
         snapshots = _sequence(options)
-        shown: Bounded = snapshots
+        shown: Bounded = cli_where.framed(snapshots, options)
         camera = _framed(shown, options)
         number = len(snapshots.times) + len(snapshots.survey.unread)
     else:
         options.source = options.source[0]
         scene, camera = one_scene(options)
-        snapshots, shown, number = None, _shown(scene, camera), 1
+        scene = cli_where.shown(scene, options)
+        snapshots, shown, number = None, cli_where.framed(_shown(scene, camera), options), 1
     path = _path(options, camera, shown)
     frames = _number_of_frames(options, path, number)
     cameras = _cameras(path, options, camera, shown, frames)
@@ -147,8 +149,10 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
             raise UsageError(f"--{name} is not for a sequence of particle files")
     if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
         raise UsageError(f"--support must be > 0, got {options.support:g}")
-    reading = Reading(options.quantity, options.support, options.kernel or "poly6", options.part_type)
-    with progress("read", " files") as show:
+    reading = Reading(
+        options.quantity, options.support, options.kernel or "poly6", options.part_type, **cli_where.selected(options)
+    )
+    with progress("read", " files") as show, cli_where.conditions():
         survey = _surveyed(options, reading, show)
     _say_survey(survey)
     asked = options.range
@@ -157,7 +161,8 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
     transfer = cli_transfer.look(survey.middle, options, survey.quantity)
     of_range = "as asked for" if asked else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
-    return Snapshots(survey, transfer)
+    center = cli_where.middle_of(survey, options)
+    return Snapshots(survey, transfer, center, cli_where.clip_of(options))
 
 
 def _surveyed(options: argparse.Namespace, reading: Reading, show: Callable[[int, int], None] | None) -> Survey:

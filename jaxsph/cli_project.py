@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph import cli_options, io
+from jaxsph import cli_options, cli_where, io
 from jaxsph.console import UsageError, say, span
 from jaxsph.io.projections import SUFFIXES
 from jaxsph.io.quantities import ROLES, choose_quantity
+from jaxsph.io.selection import chosen
 from jaxsph.model import Camera, Particles
 from jaxsph.model.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
@@ -60,6 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
     add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), default="cubic_spline", help="(default cubic_spline)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
+    cli_where.add_selection(parser)
     add = parser.add_argument_group("camera", "default: parallel rays along z, all of the particles").add_argument
     place: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     add("--axis", choices=tuple(VIEWS), help="parallel rays along an axis")
@@ -82,6 +84,8 @@ def run(options: argparse.Namespace) -> None:
     output = options.output or Path(Path(options.source).stem + ".exr")
     table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
+    with cli_where.conditions():
+        table = chosen(table, "density", options.support, options.kernel, **cli_where.selected(options))
     particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
     say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
     for note in report.notes:
@@ -104,6 +108,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Raise `UsageError` where options exclude each other, or are out of range."""
+    cli_where.settle(options)
     if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{options.output}: a projection must be {', '.join(SUFFIXES)}")
     if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
@@ -163,7 +168,7 @@ class _Columns:
     def _summed(self) -> np.ndarray:
         support = self._particles.to_numpy()["support"].astype(np.float64)
         mass = None if self.mass_name is None else self.mass
-        return io.kernel_sum(self.table.position, support, mass, kernel=self._kernel)
+        return io.kernel_sum(self.table.position, support, mass, kernel=self._kernel, box=self.table.box_size)
 
 
 def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray | None, str, str]:

@@ -24,6 +24,8 @@ from jaxsph.model import Camera, Image, Particles, Scene
 from jaxsph.model.camera import Bounded
 from jaxsph.model.clips import Box, Clip, Plane, Sphere
 from jaxsph.slices import slice_of
+from jaxsph.snapshots import center_of
+from jaxsph.survey import Survey
 
 OF_FILES = ("where", "share", "box", "not_periodic", "center")
 OF_PARTICLES = (*OF_FILES, "slice")
@@ -40,7 +42,7 @@ def add_selection(parser: argparse.ArgumentParser) -> None:
     add("--not-periodic", action="store_true", default=None, help="leave the file's box aside: nothing reaches across its faces")
 
 
-def add_places(parser: argparse.ArgumentParser) -> None:
+def add_places(parser: argparse.ArgumentParser, *, slices: bool = True) -> None:
     """Options of where things are shown."""
     add = parser.add_argument_group("where", "Clips may be repeated: what is in all of them is shown.").add_argument
     more = f"middle of a periodic box: X Y Z, or {DENSEST} for the densest point"
@@ -54,6 +56,8 @@ def add_places(parser: argparse.ArgumentParser) -> None:
     add("--cut-box", nargs=6, metavar=corners, **clips, help="what is outside of it")
     add("--clip-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is inside of a sphere")
     add("--cut-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is outside of it")
+    if not slices:
+        return
     more = "the quantity on a plane through (X, Y, Z), seen from where (NX, NY, NZ) points to; OUT may be .npy, too"
     add("--slice", nargs=6, type=float, metavar=(*vector, "NX", "NY", "NZ"), help=more)
 
@@ -123,6 +127,16 @@ def centered(particles: Particles, options: argparse.Namespace) -> Particles:
     lower, upper = moved.box.corners()
     say("center", " ".join(f"{value:.6g}" for value in (lower + upper) / 2))
     return moved
+
+
+def middle_of(survey: Survey, options: argparse.Namespace) -> tuple[float, float, float] | None:
+    """The same of a sequence."""
+    if options.center is not None and survey.box is None:
+        raise UsageError("--center is for periodic boxes, and these files do not have one; give its sides by --box")
+    center = center_of(survey, options.center)
+    if center is not None:
+        say("center", " ".join(f"{value:.6g}" for value in center))
+    return center
 
 
 def shown(scene: Scene, options: argparse.Namespace) -> Scene:

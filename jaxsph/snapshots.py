@@ -19,6 +19,7 @@ import numpy as np
 from jaxsph import io, scenes
 from jaxsph.io.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
 from jaxsph.model import Particles, Scene, TransferFunction
+from jaxsph.model.clips import Clip
 from jaxsph.model.particles import capacity_class
 from jaxsph.survey import Reading, Survey, surveyed
 
@@ -49,10 +50,14 @@ class Snapshots:
     Attributes:
         survey: the files in the order of time, and what they hold.
         transfer: what they look like, all of them.
+        center: middle of the periodic box that all files have, where it is not their own.
+        within: where they are shown; None is everywhere.
     """
 
     survey: Survey
     transfer: TransferFunction
+    center: tuple[float, float, float] | None = None
+    within: Clip | None = None
     _loaded: dict[int, Loaded] = dataclasses.field(default_factory=dict, repr=False)
     _ways: dict[int, Way | str] = dataclasses.field(default_factory=dict, repr=False)
 
@@ -65,6 +70,11 @@ class Snapshots:
         support: float | None = None,
         kernel: str = "poly6",
         part_type: int | None = None,
+        box: Any = "file",
+        where: str | None = None,
+        share: float | None = None,
+        center: Any = None,
+        within: Clip | None = None,
         transfer: TransferFunction | None = None,
         colormap: str = "viridis",
         gaps: bool = False,
@@ -77,6 +87,9 @@ class Snapshots:
             paths: of particle files, in any order: times in the files order them, else numbers in their names.
             quantity, support, kernel, part_type: as for `jaxsph.io.read_particles`; a quantity that is chosen is chosen by the
                 file in the middle, and taken of all.
+            box, where, share: as for `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids.
+            center: (3,) middle of the periodic box, or "densest" for the densest point of the file in the middle.
+            within: where particles are shown; default everywhere.
             transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
                 that suits the file in the middle.
             colormap: name of a colour map.
@@ -89,10 +102,11 @@ class Snapshots:
             FileNotFoundError: there is no such file.
             ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        survey = surveyed(paths, Reading(quantity, support, kernel, part_type), gaps=gaps, strict=strict, progress=progress)
+        reading = Reading(quantity, support, kernel, part_type, box, where, share)
+        survey = surveyed(paths, reading, gaps=gaps, strict=strict, progress=progress)
         if transfer is None:
             transfer = scenes.default_transfer(survey.middle, colormap, survey.span)
-        return cls(survey, transfer)
+        return cls(survey, transfer, center_of(survey, center), within)
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -101,7 +115,10 @@ class Snapshots:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around all particles of all snapshots: something to frame."""
-        return self.survey.bounds()
+        lower, upper = self.survey.bounds()
+        if self.center is None:
+            return lower, upper
+        return np.array(self.center) - (upper - lower) / 2, np.array(self.center) + (upper - lower) / 2
 
     def at(self, time: float) -> Scene:
         """Particles at a time: those of a file, or between two.
@@ -112,7 +129,7 @@ class Snapshots:
         for the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file.
         """
         particles = self._particles(*self.place(time))
-        return Scene(particles=particles, transfer=self.transfer)
+        return Scene(particles=particles, transfer=self.transfer, within=self.within)
 
     def moments(self, times: Sequence[float]) -> list[Moment]:
         """Sources of frames at such times, each read when it is its turn."""
@@ -147,8 +164,10 @@ class Snapshots:
         """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
         before, share = self.place(time)
         files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
-        digest = hashlib.sha256(repr((files, share, self.survey.reading, self.survey.quantity)).encode())
-        for leaf in jax.tree.leaves(self.transfer):
+        look = self.transfer, self.within
+        told = files, share, self.survey.reading, self.survey.quantity, self.center, jax.tree.structure(look)
+        digest = hashlib.sha256(repr(told).encode())
+        for leaf in jax.tree.leaves(look):
             digest.update(np.ascontiguousarray(leaf).tobytes())
         return digest.hexdigest()
 
@@ -199,10 +218,10 @@ class Snapshots:
         wide = self.survey.wide
         position = columns["position"] if wide else columns["position"].astype(np.float32)
         others = {name: column.astype(position.dtype) for name, column in columns.items() if name != "position"}
-        made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity)
+        made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity, box=self.survey.box)
         if wide and made.dtype == jnp.float32 and made.position_rest is None:
             made = dataclasses.replace(made, position_rest=jnp.asarray(np.zeros(made.position.shape, np.float32)))
-        return made
+        return made if self.center is None else made.centered(self.center)
 
     @property
     def capacity(self) -> int:
@@ -229,6 +248,21 @@ class Unreadable:
             ValueError: why.
         """
         raise ValueError(self.why)
+
+
+def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
+    """Middle of the period that is asked for; of "densest" that of the file in the middle.
+
+    Raises:
+        ValueError: files without a period, or no three numbers.
+    """
+    if at is None:
+        return None
+    if survey.box is None:
+        raise ValueError("`center` is for periodic boxes, and these files do not have one; give `box=(Lx, Ly, Lz)`")
+    lower, upper = survey.middle.centered(at).bounds()
+    x, y, z = (float(value) for value in (lower + upper) / 2)
+    return x, y, z
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxsph import io
 from jaxsph.io.matching import agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.quantities import choose_quantity
+from jaxsph.io.selection import chosen
 from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
 from jaxsph.model.colormaps import value_range
@@ -34,6 +35,9 @@ class Reading:
     support: float | None = None
     kernel: str = "poly6"
     part_type: int | None = None
+    box: Any = "file"
+    where: str | None = None
+    share: float | None = None
 
     @property
     def how(self) -> tuple[float | None, str]:
@@ -41,8 +45,12 @@ class Reading:
         return self.support, self.kernel
 
     def table(self, path: Path) -> io.ParticleTable:
-        """What a file holds."""
-        return io.read_table(path, part_type=self.part_type)
+        """What a file holds of what is asked for."""
+        table, which = io.read_table(path, part_type=self.part_type), {"box": self.box, "where": self.where, "share": self.share}
+        try:
+            return chosen(table, self.quantity, *self.how, **which)
+        except io.DataError as error:
+            raise type(error)(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +139,9 @@ class Survey:
     unread: tuple[UnreadFile, ...] = ()
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the box around all particles of all files."""
+        """Lower and upper corner of the box around all particles of all files, or of their period."""
+        if self.box is not None:
+            return np.zeros(3), np.array(self.box)
         filled = [file for file in self.files if file.num_particles]
         if not filled:
             return np.zeros(3), np.zeros(3)
@@ -204,6 +214,8 @@ def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
     for path in nearest:
         try:
             table = reading.table(path)
+        except io.ConditionError:
+            raise
         except (ValueError, OSError) as error:
             if path == nearest[-1]:
                 raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error

@@ -84,6 +84,14 @@ def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch
     assert not np.array_equal(images[0], images[2])
 
 
+def test_options_of_which_particles_and_where_hold_for_all_frames(sequence, tmp_path, capsys):
+    chosen = ["--where", "temperature > 0 and x < 2", "--share", 0.9, "--clip-box", -2, -2, -2, 2, 2, 2]
+    code, out, err = run(capsys, *sequence, "--frames", 2, *chosen, "--box", 9, 9, 9, *TINY, "-o", "a.mp4")
+    assert (code, err) == (0, []) and "left out by temperature > 0" in out and "for a quick look" in out
+    orbit = ["--orbit", 90, "--frames", 2, "--clip-sphere", 0, 0, 0, 1, *TINY, "-o", "c.mp4"]
+    assert run(capsys, "s_0.npz", "--where", "temperature > 0", *orbit)[0] == 0
+
+
 @pytest.mark.slow
 def test_a_command_that_was_killed_goes_on_and_ends_with_the_same_bits(sequence, tmp_path):
     command = [sys.executable, "-m", "jaxsph", "movie", *sequence, "--frames", "24", "--orbit", "90", *TINY, "--no-cache"]
@@ -129,6 +137,10 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, ca
         (["s_0.npz", "s_1.npz", "--workers", 0], "--workers must be at least 1"),
         (["s_0.npz", "s_1.npz", "--workers", 2, "--client", "tcp://x:1"], "not allowed with"),
         (["s_0.npz", "s_1.npz", "--client", "nonsense"], "no address of a scheduler"),
+        (["s_0.npz", "s_1.npz", "--where", "entropy > 1"], "no quantity 'entropy'"),
+        (["s_0.npz", "s_1.npz", "--share", 0], "`share` must be above 0"),
+        (["s_0.npz", "s_1.npz", "--center", 0, 0, 0], "--center is for periodic boxes"),
+        (["s_0.npz", "s_1.npz", "--clip-plane", 0, 0, 0, 0, 0, 0], "--clip-plane: `normal`"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
         ([], "required"),
     ],

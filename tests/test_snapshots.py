@@ -134,3 +134,66 @@ def test_progress_is_told_file_by_file(tmp_path):
     seen = []
     js.Snapshots.from_files([write(tmp_path, n) for n in range(3)], progress=lambda *count: seen.append(count))
     assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def periodic(folder, number, shift):
+    """Half of the particles across the faces of a unit box from where they were, and every other hot."""
+    rng = np.random.default_rng(5)
+    position = np.mod(rng.uniform(0, 1, (200, 3)) + (shift, 0, 0), 1)
+    columns = {
+        "temperature": np.where(np.arange(200) % 2, 1e3, 1e5) + 500.0 * (np.arange(200) % 7),
+        "support": np.full(200, 0.2),
+        "id": np.arange(200),
+    }
+    order = np.random.default_rng(number).permutation(200)
+    path = folder / f"p_{number:02d}.npz"
+    np.savez(path, position=position[order], time=0.5 * number, **{name: column[order] for name, column in columns.items()})
+    return path
+
+
+def test_a_condition_a_share_and_a_period_hold_for_all_moments(tmp_path):
+    paths = [periodic(tmp_path, 0, 0.0), periodic(tmp_path, 1, 0.3)]
+    wanted = {"box": (1, 1, 1), "where": "temperature > 1e4", "share": 0.4}
+    snapshots = js.Snapshots.from_files(paths, "temperature", **wanted, center=(0.5, 0.5, 1.0))
+    assert snapshots.survey.told()[0].endswith("40 matched, 0 vanish, 0 appear")  # of ids, the same in both files
+    places = [np.asarray(snapshots.at(time).particles.exact_position()[:40]) for time in (0, 0.25, 0.5)]
+    start = np.random.default_rng(5).uniform(0, 1, (200, 3))
+    for place, shift in zip(places, (0, 0.15, 0.3), strict=True):
+        away = place[:, None] - (start[::2] + (shift, 0, 0))
+        assert (np.abs(away - np.round(away)).max(-1).min(1) < 1e-5).all()
+        assert (place[:, 2] >= 0.5 - 1e-6).all() and (place[:, 2] <= 1.5 + 1e-6).all()
+    found = snapshots.at(0.25).particles
+    assert found.num_particles == 40 and found.box is not None and found.quantity[:40].min() > 1e4
+    np.testing.assert_allclose(snapshots.bounds(), [(0, 0, 0.5), (1, 1, 1.5)])
+    np.testing.assert_allclose(found.bounds(), snapshots.bounds(), atol=1e-6)
+    assert any("left out by temperature > 1e4" in note for note in snapshots.survey.report.notes)
+
+
+def test_what_is_shown_is_in_the_mark_of_a_moment(tmp_path):
+    path = [periodic(tmp_path, 0, 0.0)]
+    given = [{}, {"where": "temperature > 1e4"}, {"share": 0.5}, {"box": (1, 1, 1)}, {"within": js.Plane((0, 0, 0), (1, 0, 0))}]
+    given += [{"box": (1, 1, 1), "center": (0, 0, 0)}, {"within": ~js.Plane((0, 0, 0), (1, 0, 0))}]
+    marks = [js.Snapshots.from_files(path, **more).fingerprint(0.0) for more in given]
+    assert len(set(marks)) == len(marks)
+    clip = js.Sphere((0.5, 0.5, 0.5), 0.3)
+    assert js.Snapshots.from_files(path, within=clip).at(0.0).within is clip
+
+
+def test_volumes_and_densities_of_those_that_are_chosen_are_those_that_all_have_made(tmp_path):
+    position = np.random.default_rng(0).normal(size=(150, 3)).astype(np.float32)
+    np.savez(tmp_path / "a.npz", position=position, mass=np.ones(150), temperature=position[:, 0])
+    for quantity in ("temperature", "log10:density"):
+        whole = js.Snapshots.from_files([tmp_path / "a.npz"], quantity).at(0).particles.to_numpy()
+        some = js.Snapshots.from_files([tmp_path / "a.npz"], quantity, where="temperature > 0").at(0).particles.to_numpy()
+        for name, column in whole.items():
+            np.testing.assert_allclose(some[name], column[position[:, 0] > 0], rtol=1e-6, err_msg=name)
+
+
+def test_conditions_and_middles_that_make_no_sense_are_refused(tmp_path):
+    paths = [periodic(tmp_path, number, 0.0) for number in range(2)]
+    with pytest.raises(js.io.ConditionError, match=r"p_01\.npz: the condition 'entropy > 1'"):
+        js.Snapshots.from_files(paths, where="entropy > 1")
+    with pytest.raises(ValueError, match="200 left out by temperature > 1e9"):
+        js.Snapshots.from_files(paths, where="temperature > 1e9")
+    with pytest.raises(ValueError, match="`center` is for periodic boxes"):
+        js.Snapshots.from_files(paths, center=(0, 0, 0))

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from .damage import DataError
+from .matching import ids_of
 from .quantities import quantity_named
 from .table import ParticleTable
 
@@ -80,7 +81,7 @@ class Selection(NamedTuple):
 def select(
     table: ParticleTable, where: str | None = None, share: float | None = None, *, density: Callable[[], Any] | None = None
 ) -> Selection:
-    """Particles that meet a condition, and of those a share, chosen at random but always the same.
+    """Particles that meet a condition, and of those a share, chosen at random but always the same: by ids, where there are some.
 
     Args:
         table: the particles.
@@ -103,11 +104,22 @@ def select(
             raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
         some = np.flatnonzero(kept)
         number = min(max(round(share * len(some)), 1), len(some))
-        chosen = np.random.default_rng(0).permutation(some)[:number]
+        chosen = some[_shuffled(table)[some].argsort(kind="stable")[:number]]
         notes.append(f"a share of {share:g}: {number:,} of {len(some):,} particles, for a quick look: their field is another one")
         kept = np.zeros(len(table), bool)
         kept[chosen] = True
     return Selection(kept, tuple(notes))
+
+
+def _shuffled(table: ParticleTable) -> np.ndarray:
+    """Numbers to draw by, one a particle: of ids, such that a share is of the same particles in each file of a sequence."""
+    ids = ids_of(table)
+    if isinstance(ids, str):
+        return np.random.default_rng(0).random(len(table))
+    mixed = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # Steele, Lea & Flood 2014: splitmix64
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint64(31)))
 
 
 def _met(table: ParticleTable, where: str, density: Callable[[], Any] | None) -> tuple[np.ndarray, str]:

@@ -1,0 +1,105 @@
+"""Projections as files: raw values come back, pictures have their colours, and a file is whole or not there."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image as Pillow
+
+import jaxsph as js
+from jaxsph import io
+
+
+def made(mean=False, name="column.mass"):
+    values = np.geomspace(1e-3, 10, 12, dtype=np.float32).reshape(3, 4)
+    weight = np.where(np.arange(12).reshape(3, 4) == 5, 0, 1).astype(np.float32)
+    values = np.where(weight > 0, values, np.nan) if mean else np.where(weight > 0, values, 0)
+    known = (("jaxsph.kernel", "cubic_spline"),)
+    return js.Projection(
+        jnp.asarray(values), jnp.asarray(weight) if mean else None, jnp.float32(0.25), False, 0, name, "Msun/kpc**2", known
+    )
+
+
+@pytest.mark.parametrize("mean", [False, True])
+@pytest.mark.parametrize("name", ["column.mass", "Z", "log10:Density of gas"])
+def test_exr_files_come_back_with_all_that_is_known(tmp_path, mean, name):
+    image = made(mean, name)
+    image.save(tmp_path / "a.exr")
+    found = io.read_projection(tmp_path / "a.exr")
+    np.testing.assert_array_equal(found.values, image.values)
+    assert (found.weight is None) != mean and (found.name, found.unit, found.perspective) == (name, "Msun/kpc**2", False)
+    np.testing.assert_allclose(found.pixel_area, 0.25)
+    assert ("jaxsph.kernel", "cubic_spline") in found.metadata
+    if not mean:
+        np.testing.assert_allclose(found.total(), np.asarray(image.values).sum() * 0.25, rtol=1e-6)
+
+
+def test_numpy_files_hold_values_in_their_precision(tmp_path, x64):
+    image = dataclasses.replace(made(), values=jnp.asarray(made().values, np.float64))
+    image.save(tmp_path / "a.npy")
+    found = np.load(tmp_path / "a.npy", allow_pickle=False)
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, image.values)
+
+
+def test_pictures_have_the_colours_of_a_map_black_where_no_mean_is(tmp_path):
+    made(mean=True).save(tmp_path / "a.png", colormap="heat", norm="log", value_span=(1e-3, 10))
+    with Pillow.open(tmp_path / "a.png") as opened:
+        picture = np.asarray(opened)
+        assert opened.text["jaxsph.colors"] == "log 0.001 to 10" and opened.text["jaxsph.unit"] == "Msun/kpc**2"
+    assert (picture[1, 1] == 0).all() and picture[2, 3].sum() > picture[0, 0].sum()
+    np.testing.assert_array_equal(picture, made(mean=True).to_uint8("heat", "log", (1e-3, 10)))
+    amounts = made().to_uint8("viridis")  # nothing is as dark as the least that is shown
+    np.testing.assert_array_equal(amounts[1, 1], made().to_uint8("viridis", "log", (1.0, 10))[0, 0])
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".npy", ".png"])
+def test_a_file_is_written_whole_or_not_at_all(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"a{suffix}"
+    made().save(path)
+    before = path.read_bytes()
+
+    def fails(*given, **more):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", fails)
+    monkeypatch.setattr(Pillow.Image, "save", fails)
+    monkeypatch.setattr(OpenEXR.File, "write", lambda *given: fails())
+    with pytest.raises((ValueError, OSError), match="No space"):
+        made().save(path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_written_is_said(tmp_path, x64):
+    with pytest.raises(ValueError, match=r"written as \.exr, \.npy, \.png, not as '\.jpg'"):
+        made().save(tmp_path / "a.jpg")
+    with pytest.raises(ValueError, match="`colormap` is for pictures"):
+        made().save(tmp_path / "a.exr", colormap="heat")
+    large = dataclasses.replace(made(), values=jnp.full((2, 2), 1e300, np.float64))
+    with pytest.raises(ValueError, match="that float32 cannot hold"):
+        large.save(tmp_path / "a.exr")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_projection_is_refused_by_name(tmp_path):
+    with pytest.raises(FileNotFoundError, match="none"):
+        io.read_projection(tmp_path / "none.exr")
+    layer = np.zeros((4, 5), np.float32)
+    io.write_image(tmp_path / "light.exr", js.Image(np.zeros((4, 5, 3), np.float32), layer, layer, layer, layer, True, 0, {}, ()))
+    with pytest.raises(ValueError, match=r"light\.exr.*holds no projection.*read_image"):
+        io.read_projection(tmp_path / "light.exr")
+    made().save(tmp_path / "a.exr")
+    whole = (tmp_path / "a.exr").read_bytes()
+    for stop in (0, 3, 40, len(whole) // 2):
+        (tmp_path / "cut.exr").write_bytes(whole[:stop])
+        with pytest.raises(ValueError, match=r"cut\.exr"):
+            io.read_projection(tmp_path / "cut.exr")
+
+
+def test_totals_are_of_amounts_in_parallel_rays():
+    with pytest.raises(ValueError, match="means are not added up"):
+        made(mean=True).total()
+    with pytest.raises(ValueError, match="pixels of a perspective camera have no area"):
+        dataclasses.replace(made(), perspective=True).total()
