@@ -23,7 +23,7 @@ WorkerPlugin: Any = distributed.WorkerPlugin
 CLOSING = 10.0
 """Seconds that workers have to end by themselves; those that compile do not hear, and are killed."""
 PROFILE = "distributed.worker.profile.enabled"
-"""Whether Dask looks at what its workers are at, 100 times a second: nobody reads it here, and it is half of what idle ones use."""
+"""Whether Dask looks at what its workers are at, 100 times a second: half of what idle ones use, and nobody reads it here."""
 CACHE = (
     "jax_enable_compilation_cache",
     "jax_compilation_cache_dir",
