@@ -19,6 +19,8 @@ distributed = pytest.importorskip("distributed")
 SETTINGS = js.Settings(samples=16)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=24, height=16, near=2, far=6)
 LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])
+NO_PAGES = {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}, "dashboard_address": None}
+IN_THIS_PROCESS = {"n_workers": 1, "threads_per_worker": 1, "processes": False, **NO_PAGES}
 LAYERS = ("color", "transmittance", "depth", "error_bound", "evaluations")
 
 
@@ -47,8 +49,7 @@ def same(one, other):
 @pytest.fixture(scope="module")
 def client():
     """Of a worker that is a thread of this process, so that what is compiled serves both."""
-    how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(**how) as cluster, distributed.Client(cluster) as made:
+    with distributed.LocalCluster(**IN_THIS_PROCESS) as cluster, distributed.Client(cluster) as made:
         yield made
 
 
@@ -220,7 +221,9 @@ def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_start
 
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_the_sequence_and_says_so(tmp_path):
-    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None)
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, scheduler_kwargs=NO_PAGES
+    )
     with distributed.Client(cluster) as made:
         frames = js.render_frames(sources(30), CAMERA, SETTINGS, made, output=tmp_path)
         next(frames)
