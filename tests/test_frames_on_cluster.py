@@ -221,9 +221,7 @@ def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_start
 
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_the_sequence_and_says_so(tmp_path):
-    cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, scheduler_kwargs=NO_PAGES
-    )
+    cluster = distributed.LocalCluster(**IN_THIS_PROCESS)
     with distributed.Client(cluster) as made:
         frames = js.render_frames(sources(30), CAMERA, SETTINGS, made, output=tmp_path)
         next(frames)
