@@ -45,6 +45,7 @@ RETRIES = 2
 """How often a frame is tried again that failed by anything but its data, such as a file system that was away."""
 SHARED = 4
 """Scenes and sequences that are kept by the cluster, the latest: frames come from few."""
+GONE = "the scheduler of the cluster is gone ({}); frames that are written stay"
 LARGE = "distributed.admin.large-graph-warning-threshold"
 
 
@@ -133,6 +134,8 @@ class _Sequence:
                 if number not in ready:
                     break
                 yield ready.pop(number)
+        except OSError as error:  # what is wrong with a frame is in its outcome
+            raise RuntimeError(GONE.format(type(error).__name__)) from error
         finally:
             with contextlib.suppress(Exception):  # of a cluster that is gone nothing is on the way
                 self._client.cancel([future for future, _ in running.values()])
@@ -152,6 +155,8 @@ class _Sequence:
         finished.add(future)
 
     def _room(self) -> int:
+        if self._client.status != "running":
+            raise RuntimeError(GONE.format(self._client.status))
         return AHEAD * max(len(self._client.nthreads()), 1)
 
     def _send(self, task: FrameTask, what: str) -> Any:
@@ -166,7 +171,7 @@ class _Sequence:
         """What became of a frame, once it is known; what no other frame would escape is raised."""
         error = future.exception()
         if future.status not in ("finished", "error"):
-            raise RuntimeError(f"the scheduler of the cluster is gone ({future.status}); frames that are written stay")
+            raise RuntimeError(GONE.format(future.status))
         outcome: Outcome = Outcome(error=error) if error is not None else future.result()
         if isinstance(outcome.error, UnwritableError | ImportError):
             raise outcome.error

@@ -18,9 +18,12 @@ import jax
 from jaxsph.io.optional import require
 
 distributed = require("distributed", "frames on several processes", "cluster")
+dask: Any = require("dask", "frames on several processes", "cluster")
 WorkerPlugin: Any = distributed.WorkerPlugin
 CLOSING = 10.0
 """Seconds that workers have to end by themselves; those that compile do not hear, and are killed."""
+PROFILE = "distributed.worker.profile.enabled"
+"""Whether Dask looks at what its workers are at, 100 times a second: half of what idle ones use, and nobody reads it here."""
 CACHE = (
     "jax_enable_compilation_cache",
     "jax_compilation_cache_dir",
@@ -55,7 +58,8 @@ def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterato
     )
     how = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "silence_logs": logging.CRITICAL}
     no_pages = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # at any free port, as several may run
-    cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
+    with dask.config.set({PROFILE: False}):
+        cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
     try:
         with distributed.Client(cluster) as client:
             client.register_plugin(share)

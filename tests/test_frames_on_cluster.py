@@ -1,5 +1,6 @@
 """Frames on a cluster: the same bits as without one, whatever dies or is damaged on the way."""
 
+import argparse
 import os
 import signal
 import threading
@@ -10,14 +11,16 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph import frames_on_cluster
-from jaxsph.workers import local_client, share_of
+from jaxsph import frames_on_cluster, workers
+from jaxsph.workers import Share, local_client, share_of
 
 distributed = pytest.importorskip("distributed")
 
 SETTINGS = js.Settings(samples=16)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=24, height=16, near=2, far=6)
 LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])
+NO_PAGES = {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}, "dashboard_address": None}
+IN_THIS_PROCESS = {"n_workers": 1, "threads_per_worker": 1, "processes": False, **NO_PAGES}
 LAYERS = ("color", "transmittance", "depth", "error_bound", "evaluations")
 
 
@@ -46,8 +49,7 @@ def same(one, other):
 @pytest.fixture(scope="module")
 def client():
     """Of a worker that is a thread of this process, so that what is compiled serves both."""
-    how = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(**how) as cluster, distributed.Client(cluster) as made:
+    with distributed.LocalCluster(**IN_THIS_PROCESS) as cluster, distributed.Client(cluster) as made:
         yield made
 
 
@@ -190,18 +192,42 @@ def test_an_iterable_that_ends_too_early_is_told_of_after_its_frames(client):
         next(frames)
 
 
-@pytest.mark.parametrize("workers", [0, -1, 1.5, True])
-def test_numbers_of_workers_that_make_no_sense_are_refused(workers):
-    with pytest.raises(ValueError, match="`workers` must be an integer of at least 1"), local_client(workers):
+@pytest.mark.parametrize("number", [0, -1, 1.5, True])
+def test_numbers_of_workers_that_make_no_sense_are_refused(number):
+    with pytest.raises(ValueError, match="`workers` must be an integer of at least 1"), local_client(number):
         pass
 
 
-@pytest.mark.parametrize(("cores", "workers"), [(8, 2), (7, 3), (2, 2), (2, 5), (1, 1)])
-def test_every_worker_has_cores_and_every_core_a_worker(cores, workers):
-    shares = [share_of(range(cores), place, workers) for place in range(workers)]
+@pytest.mark.parametrize(("cores", "number"), [(8, 2), (7, 3), (2, 2), (2, 5), (1, 1)])
+def test_every_worker_has_cores_and_every_core_a_worker(cores, number):
+    shares = [share_of(range(cores), place, number) for place in range(number)]
     assert all(shares) and set().union(*shares) == set(range(cores))
-    if workers <= cores:
+    if number <= cores:
         assert sum(map(len, shares)) == cores
+
+
+def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_started_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    before = jax.config.jax_compilation_cache_dir
+    shares = Share(4, [], workers._accelerators(), {"jax_compilation_cache_dir": str(tmp_path)})
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        shares.setup(argparse.Namespace(name=3))
+        assert os.environ["CUDA_VISIBLE_DEVICES"] == "5" and jax.config.jax_compilation_cache_dir == str(tmp_path)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+        signal.signal(signal.SIGINT, handler)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_sequence_and_says_so(tmp_path):
+    cluster = distributed.LocalCluster(**IN_THIS_PROCESS)
+    with distributed.Client(cluster) as made:
+        frames = js.render_frames(sources(30), CAMERA, SETTINGS, made, output=tmp_path)
+        next(frames)
+        cluster.close()
+        with pytest.raises(RuntimeError, match="the scheduler of the cluster is gone"):
+            list(frames)
 
 
 @pytest.mark.slow
