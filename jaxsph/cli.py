@@ -119,9 +119,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_parts(render)
     cli_where.add_places(render)
     cli_disk.add_options(render)
-    render.add_argument(
-        "-o", "--output", type=Path, metavar="OUT", help=".exr or .png; of several files a folder, or a name with {} in it"
-    )
+    where = ".exr or .png; of several files a folder, or a name with {} in it"
+    render.add_argument("-o", "--output", type=Path, metavar="OUT", help=where)
     cli_options.add_picture(render)
     cli_options.add_control(render)
     cli_transfer.add_looks(render)

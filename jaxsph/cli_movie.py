@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph import cli_cluster, cli_frames, cli_transfer, cli_where, io, scenes
+from jaxsph import cli_cluster, cli_frames, cli_particles, cli_transfer, cli_where, io, scenes
 from jaxsph.cli_points import Together
 from jaxsph.console import UsageError, camera_line, progress, say, span
 from jaxsph.frame_task import FramesError, Source, Still
@@ -149,16 +149,15 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
             raise UsageError(f"--{name} is not for a sequence of particle files")
     if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
         raise UsageError(f"--support must be > 0, got {options.support:g}")
-    reading = Reading(
-        options.quantity, options.support, options.kernel or "poly6", options.part_type, **cli_where.selected(options)
-    )
+    more = {**cli_where.selected(options), "opacity_by": cli_particles.opacity_by(options)}
+    reading = Reading(options.quantity, options.support, options.kernel or "poly6", options.part_type, **more)
     with progress("read", " files") as show, cli_where.conditions():
         survey = _surveyed(options, reading, show)
     _say_survey(survey)
     asked = options.range
     if options.transfer is None:
         options.range = options.range or survey.span
-    transfer = cli_transfer.look(survey.middle, options, survey.quantity)
+    transfer = cli_transfer.look(survey.middle, options, survey.quantity, cli_particles.ramp_of(survey.report))
     of_range = "as asked for" if asked else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     center = cli_where.middle_of(survey, options)

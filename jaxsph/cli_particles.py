@@ -32,8 +32,12 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
         say("note", note)
     cli_annotate.label_file(table, report.quantity, columns["quantity"], options, report.opacity_by)
     particles = cli_where.centered(particles, options)
-    ramp = "steep" if report.opacity_by is not None else "even" if report.quantity in COORDINATES else None
-    return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity, ramp)), particles
+    return Scene(particles=particles, transfer=cli_transfer.look(particles, options, report.quantity, ramp_of(report))), particles
+
+
+def ramp_of(report: io.Report) -> str | None:
+    """How extinction depends on its quantity by default, see `scenes.default_transfer`."""
+    return "steep" if report.opacity_by is not None else "even" if report.quantity in COORDINATES else None
 
 
 def describe(options: argparse.Namespace) -> Particles:
@@ -59,11 +63,11 @@ def _particles(table: io.ParticleTable, options: argparse.Namespace) -> tuple[Pa
     kernel = options.kernel or "poly6"
     with cli_where.conditions():
         return io.particles_from_table(
-            table, options.quantity, options.support, kernel, opacity_by=_opacity_by(options), **cli_where.selected(options)
+            table, options.quantity, options.support, kernel, opacity_by=opacity_by(options), **cli_where.selected(options)
         )
 
 
-def _opacity_by(options: argparse.Namespace) -> str | None:
+def opacity_by(options: argparse.Namespace) -> str | None:
     """What opacity is looked up by: nothing of its own where the whole transfer function is said."""
     if options.opacity_by is not None:
         return str(options.opacity_by)

@@ -39,7 +39,7 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Camera]:
 def source_of(options: argparse.Namespace) -> tuple[Any, Any, Camera | None]:
     """Scene of the source, what there is to frame, and the camera where it has one."""
     if options.source is None:
-        of_source = ("quantity", "support", "kernel", "part_type", "iso", "particles", "frame")
+        of_source = ("quantity", "opacity_by", "support", "kernel", "part_type", "iso", "particles", "frame")
         refuse(
             options, (*of_source, *cli_transfer.LOOKS, *cli_where.OF_PARTICLES), "is for FILE or scene:NAME, and there is none"
         )
@@ -58,7 +58,7 @@ def require_something(options: argparse.Namespace, also: str = "") -> None:
 
 
 def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
-    of_files = ("quantity", "support", "kernel", "part_type", "iso", *cli_where.OF_FILES)
+    of_files = ("quantity", "opacity_by", "support", "kernel", "part_type", "iso", *cli_where.OF_FILES)
     refuse(options, of_files, "is for particle files, not for built-in scenes")
     name = options.source.removeprefix(SCENE)
     width, height = getattr(options, "size", (512, 512))
@@ -80,7 +80,7 @@ def _scene_of_name(options: argparse.Namespace) -> tuple[Scene, Camera]:
 def _scene_of_file(options: argparse.Namespace) -> tuple[Scene, Bounded]:
     refuse(options, ("particles", "frame"), "is for built-in scenes, not for files")
     if io.is_volume(options.source):
-        of_particles = ("support", "kernel", "part_type", *cli_where.OF_PARTICLES)
+        of_particles = ("opacity_by", "support", "kernel", "part_type", *cli_where.OF_PARTICLES)
         refuse(options, of_particles, "is for particles, and this is a volume")
         return cli_volume.scene_of(options)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")

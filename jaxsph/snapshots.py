@@ -75,6 +75,7 @@ class Snapshots:
         share: float | None = None,
         center: Any = None,
         within: Clip | None = None,
+        opacity_by: str | None = None,
         transfer: TransferFunction | None = None,
         colormap: str = "viridis",
         gaps: bool = False,
@@ -90,6 +91,7 @@ class Snapshots:
             box, where, share: as for `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids.
             center: (3,) middle of the periodic box, or "densest" for the densest point of the file in the middle.
             within: where particles are shown; default everywhere.
+            opacity_by: as for `jaxsph.io.read_particles`; `"auto"` by the file in the middle.
             transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
                 that suits the file in the middle.
             colormap: name of a colour map.
@@ -102,10 +104,11 @@ class Snapshots:
             FileNotFoundError: there is no such file.
             ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        reading = Reading(quantity, support, kernel, part_type, box, where, share)
+        reading = Reading(quantity, support, kernel, part_type, box, where, share, opacity_by)
         survey = surveyed(paths, reading, gaps=gaps, strict=strict, progress=progress)
         if transfer is None:
-            transfer = scenes.default_transfer(survey.middle, colormap, survey.span)
+            ramp = None if survey.report.opacity_by is None else "steep"
+            transfer = scenes.default_transfer(survey.middle, colormap, survey.span, ramp=ramp)
         return cls(survey, transfer, center_of(survey, center), within)
 
     @property
@@ -206,7 +209,8 @@ class Snapshots:
                 del self._loaded[min(self._loaded)]
             file = self.survey.files[number]
             table = self.survey.reading.table(file.path)
-            particles, _ = io.particles_from_table(table, self.survey.quantity, *self.survey.reading.how)
+            quantity, by = self.survey.quantity, self.survey.report.opacity_by
+            particles, _ = io.particles_from_table(table, quantity, *self.survey.reading.how, opacity_by=by)
             exact = particles.exact_position()[np.asarray(particles.valid)]
             self._loaded[number] = Loaded(
                 {**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table), velocity_of(table)
@@ -217,7 +221,9 @@ class Snapshots:
         """Particles with room for those of the largest file, and of one structure, so that all frames share programs."""
         wide = self.survey.wide
         position = columns["position"] if wide else columns["position"].astype(np.float32)
-        others = {name: column.astype(position.dtype) for name, column in columns.items() if name != "position"}
+        others: dict[str, Any] = {name: column.astype(position.dtype) for name, column in columns.items() if name != "position"}
+        if "extinction_quantity" in others:
+            others["quantity"] = others["quantity"], others.pop("extinction_quantity")
         made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity, box=self.survey.box)
         if wide and made.dtype == jnp.float32 and made.position_rest is None:
             made = dataclasses.replace(made, position_rest=jnp.asarray(np.zeros(made.position.shape, np.float32)))

@@ -38,6 +38,7 @@ class Reading:
     box: Any = "file"
     where: str | None = None
     share: float | None = None
+    opacity_by: str | None = None
 
     @property
     def how(self) -> tuple[float | None, str]:
@@ -220,7 +221,7 @@ def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
             if path == nearest[-1]:
                 raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error
             continue
-        return io.particles_from_table(table, reading.quantity, *reading.how)
+        return io.particles_from_table(table, reading.quantity, *reading.how, opacity_by=reading.opacity_by)
     raise AssertionError("there is a last path")
 
 

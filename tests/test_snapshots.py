@@ -197,3 +197,13 @@ def test_conditions_and_middles_that_make_no_sense_are_refused(tmp_path):
         js.Snapshots.from_files(paths, where="temperature > 1e9")
     with pytest.raises(ValueError, match="`center` is for periodic boxes"):
         js.Snapshots.from_files(paths, center=(0, 0, 0))
+
+
+def test_opacity_by_density_is_carried_from_file_to_file(tmp_path):
+    density = np.geomspace(1e-3, 1, 200)
+    paths = [write(tmp_path, number, density=(1 + number) * density, mass=np.ones(200)) for number in range(2)]
+    snapshots = js.Snapshots.from_files(paths, "temperature", opacity_by="auto")
+    found = snapshots.at(0.25)
+    expected = np.log10(density) + 0.5 * np.log10(2)
+    np.testing.assert_allclose(found.particles.to_numpy()["extinction_quantity"], expected, atol=1e-5)
+    assert found.transfer.extinction_values is not None and float(found.transfer.extinction[0]) == 0
