@@ -59,8 +59,7 @@ def project(
     it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see `emission`.
 
     Args:
-        particles: kernel and supports are theirs; nothing is normalised. Of a periodic set, parallel rays along an axis of its
-            box meet what that holds, supports across its faces included; other cameras see each particle once, with all of it.
+        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic_views`.
         camera: where from, how large the image is, and the depths that rays begin and end at.
         of: numbers of all particles in their order, or the name of a column of them, `"volume"` or `"quantity"`. Without
             weight: the amounts $a_j$, default the volumes (which then must be true ones, and give the path length inside). With
