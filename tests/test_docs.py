@@ -33,7 +33,7 @@ def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
 
 
 def test_there_are_blocks_to_run():
-    assert len(BLOCKS) == 8 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
+    assert len(BLOCKS) == 9 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
 
 
 def test_pictures_and_files_that_are_named_exist():
