@@ -10,11 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jaxsph
 from jaxsph import io, tiles
 from jaxsph.console import UsageError, largest, say
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.render import Progress
-from jaxsph.render import render as render_whole
 
 MORE = "Parts are those of `jaxsph render --tile I/N`, in any order; they must be all of one picture."
 
@@ -59,7 +59,7 @@ def render(
 ) -> Image:
     """The picture, or the part of it that is asked for."""
     if options.tile is None:
-        return render_whole(scene, camera, settings, progress=show, devices=devices)
+        return jaxsph.render(scene, camera, settings, progress=show, devices=devices)
     image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
     first = dict(image.metadata)[tiles.FIRST_ROW]
     say("part", f"{'/'.join(map(str, options.tile))}, rows {first} to {first + image.shape[0] - 1} of {camera.height}")

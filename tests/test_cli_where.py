@@ -31,7 +31,7 @@ def seen(monkeypatch):
     """What the command would have rendered; its picture is black."""
     found = types.SimpleNamespace()
 
-    def render(scene, camera, settings, progress=None):
+    def render(scene, camera, settings, progress=None, devices=None):
         found.scene, found.camera = scene, camera
         layer = np.zeros((camera.height, camera.width), np.float32)
         stats = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0, "seconds": {"cast": 0.0}}
