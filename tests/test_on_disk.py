@@ -29,14 +29,14 @@ def in_memory(path, transfer, camera, settings=SETTINGS):
 
 
 def test_parts_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
-    monkeypatch.setattr(on_disk_module, "BYTES_A_PARTICLE", 2000)
+    monkeypatch.setattr(on_disk_module, "BYTES_A_PARTICLE", 3500)
     columns = particles(6000)
     columns["SmoothingLength"] *= np.float32(0.5)
     path = write(tmp_path, columns, files=3)
     on_disk = js.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, width=96, height=88), on_disk.transfer()
     told = []
-    image = js.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=18 << 20, progress=lambda *at: told.append(at))
+    image = js.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=20 << 20, progress=lambda *at: told.append(at))
     whole = in_memory(path, transfer, camera)
     for layer in ("color", "transmittance", "error_bound"):
         np.testing.assert_allclose(getattr(image, layer), getattr(whole, layer), atol=3e-7)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -54,7 +56,8 @@ def test_the_periodic_box_is_noted(samples, tmp_path):
     samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
     table = io.read_table(tmp_path / "a.hdf5")
     assert table.box_size == (16, 16, 16)
-    assert any("periodic box" in sentence for sentence in table.conventions)
+    _, report = io.particles_from_table(dataclasses.replace(table, position=np.mod(table.position, 16)))
+    assert "periodic box of 16 x 16 x 16: supports reach across its faces" in report.notes
 
 
 def test_without_gas_the_first_type_with_positions_is_read(samples, tmp_path):
