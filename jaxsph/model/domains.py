@@ -24,6 +24,7 @@ References: Webber 2012, *A bi-symmetric log transformation for wide-range data*
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -94,7 +95,7 @@ def log_departure(values: Any, colors: Any) -> float:
     values, colors = np.asarray(values, np.float64), np.asarray(colors, np.float64)
     ratio = values[1:] / values[:-1]
     wide = ratio > 1
-    logarithm = np.log(np.where(wide, ratio, np.e))
+    logarithm = np.log(np.where(wide, ratio, math.e))
     steepest = np.where(wide, (ratio - 1) / logarithm, 1)
     part = np.where(wide, np.log(steepest) / logarithm - (steepest - 1) / np.where(wide, ratio - 1, 1), 0)
     change = np.abs(np.diff(colors.reshape(len(values), -1), axis=0)).max(1)
