@@ -30,8 +30,8 @@ from workloads import view
 import jaxsph as js
 from jaxsph.io.replace import written_whole
 from jaxsph.provenance import of_frame, of_this_run
-from jaxsph.reference_chords import Spheres, rays_of
-from jaxsph.reference_media import to_view
+from jaxsph.reference.chords import Spheres, rays_of
+from jaxsph.reference.media import to_view
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 RESULTS = pathlib.Path(__file__).with_name("results") / "truth.json"

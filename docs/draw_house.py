@@ -368,7 +368,7 @@ def picture(root: Path = ROOT) -> str:
     package = root / PACKAGE
     settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
-    (layers,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    (layers,) = (contract["layers"] for contract in contracts if contract.get("containers") == [PACKAGE])
     names = rooms_of(package)
     imports = {room: imports_of(package, room, names) for room in names}
     floors = floors_of(layers, imports)

@@ -1,6 +1,6 @@
 """How far images are from the light integral, at random pixels of a frame.
 
-Flow: scene, camera -> reference_integral -> [integral_error] -> sweep.
+Flow: scene, camera -> reference -> [integral_error] -> sweep.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.model import Camera, Image, Scene
-from jaxsph.reference_integral import integral
+from jaxsph.reference import integral
 
 SEED = 0
 TOLERANCE = 1e-6  # of the integral itself: far below any tolerance that images are asked for

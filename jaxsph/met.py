@@ -20,10 +20,10 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.scales import Scale
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.reference_chords import Rays, blocks, rays_of
-from jaxsph.reference_looks import INTEGRATION, AtNodes, Look, light_of
-from jaxsph.reference_media import AllOfVolume, AllParticles, Part, Whole, parts_of
-from jaxsph.reference_portions import Portions, cut
+from jaxsph.reference.chords import Rays, blocks, rays_of
+from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
+from jaxsph.reference.media import AllOfVolume, AllParticles, Part, Whole, parts_of
+from jaxsph.reference.portions import Portions, cut
 
 BLOCK = 128  # rays that share arrays
 WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2

@@ -10,6 +10,7 @@ from unittest import mock
 import numpy as np
 
 import jaxsph as js
+from jaxsph.reference import image as reference_image
 
 EPS = float(np.finfo(np.float32).eps)
 FORWARD = -np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
@@ -101,14 +102,14 @@ def error_and_allowance(image, scene, camera, settings, draws=6):
     truth = layers(js.reference.render(scene, camera, settings))
     part = (4 + np.log(float(camera.far) / float(camera.near)) / 2 if camera.is_perspective else 4) * EPS
     rng, change = np.random.default_rng(0), np.zeros(truth.shape[:2])
-    depth = js.reference._depth
+    depth = reference_image._depth
     for _ in range(draws):
 
         def shaken_depth(*at):
             exact = depth(*at)
             return exact + part * np.abs(exact) * rng.uniform(-1, 1, exact.shape)
 
-        with mock.patch.object(js.reference, "_depth", shaken_depth):
+        with mock.patch.object(reference_image, "_depth", shaken_depth):
             shaken = layers(js.reference.render(moved(scene, camera, rng, part), camera, settings))
         change = np.maximum(change, np.abs(shaken - truth).max(-1))
     return np.abs(layers(image) - truth).max(-1), 64 * EPS + 2 * change

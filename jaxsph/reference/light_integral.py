@@ -1,6 +1,6 @@
 r"""The light integral itself, along the ray of each pixel, in float64 NumPy: what every way of sampling it is judged by.
 
-Flow: scene, camera, pixels -> rays -> portions -> light of portions, halved until it is known -> [reference_integral] -> image.
+Flow: scene, camera, pixels -> rays -> portions -> light of portions, halved until it is known -> [light_integral] -> image.
 
 $I = \int T(l)\,c(l)\,\sigma(l)\,dl$ over the path length l, with $T(l) = \exp(-\int_0^l \sigma)$.
 """
@@ -17,10 +17,10 @@ from jaxtyping import Int
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.reference_chords import Rays, blocks, rays_of
-from jaxsph.reference_looks import AtNodes, Light, light_of, where_thickness
-from jaxsph.reference_media import Part, Whole, parts_of
-from jaxsph.reference_portions import Portions, cut
+from jaxsph.reference.chords import Rays, blocks, rays_of
+from jaxsph.reference.looks import AtNodes, Light, light_of, where_thickness
+from jaxsph.reference.media import Part, Whole, parts_of
+from jaxsph.reference.portions import Portions, cut
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20

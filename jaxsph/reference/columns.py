@@ -1,6 +1,6 @@
 """Projections in the oracle: particle by particle, by quadrature of kernels along rays in float64 NumPy, with no closed form.
 
-Flow: particles, camera -> [reference_columns] -> Projection.
+Flow: particles, camera -> [columns] -> Projection.
 """
 
 from __future__ import annotations

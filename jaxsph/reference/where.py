@@ -1,6 +1,6 @@
 """Where a scene is shown, in float64 NumPy: clips at points and along rays, and periodic sets as explicit copies.
 
-Flow: scene -> [reference_where] -> reference, reference_media.
+Flow: scene -> [where] -> image, media.
 
 Written apart from `model.clips` and `model.periodic`, which are judged by it: in world space, with all copies of all particles.
 """

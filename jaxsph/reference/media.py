@@ -1,6 +1,6 @@
 """What a scene has along rays, in float64: particles, volumes and points at the nodes of portions.
 
-Flow: scene, rays -> [reference_media] -> cuts of rays; portions -> [reference_media] -> extinction and emission at nodes.
+Flow: scene, rays -> [media] -> cuts of rays; portions -> [media] -> extinction and emission at nodes.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference_chords import NO_CHORDS, Chords, Rays, Spheres
-from jaxsph.reference_looks import NODES, PLACE, AtNodes, Look
-from jaxsph.reference_points import at_offset, kinks
-from jaxsph.reference_portions import Cuts, Lists, Portions, borders, lists
-from jaxsph.reference_where import columns_of, crossings, inside
+from jaxsph.reference.chords import NO_CHORDS, Chords, Rays, Spheres
+from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
+from jaxsph.reference.points import at_offset, kinks
+from jaxsph.reference.portions import Cuts, Lists, Portions, borders, lists
+from jaxsph.reference.where import columns_of, crossings, inside
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 

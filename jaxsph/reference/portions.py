@@ -1,6 +1,6 @@
 """Rays cut into portions: nothing begins or ends inside of a portion, and a list says which chords lie over it.
 
-Flow: rays, chords -> [reference_portions] -> reference_media -> reference_integral.
+Flow: rays, chords -> [portions] -> media -> light_integral.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.reference_chords import Chords, Rays, ranges
+from jaxsph.reference.chords import Chords, Rays, ranges
 
 LONGEST = 0.25  # of a support: see `borders`
 FEW = 4  # chords, see `borders`

@@ -1,6 +1,6 @@
 """The oracle: the same image in float64 NumPy, particle by particle and sample by sample, with no grid and no cleverness.
 
-Flow: scene, camera -> [reference] -> image.
+Flow: scene, camera -> [image] -> Image.
 
 It follows Hochstetter et al. 2016, sections 2.1 and 2.2, line by line and is what every other renderer here is judged by. Slow:
 about 50 M particle-sample evaluations a second, and two float64 numbers of memory a sample.
@@ -22,13 +22,9 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference_columns import project
-from jaxsph.reference_integral import integral
-from jaxsph.reference_points import thickness
-from jaxsph.reference_where import columns_of, to_world
-from jaxsph.reference_where import inside as within
-
-__all__ = ["field", "integral", "project", "render", "sample_depths"]
+from jaxsph.reference.points import thickness
+from jaxsph.reference.where import columns_of, to_world
+from jaxsph.reference.where import inside as within
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
 """What a part of a scene has in a sample of every ray: its optical thickness, and the same times colour."""

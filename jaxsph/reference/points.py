@@ -1,6 +1,6 @@
 """Points in the oracle: how much of each lies in each sample of each ray, by quadrature of what a profile is.
 
-Flow: Points, rays, borders of samples -> [reference_points] -> reference.
+Flow: Points, rays, borders of samples -> [points] -> image.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where rays pass spheres, in float64: rays of chosen pixels, and their entries into and exits from supports.
 
-Flow: camera, pixels -> rays; rays, spheres -> [reference_chords] -> reference_portions, reference_media.
+Flow: camera, pixels -> rays; rays, spheres -> [chords] -> portions, media.
 """
 
 from __future__ import annotations

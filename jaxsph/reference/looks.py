@@ -1,6 +1,6 @@
 """Light along portions of rays from what a quantity is at Chebyshev nodes: transfer functions, their kinks and jumps, quadrature.
 
-Flow: quantity at nodes of portions -> [reference_looks] -> extinction and emission at nodes -> light of portions.
+Flow: quantity at nodes of portions -> [looks] -> extinction and emission at nodes -> light of portions.
 
 On a portion whatever is smooth is taken as the polynomial through `NODES` nodes, ends included; the polynomial through every
 second of them says how good that is.
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.reference_portions import Portions
+from jaxsph.reference.portions import Portions
 
 NODES = 9
 PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 1
