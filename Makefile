@@ -1,4 +1,4 @@
-# make setup: .venv with everything. make test: lint and the whole suite. make notebooks: they run. make demo: one picture.
+# make setup: .venv with everything. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README. make demo: one picture.
 # Nothing but Python is needed.
 # make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
 SHELL := /bin/bash
@@ -56,7 +56,7 @@ test-endurance: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q -m endurance $(PYTEST_ARGS) tests/test_endurance.py
 
 notebooks: $(VENV)/.installed-test
-	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py
+	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .

@@ -9,6 +9,7 @@ from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
 from jaxsph.frame_task import FrameFile, FramesError
 from jaxsph.frames import render_frames
+from jaxsph.from_disk import render_from_disk
 from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.clips import Box, Plane, Sphere
@@ -16,7 +17,7 @@ from jaxsph.model.domains import control_values
 from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
-from jaxsph.on_disk import OnDisk, render_from_disk
+from jaxsph.on_disk import OnDisk
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive

@@ -13,11 +13,12 @@ import numpy as np
 
 from jaxsph import cli_scene, cli_transfer, cli_where
 from jaxsph.console import UsageError, camera_line, progress, say, span, time_line
+from jaxsph.from_disk import render_from_disk
 from jaxsph.io.snapshot_index import index_path
 from jaxsph.io.snapshot_rows import Snapshot
 from jaxsph.io.snapshot_sort import sort_snapshot
 from jaxsph.model import Image, Settings
-from jaxsph.on_disk import OnDisk, render_from_disk
+from jaxsph.on_disk import OnDisk
 
 OTHERS = ("volume", "points", "iso", "support", "particles", "frame", *cli_where.CLIPS)
 """Options of what cannot be rendered part by part."""
@@ -63,9 +64,9 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     camera = cli_scene.camera_of(on_disk, options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
-    with progress("render", " parts") as show:
+    with progress("render", " blocks") as show:
         image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * 2**30), progress=show)
-    say("parts", f"{image.stats['parts']}, of at most {image.stats['most_particles']:,} particles")
+    say("blocks", f"{image.stats['blocks']}, of at most {image.stats['most_particles']:,} particles")
     say("time", time_line(image, time.perf_counter() - started))
     return image
 

@@ -1,11 +1,6 @@
-"""Pictures of snapshots that are larger than memory: each part of the image has the particles that its rays can meet, no others.
+"""Snapshots whose particles stay on disk: a sample of them, and those that a region can see.
 
-Flow: snapshot, index -> rows of a part -> runs that they can see -> particles -> view -> [on_disk] -> parts -> Image.
-
-All rays of a part find what they would find among all particles, in the same order. Two things of a picture depend on particles
-elsewhere, too: classes of supports on the widest, strengths on the strongest. Those two come along with every part. So pixels are
-the same bits as those of the whole in memory, if what is chosen by how large supports appear, of a sample here, is chosen alike;
-where supports reach around the eye or across near and far, they are so to rounding.
+Flow: snapshot, index, region -> [on_disk: OnDisk] -> columns of particles -> from_disk.
 """
 
 from __future__ import annotations
@@ -13,36 +8,21 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.access.lists import TILE
-from jaxsph.along_rays import along_rays
-from jaxsph.field.in_octree import reachable
 from jaxsph.io.assemble import opacity_of
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
 from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes
 from jaxsph.io.table import ParticleTable
-from jaxsph.measures import Measures
 from jaxsph.model.camera import Camera
-from jaxsph.model.frusta import Planes, between_depths, seen_by_rows
-from jaxsph.model.image import Image
-from jaxsph.model.particles import Particles, capacity_class
-from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
+from jaxsph.model.frusta import Planes, between_depths
+from jaxsph.model.particles import Particles
 from jaxsph.model.transfer import TransferFunction
-from jaxsph.numerics import free_memory
-from jaxsph.numerics.executors import Clock
-from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted
-from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
-from jaxsph.render import Progress, image_of
-from jaxsph.tiles import joined, of_rows
-from jaxsph.viewing import Seen
 
 MEMORY = 1 << 30
 SAMPLED = 1 << 16
@@ -202,168 +182,3 @@ def _sampled(snapshot: Snapshot, index: SnapshotIndex) -> ParticleTable:
     supports = [table.support for table in tables if table.support is not None]
     position = np.concatenate([table.position for table in tables])
     return dataclasses.replace(tables[0], position=position, columns=columns, support=np.concatenate(supports))
-
-
-class Parts(NamedTuple):
-    """How a picture is cut.
-
-    Attributes:
-        rows: first row of each part, and the end of the last.
-        capacity: room for particles of each.
-    """
-
-    rows: list[int]
-    capacity: int
-
-    def __len__(self) -> int:
-        return len(self.rows) - 1
-
-
-def render_from_disk(
-    on_disk: OnDisk,
-    transfer: TransferFunction,
-    camera: Camera,
-    settings: Settings | None = None,
-    *,
-    memory: int = MEMORY,
-    progress: Progress | None = None,
-) -> Image:
-    """Render a snapshot that is larger than memory.
-
-    Rows of the image are rendered part by part, each with the particles whose supports its rays can meet; those of the next part
-    are read meanwhile. A snapshot whose rows are ordered in space is read about once, one whose are not once a part: see
-    `jaxsph.io.sort_snapshot`.
-
-    Args:
-        on_disk: the snapshot.
-        transfer: what its particles look like: `on_disk.transfer()`.
-        camera, settings: as for `jaxsph.render`; no quadtree of rays, nor octree integrators.
-        memory: bytes that particles and what is made of them may take, beyond the interpreter and compiled programs.
-        progress: called as `progress(done, total)` after every part.
-
-    Returns:
-        As `jaxsph.render` of all particles, not repeated across the faces of a periodic box; `stats["parts"]` and
-        `stats["most_particles"]` say how many parts there were, and how many particles the fullest had.
-
-    Raises:
-        ValueError: memory that does not suffice for a single row of tiles (how much does), a screen or an integrator that
-            needs all particles; as `jaxsph.render`.
-    """
-    settings = settings or Settings()
-    if settings.screen == "quadtree":
-        raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
-    parts = cut(on_disk, camera, memory)
-    left = max(memory - READ_BYTES * parts.capacity, 1)
-    settings = dataclasses.replace(settings, memory_limit=settings.memory_limit or left)
-    renderer = _Renderer(on_disk, transfer, camera, settings, parts.capacity)
-    always = on_disk.extremes(camera)
-    planes = [seen_by_rows(camera, *ends) for ends in zip(parts.rows[:-1], parts.rows[1:], strict=True)]
-    images, most = [], 0
-    with ThreadPoolExecutor(1, "jaxsph-read") as reader:
-        ahead: Future[Columns] = reader.submit(on_disk.seen_by, planes[0], always)
-        for number, (first, end) in enumerate(zip(parts.rows[:-1], parts.rows[1:], strict=True)):
-            columns = ahead.result()
-            if number + 1 < len(parts):
-                ahead = reader.submit(on_disk.seen_by, planes[number + 1], always)
-            images.append(renderer.part(columns, first, end))
-            free_memory.give_back()
-            most = max(most, len(columns[0]))
-            if progress is not None:
-                progress(number + 1, len(parts))
-    image = joined(images)
-    return dataclasses.replace(image, stats=image.stats | {"parts": len(parts), "most_particles": most})
-
-
-def cut(on_disk: OnDisk, camera: Camera, memory: int) -> Parts:
-    """Parts of as many rows as memory allows, by how many particles of the sample each can see.
-
-    Raises:
-        ValueError: a row of tiles alone needs more.
-    """
-    tile_rows = -(-camera.height // TILE)
-    each = _particles_of(on_disk, camera, tile_rows)
-    room = int((1 - FRAME_SHARE) * memory) // BYTES_A_PARTICLE
-    if max(each) > room:
-        least = int(BYTES_A_PARTICLE * max(each) / (1 - FRAME_SHARE)) + 1
-        raise ValueError(
-            f"`memory` = {memory} bytes is too little: {TILE} rows of pixels see about {max(each):,} particles, "
-            f"which need {least:,}; give more, or look closer"
-        )
-    rows = 1
-    while rows < tile_rows and max(_particles_of(on_disk, camera, -(-tile_rows // (2 * rows)))) <= room:
-        rows *= 2
-    most = max(_particles_of(on_disk, camera, -(-tile_rows // rows)))
-    rows = min(rows, tile_rows)
-    return Parts([*range(0, camera.height, rows * TILE), camera.height], capacity_class(max(most, 1)))
-
-
-def _particles_of(on_disk: OnDisk, camera: Camera, parts: int) -> list[int]:
-    """About how many particles each of so many parts sees, with some to spare."""
-    there = np.asarray(on_disk.sample.valid)
-    position, count = on_disk.sample.exact_position()[there], int(there.sum())
-    support = np.asarray(on_disk.sample.support, np.float64)[there]
-    support = support * np.cbrt(max(count, 1) / max(len(on_disk), 1))  # the sample's are larger
-    tile_rows = -(-camera.height // TILE)
-    rows = -(-tile_rows // parts) * TILE
-    found = []
-    for first in range(0, camera.height, rows):
-        seen = seen_by_rows(camera, first, min(first + rows, camera.height)).meet(position, support)
-        share = (seen.sum() + 2 * np.sqrt(seen.sum()) + 1) / max(count, 1)
-        found.append(int(min(CROWDED * share, 1.0) * len(on_disk)) + 2)
-    return found
-
-
-@dataclasses.dataclass
-class _Renderer:
-    """Parts of one picture, with one plan that grows where it has to."""
-
-    on_disk: OnDisk
-    transfer: TransferFunction
-    camera: Camera
-    settings: Settings
-    capacity: int
-    plan: Plan | None = None
-
-    def part(self, columns: Columns, first: int, end: int) -> Image:
-        """The image of some rows."""
-        self.capacity = max(self.capacity, capacity_class(len(columns[0])))
-        particles = self.on_disk.particles(columns, self.capacity)
-        scene = reachable(Scene(particles=particles, transfer=self.transfer), self.settings)
-        along, clock = along_rays(scene, self.settings), Clock()
-        shape = dataclasses.replace(shape_of_scene(scene, self.camera, along), headroom=1.0, num_classes=self._classes)
-        seen, measures = measured(
-            see(scene, self.camera, shape, clock), self.camera, shape.samples, shape.tuning, stride_of(along)
-        )
-        rows = dataclasses.replace(shape, height=end - first)
-        needed = of_rows(measures, first // TILE, -(-end // TILE))
-        made = fitted(needed, rows, along, self._choices)
-        if self.plan is None or self.plan.height != made.height:
-            roomy = fitted(needed, dataclasses.replace(rows, headroom=CROWDED), along, self._choices)
-            self.plan = roomy
-        self.plan = self.plan.grown(made)
-        clock.mark("plan")
-        return image_of(seen, self.camera, self.settings, self.plan, scene.formulas, clock, None, planned=True, first_row=first)
-
-    @functools.cached_property
-    def _classes(self) -> int:
-        """Of supports, as the whole snapshot has them: `planning` counts octaves."""
-        support = self.on_disk.index.support
-        if not support.size:
-            return 1
-        octaves = np.log2(support.max() / self.on_disk.index.least.min())
-        return int(min(2 + np.ceil(max(octaves, 0)), MAX_CLASSES))
-
-    @functools.cached_property
-    def _choices(self) -> Choices:
-        """By how large supports of the sample appear."""
-        sample = self.on_disk.sample
-        thinned = np.cbrt(max(sample.num_particles, 1) / max(len(self.on_disk), 1))
-        true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
-        scene = reachable(Scene(particles=true, transfer=self.transfer), self.settings)
-        along, clock = along_rays(scene, self.settings), Clock()
-        shape: FrameShape = shape_of_scene(scene, self.camera, along)
-        return choose(self._measured(scene, shape, along, clock)[1], along)
-
-    def _measured(self, scene: Scene, shape: FrameShape, along: Settings, clock: Clock) -> tuple[Seen, Measures]:
-        seen = see(scene, self.camera, shape, clock)
-        return measured(seen, self.camera, shape.samples, shape.tuning, stride_of(along))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.access.lists import TILE
+from jaxsph.access.lists import BUNDLE, TILE
 from jaxsph.along_rays import along_rays
 from jaxsph.field.in_octree import reachable
 from jaxsph.io.exr import FIRST_ROW, ROWS
@@ -208,12 +208,21 @@ def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[s
         raise ValueError(f"{names[0]} begins at row {begins[0]}, not 0; render it again")
 
 
-def joined(parts: list[Image]) -> Image:
-    """The image of rows that follow on one another."""
-    layers = ("color", "transmittance", "depth", "error_bound", "evaluations")
-    whole = {name: jnp.concatenate([getattr(part, name) for part in parts]) for name in layers}
+LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
+
+
+def of_columns(image: Image, left: int, right: int) -> Image:
+    """Some columns alone, from the border of a tile to that of another or of the image."""
+    layers = {name: getattr(image, name)[:, left:right] for name in LAYERS}
+    levels = None if image.levels is None else image.levels[..., left // BUNDLE : -(-right // BUNDLE)]
+    return dataclasses.replace(image, **layers, levels=levels)
+
+
+def joined(parts: list[Image], axis: int = 0) -> Image:
+    """The image of rows that follow on one another, or of columns."""
+    whole = {name: jnp.concatenate([getattr(part, name) for part in parts], axis) for name in LAYERS}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = jnp.concatenate(of_cells, axis=1) if len(of_cells) == len(parts) else None
+    levels = jnp.concatenate(of_cells, axis=1 + axis) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

@@ -92,6 +92,7 @@ def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
     assert np.abs(placed - np.asarray(io.read_image(tmp_path / "pasted.exr").color)).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_integral_is(file, tmp_path, capsys):
     arguments = ["--size", "12x8", "--samples", "16"]
     code, out, err = run(capsys, "render", file, "-o", "out.exr", *arguments, "--integrator", "segments", "--tolerance", 0.01)
@@ -124,6 +125,7 @@ def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
     assert run(capsys, "info", "scene:radial")[0] == 0
 
 
+@pytest.mark.slow
 def test_the_demo_prints_paths_tolerance_error_and_time(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "DEMO_CHECK", 8)
     load = js.scenes.load
@@ -231,6 +233,7 @@ def test_a_volume_is_rendered_described_and_cut_at_a_level(tmp_path, monkeypatch
     assert code == 1 and err == ["jaxsph render: ball.vti: has no quantity 'rho'; it has values"]
 
 
+@pytest.mark.slow
 def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(tmp_path, capsys):
     output = tmp_path / "stages.png"
     tiny = ("--particles", "400", "--size", "40x32", "--samples", "16")

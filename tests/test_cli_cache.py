@@ -32,6 +32,7 @@ def command(tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_a_second_process_loads_what_the_first_compiled(command, tmp_path):
     _, said = command(*RENDER)
     assert said.count(COMPILING) == 1 and "once" in said
@@ -52,6 +53,7 @@ def test_without_the_cache_nothing_is_written(command, tmp_path):
     assert not list(tmp_path.rglob("*-cache"))
 
 
+@pytest.mark.slow
 def test_a_folder_that_the_user_names_is_taken(command, tmp_path):
     folder = tmp_path / "mine"
     told, _ = command("info", "--cache", JAX_COMPILATION_CACHE_DIR=str(folder))
@@ -60,6 +62,7 @@ def test_a_folder_that_the_user_names_is_taken(command, tmp_path):
     assert list(folder.iterdir()) and not (tmp_path / "cache").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_is_said_and_does_no_harm(command, tmp_path):
     (tmp_path / "cache").write_text("a file where a folder should be")
     _, said = command(*RENDER)

@@ -21,6 +21,7 @@ def run(capsys, *arguments):
     return code, out, err.splitlines()
 
 
+@pytest.mark.slow
 def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
     assert run(capsys, "render", *SCENE, "-o", "whole.exr")[0] == 0
     assert run(capsys, "render", *SCENE, "--tile", "1/2", "-o", "b.exr")[0] == 0

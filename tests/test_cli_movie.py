@@ -75,6 +75,7 @@ def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, capsy
         assert differs.sum() <= 1
 
 
+@pytest.mark.slow
 def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, _, err = run(capsys, "scene:radial", "--particles", 300, "--orbit", 360, "--frames", 3, *TINY, "-o", "m.mp4")
@@ -84,6 +85,7 @@ def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch
     assert not np.array_equal(images[0], images[2])
 
 
+@pytest.mark.slow
 def test_options_of_which_particles_and_where_hold_for_all_frames(sequence, tmp_path, capsys):
     chosen = ["--where", "temperature > 0 and x < 2", "--share", 0.9, "--clip-box", -2, -2, -2, 2, 2, 2]
     code, out, err = run(capsys, *sequence, "--frames", 2, *chosen, "--box", 9, 9, 9, *TINY, "-o", "a.mp4")

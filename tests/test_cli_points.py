@@ -62,6 +62,7 @@ def framed(camera, *boxes):
     return True
 
 
+@pytest.mark.slow
 def test_a_volume_and_points_share_a_picture_that_is_the_references(files, capsys):
     code, out, err = run(capsys, "render", "gas.vti", "--points", "stars.csv", "-o", "out.exr", *TINY)
     assert (code, err) == (0, [])

@@ -80,6 +80,7 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
         np.testing.assert_allclose(found[there], truth[there], atol=1e-3 * truth[there].max(), err_msg=str(arguments))
 
 
+@pytest.mark.slow
 def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file, capsys):
     whole, some = (values(capsys, "bare.npz", "--of", "density", *more)[0] for more in ([], ["--where", "x < 0.5"]))
     others, out = values(capsys, "bare.npz", "--of", "density", "--where", "x >= 0.5")

@@ -24,6 +24,7 @@ def smaller(code):
     return code
 
 
+@pytest.mark.notebook
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
 def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

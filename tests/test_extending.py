@@ -74,6 +74,7 @@ def test_a_ball_without_particles_is_the_light_integral_but_for_its_borders(adde
     assert float(image.alpha.max()) > 0.5 and (np.asarray(image.alpha)[0] == 0).all()
 
 
+@pytest.mark.slow
 def test_media_share_a_ray_and_are_sorted_in_depth(added):
     """An absent ball changes no bit; an opaque one hides what is behind it, and not what is in front."""
     view, settings, fluid = camera(), js.Settings(samples=128), particles(60)
@@ -88,6 +89,7 @@ def test_media_share_a_ray_and_are_sorted_in_depth(added):
     assert float(both.depth[middle]) <= float(alone.depth[middle])
 
 
+@pytest.mark.slow
 def test_a_ball_is_differentiated_by_what_it_is_made_of(added):
     view, settings, fluid = camera(9, 8), js.Settings(samples=16), particles(20)
     plan = js.plan(js.Scene(**fluid, media=(ball(added),)), view, settings)
@@ -108,6 +110,7 @@ def test_a_ball_is_differentiated_by_what_it_is_made_of(added):
     assert float(of_color[0]) == 0 != float(wanted)
 
 
+@pytest.mark.slow
 def test_trapezoids_integrate_what_point_samples_do_and_better(added):
     """Inside one large support the field is smooth: their error falls faster with the number of samples."""
     position = np.asarray([[0.0, 0, 0], [0.4, 0, 0]], np.float32)
@@ -121,6 +124,7 @@ def test_trapezoids_integrate_what_point_samples_do_and_better(added):
     assert coarse.stats["evaluations"] > 0
 
 
+@pytest.mark.slow
 def test_trapezoids_are_differentiable_without_an_adjoint_of_their_own(added):
     fluid, view, settings = particles(30), camera(13, 11), js.Settings(samples=32, integrator="trapezoids")
     scene = js.Scene(**fluid)
@@ -138,6 +142,7 @@ def test_trapezoids_are_differentiable_without_an_adjoint_of_their_own(added):
         np.testing.assert_allclose(found[k], wanted, rtol=5e-3, atol=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size", [(37, 29), pytest.param((8, 8), marks=pytest.mark.slow), pytest.param((1, 1), marks=pytest.mark.slow)]
 )

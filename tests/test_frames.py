@@ -45,6 +45,7 @@ def snapshots(tmp_path):
     return js.Snapshots.from_files(sorted(tmp_path.glob("s_*.npz")))
 
 
+@pytest.mark.slow
 def test_48_frames_over_6_snapshots_of_different_size_compile_at_most_three_times(snapshots, compiles):
     PROGRAMS.clear()
     cameras = js.CameraPath.orbit(CAMERA, 360, center=(0, 0, 0)).cameras(48)
@@ -66,6 +67,7 @@ def test_an_image_is_the_same_bits_as_alone_whatever_was_rendered_before():
     np.testing.assert_allclose(together[2].color, expected.color, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_sources_are_made_one_at_a_time_when_it_is_their_turn():
     made = []
 
@@ -95,6 +97,7 @@ def test_files_that_are_there_are_left_alone_and_others_are_made(tmp_path):
     assert all(frame.rendered for frame in render(js.Settings(samples=16, min_transmittance=1e-9)))
 
 
+@pytest.mark.slow
 def test_frames_may_be_exr_by_a_pattern(tmp_path):
     pattern = str(tmp_path / "f_{:03d}.exr")
     (frame,) = js.render_frames(cloud(), CAMERA, SETTINGS, output=pattern)

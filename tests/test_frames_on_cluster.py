@@ -151,6 +151,7 @@ def test_a_sequence_of_files_is_the_same_bits_and_a_truncated_file_is_one_frame(
         js.render_frames(snapshots, CAMERA, SETTINGS, client)
 
 
+@pytest.mark.slow
 def test_in_double_precision_all_is(client):
     with jax.enable_x64(True):
         rng = np.random.default_rng(0)

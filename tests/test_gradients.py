@@ -55,6 +55,7 @@ def test_gradients_are_those_of_differences_when(frames, x64, phenomenon):
     assert pushed == pytest.approx(slope, abs=AGREE * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kernel", "projection"), [
     ("poly6", "perspective"), ("wendland_c2", "orthographic"),
     pytest.param("cubic_spline", "perspective", marks=pytest.mark.slow),

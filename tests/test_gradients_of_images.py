@@ -16,6 +16,7 @@ ADAPTIVE = {"super_pixels": False}
 STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this file's even scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["a batch of gradients", pytest.param("the gradient of a batch", marks=pytest.mark.slow)])
 def test_gradients_are_batched_as(frames, x64, order):
     rng = np.random.default_rng(3)
@@ -42,6 +43,7 @@ def test_gradients_are_batched_as(frames, x64, order):
     np.testing.assert_allclose(quantity, wanted, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_of_bands_and_of_many_control_points_are_those_of_differences(frames, x64):
     """A memory limit makes the bands; beyond 16 points a transfer function is searched rather than compared."""
     rng = np.random.default_rng(6)

@@ -71,6 +71,7 @@ def check_along(inputs, move, cotangent, asked, plan):
     assert pushed == pytest.approx(slope, abs=AGREE * (1 + size))
 
 
+@pytest.mark.slow
 @settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_gradients_are_those_of_differences_wherever_borders_are(frames, seed):

@@ -62,7 +62,7 @@ def require_kept(image, truth, tolerance):
 
 @pytest.mark.parametrize(("dtype", "kernel", "how", "slab_samples", "projection", "render"), [
     (np.float64, "poly6", "budget", 4, "perspective", js.render),
-    (np.float32, "wendland_c2", "alone", 16, "orthographic", js.render),
+    pytest.param(np.float32, "wendland_c2", "alone", 16, "orthographic", js.render, marks=pytest.mark.slow),
     pytest.param(np.float32, "poly6", "levels", 4, "perspective", jitted, marks=pytest.mark.slow),
     pytest.param(np.float32, "cubic_spline", "paper", 8, "perspective", js.render, marks=pytest.mark.slow),
     pytest.param(np.float64, "wendland_c2", "levels", 8, "orthographic", jitted, marks=pytest.mark.slow),
@@ -130,6 +130,7 @@ def half_constant(frames, kernel, projection, dtype):
     return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: leaf.astype(dtype), STEEP)), camera
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(
     data=st.data(),
@@ -229,6 +230,7 @@ def test_relaxing_gives_up_the_certificate(frames):
     assert image.certified is False
 
 
+@pytest.mark.slow
 def test_one_program_serves_a_batch_of_tolerances_and_relaxations_and_is_each_of_them(frames):
     """Under `vmap` and `jit`: changing a tolerance compiles nothing."""
     frames, traces = frames.deep(4), []
@@ -254,6 +256,7 @@ def test_one_program_serves_a_batch_of_tolerances_and_relaxations_and_is_each_of
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("merge", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_particle_that_only_a_coarse_sample_would_hit_is_counted(merge):
     """Supports smaller than a step lie between fine samples, in no slab's window, yet a coarse sample may sit on them."""

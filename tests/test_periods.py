@@ -67,7 +67,7 @@ def differences(image, truth):
     ("integrator", "projection"),
     [
         ("samples", "perspective"),
-        ("segments", "orthographic"),
+        pytest.param("segments", "orthographic", marks=pytest.mark.slow),
         pytest.param("samples", "orthographic", marks=pytest.mark.slow),
         pytest.param("segments", "perspective", marks=pytest.mark.slow),
     ],
@@ -136,6 +136,7 @@ def test_derivatives_by_a_particle_are_the_sums_of_those_by_its_copies(x64):
     np.testing.assert_allclose(gradients[0][:COUNT], expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_jitted_frame_is_the_same_of_particles_that_were_moved_by_a_period():
     scene, settings, view = scenes()[0], js.Settings(samples=8, integrator="samples"), camera(side=6)
     plan = js.plan(scene, view, settings, headroom=1.5)

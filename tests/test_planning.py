@@ -49,6 +49,7 @@ def same(one: js.Image, other: js.Image) -> bool:
     return all((np.asarray(a) == np.asarray(b)).all() for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=False))
 
 
+@pytest.mark.slow
 def test_snapshots_whose_number_drifts_by_a_fifth_compile_at_most_three_times(plans, compiles):
     """Up and down by steps that no two frames share, from the middle of a capacity class on."""
     drift = 1 + 0.1 * np.sin(np.linspace(0, 4 * np.pi, 40))
@@ -61,6 +62,7 @@ def test_snapshots_whose_number_drifts_by_a_fifth_compile_at_most_three_times(pl
     assert 1 <= frames <= 3
 
 
+@pytest.mark.slow
 def test_an_image_does_not_depend_on_what_was_rendered_before(plans):
     scene, camera = snapshot(1000)
     fresh = js.render(scene, camera, SETTINGS)
@@ -107,6 +109,7 @@ def test_like_grows_a_plan_and_gives_it_back_where_it_has_room():
         js.render(*large, SETTINGS, plan=tight)
 
 
+@pytest.mark.slow
 def test_one_plan_serves_smaller_frames_with_the_same_image(plans):
     """Eagerly and under jit: particles are padded to the plan, and room changes no bit."""
     small, large = snapshot(500), snapshot(2000, seed=1)
@@ -178,6 +181,7 @@ def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypat
                 attempt(changed, camera, asked)
 
 
+@pytest.mark.slow
 def test_at_full_rate_media_screens_and_integrators_are_free_to_choose(monkeypatch):
     scene, camera = snapshot(100)
     monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])

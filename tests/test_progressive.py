@@ -25,6 +25,7 @@ def light(image):
     return np.concatenate([np.asarray(image.color), np.asarray(image.transmittance)[..., None]], -1)
 
 
+@pytest.mark.slow
 def test_every_stage_is_better_and_the_last_keeps_the_tolerance(view):
     reference = light(js.render(*view, dataclasses.replace(SETTINGS, tolerance=None)))
     images = list(js.progressive(*view, SETTINGS, worst=60))

@@ -91,7 +91,9 @@ def test_double_precision_is_exact(x64):
     np.testing.assert_allclose(found, truth, atol=1e-9 * truth.max())
 
 
-@pytest.mark.parametrize("kernel", NAMES)
+@pytest.mark.parametrize(
+    "kernel", ["cubic_spline", *(pytest.param(name, marks=pytest.mark.slow) for name in ("poly6", "wendland_c2"))]
+)
 def test_no_mass_is_lost_however_small_supports_are(kernel):
     rng = np.random.default_rng(5)
     mass, pixel = rng.uniform(0.5, 2, 200).astype(np.float32), 2.6 / 13
@@ -110,7 +112,9 @@ def test_mass_between_two_depths_is_kept_where_they_cut_small_supports():
     assert abs(float(project(particles, camera).total()) / 100 - 1) < 1e-4
 
 
-@pytest.mark.parametrize(("kernel", "spacings"), [("cubic_spline", 4.2), ("wendland_c2", 5.2)])
+@pytest.mark.parametrize(
+    ("kernel", "spacings"), [("cubic_spline", 4.2), pytest.param("wendland_c2", 5.2, marks=pytest.mark.slow)]
+)
 def test_a_uniform_box_has_its_column_density_to_1e_4(kernel, spacings):
     axis = (np.arange(24) + 0.5) / 12 - 1
     position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
@@ -123,6 +127,7 @@ def test_a_uniform_box_has_its_column_density_to_1e_4(kernel, spacings):
     np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spacings", "ends"), [(4.0, (1, 9)), (4.0, (4.25, 5.75))], ids=["pixels", "depths"])
 def test_a_plan_has_room_however_programs_round(spacings, ends, monkeypatch):
     """Of a lattice, whole layers lie on borders of pixels and at the ends of depths: a plan without any slack still serves."""
@@ -151,6 +156,7 @@ def periodic(count=60, seed=17, **more):
     return one, js.Particles.from_arrays(copies, *(np.tile(column, 27) for column in others), "cubic_spline")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixel", ["mean", "ray"])
 def test_along_an_axis_a_periodic_set_is_its_copies_between_the_faces(pixel):
     particles, copies = periodic(25)
@@ -166,6 +172,7 @@ def test_along_an_axis_a_periodic_set_is_its_copies_between_the_faces(pixel):
     np.testing.assert_allclose(part.values, slab, atol=3e-5 * truth.max())
 
 
+@pytest.mark.slow
 def test_pixels_beyond_the_faces_hold_nothing_and_those_across_them_a_part():
     particles, _ = periodic()
     wide = js.Camera.orthographic((0.75, 0.5, 3), (0.75, 0.5, 0), view_height=1.3, near=1, far=5, **SIZE)
@@ -187,6 +194,7 @@ def test_other_cameras_see_each_particle_of_a_periodic_set_once():
     np.testing.assert_allclose(js.project(outside, aslant).values, image.values, atol=1e-3 * float(image.values.max()))
 
 
+@pytest.mark.slow
 def test_a_plan_for_a_periodic_set_grows_and_is_for_periodic_sets():
     camera = js.along_axis(periodic()[0], "z", 20, 13)
     few, many = (periodic(count)[0].padded(64) for count in (20, 60))
@@ -253,6 +261,7 @@ def test_a_plan_grows_to_what_is_needed():
     np.testing.assert_array_equal(*(js.project(few, camera, plan=plan).values for plan in (small, grown)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixel", ["mean", "ray"])
 def test_bands_change_nothing(pixel):
     particles = particles_of(11)
@@ -270,7 +279,7 @@ def test_bands_change_nothing(pixel):
     ("pixel", "projection"),
     [
         ("mean", "orthographic"),
-        ("ray", "perspective"),
+        pytest.param("ray", "perspective", marks=pytest.mark.slow),
         pytest.param("mean", "perspective", marks=pytest.mark.slow),
         pytest.param("ray", "orthographic", marks=pytest.mark.slow),
     ],
@@ -318,6 +327,7 @@ def test_one_program_serves_moved_particles_and_many_at_once():
     np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_too_small_is_refused_or_a_fault():
     particles, camera = particles_of(14), camera_of()
     plan = js.plan_projection(particles, camera, pixel="ray")

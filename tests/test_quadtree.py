@@ -69,6 +69,7 @@ def specks(frames, rng, camera, pixels=0.8):
     return js.Scene(dataclasses.replace(scene.particles, support=support), transfer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [3.0, 0.2])
 def test_without_a_tolerance_the_image_is_that_of_every_pixel(frames, screened, distance):
     """From outside and from among the particles; what is no ray's is empty for certain."""
@@ -132,6 +133,7 @@ def test_another_tolerance_pose_or_particle_compiles_nothing(frames, tolerant, c
     assert not compiles
 
 
+@pytest.mark.slow
 def test_jit_equals_eager_at_any_tolerance(frames, tolerant):
     traced = jax.jit(lambda *inputs: js.render(*inputs, plan=tolerant[1]), compiler_options=QUICKLY)
     rng = np.random.default_rng(1)

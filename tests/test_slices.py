@@ -85,6 +85,7 @@ def test_within_a_clip_values_stay_and_there_are_none_outside():
     np.testing.assert_allclose(part.values[inside], whole.values[inside], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_constant_is_that_constant_and_nothing_is_nothing():
     plane = js.Plane((0.5, 0.6, 0.4), (0, 0, 1))
     found = js.slice_of(particles_of(quantity=np.full(150, 7.25)), plane, **SIZE)

@@ -72,6 +72,7 @@ CASES = [  # each is three programs
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("projection", "profile", "spread", "with_volume"), CASES)
 @settings(max_examples=50, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(st.data())
@@ -87,6 +88,7 @@ def rounding(dtype):
     return (4 * SETTINGS.samples + 64) * np.finfo(dtype).eps
 
 
+@pytest.mark.slow
 def test_points_alone_on_their_rays_are_not_wrong():
     with jax.enable_x64(True):
         center = np.array([[-0.4, 0, 0], [0.4, 0, 0.2]])
@@ -96,12 +98,14 @@ def test_points_alone_on_their_rays_are_not_wrong():
         assert bound.max() <= 1e-9  # rounding alone: of chords that only just meet a point, by the root of eps
 
 
+@pytest.mark.slow
 def test_what_no_point_is_a_splat_of_is_not_wrong():
     points = js.Points.from_arrays(np.float32([[0, 0, 0], [0, 0, 0.1]]), 0.5, opacity=0.9, capacity=COUNT)
     _, bound = wrong(js.Scene(points=points), camera())
     np.testing.assert_array_equal(bound, np.float32(rounding(np.float32)))
 
 
+@pytest.mark.slow
 def test_two_walls_that_change_places_have_no_bound_but_one():
     """Centre of a large red ball in front of that of a small blue one, whose chord is the first to be met."""
     with jax.enable_x64(True):
@@ -131,6 +135,7 @@ def test_what_is_wrong_further_back_is_dimmed_by_what_stays_in_front():
     np.testing.assert_allclose(wrong_by[0, :, 0], [0, (1 - np.exp(-1)) * (1 - np.exp(-9))], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_under_jit_it_is_what_it_is_eagerly():
     scene = js.Scene(points=js.Points.from_arrays(np.float32([[0, 0, 0], [0, 0, 0.1]]), 0.5, opacity=0.9, spread="centres"))
     view = camera()

@@ -26,6 +26,7 @@ def test_eager_and_jit_give_the_same_image_but_for_rounding(frames):
     assert int(jitted.stats["pairs"]) == eager.stats["pairs"]
 
 
+@pytest.mark.slow
 def test_jit_renders_in_bands_too(frames):
     rng = np.random.default_rng(0)
     scene, camera, whole = frames.scene(rng), frames.camera(rng), frames.plan()
@@ -58,6 +59,7 @@ def test_vmap_over_quantities(frames):
         np.testing.assert_allclose(color, of(quantity), atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_one_program_serves_moving_particles_turning_cameras_and_new_transfer_functions(frames):
     plan = frames.plan()
     traces = []

@@ -21,6 +21,7 @@ def test_a_plan_is_tuned_for_the_device_that_holds_the_particles():
     assert memory_for(jnp.zeros(1)) == 4 << 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

@@ -1,6 +1,6 @@
-"""What of a world some rows of an image can see: which spheres and boxes, by planes (host side).
+"""What of a world some pixels of an image can see: which spheres and boxes, by planes (host side).
 
-Flow: camera, rows -> [frusta: Planes] -> which particles of a snapshot a part of a picture needs.
+Flow: camera, pixels -> [frusta: Planes] -> which particles of a snapshot a block of a picture needs.
 """
 
 from __future__ import annotations
@@ -52,30 +52,30 @@ class Planes(NamedTuple):
         return np.asarray((offset @ self.normals.T - inside <= self.offsets + reach[:, None] * length).all(1))
 
 
-def seen_by_rows(camera: Camera, first: int, last: int) -> Planes:
-    """What the rays of rows `first` to `last - 1` of an image pass through, between near and far, and a pixel around that.
+def seen_by(camera: Camera, top: int, bottom: int, left: int, right: int) -> Planes:
+    """What rays of rows `top` to `bottom - 1` and columns `left` to `right - 1` pass through, between near and far.
 
-    So whatever a list of particles takes for touching by rounding is met here, too.
+    And a pixel around that: so whatever a list of particles takes for touching by rounding is met here, too.
     """
-    right, up, forward = np.asarray(camera.axes, np.float64)
-    low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (first - 1, last + 1))
-    wide = float(camera.half_height) * (camera.width + 2) / camera.height
+    along_row, up, forward = np.asarray(camera.axes, np.float64)
+    low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (top - 1, bottom + 1))
+    least, most = sorted(float(camera.column(jnp.asarray(column, camera.dtype))) for column in (left - 1, right + 1))
     near, far = float(camera.near), float(camera.far)
     depths = [(-forward, -near), (forward, far)]
     if camera.is_perspective:
         sides = [
             (up - high * forward, 0.0),
             (low * forward - up, 0.0),
-            (right - wide * forward, 0.0),
-            (-right - wide * forward, 0.0),
+            (along_row - most * forward, 0.0),
+            (least * forward - along_row, 0.0),
         ]
     else:
-        sides = [(up, high), (-up, -low), (right, wide), (-right, wide)]
+        sides = [(up, high), (-up, -low), (along_row, most), (-along_row, -least)]
     normals, offsets = zip(*sides, *depths, strict=True)
     return Planes(camera.exact_eye(), np.stack(normals), np.array(offsets))
 
 
 def between_depths(camera: Camera) -> Planes:
     """What lies between near and far."""
-    seen = seen_by_rows(camera, 0, camera.height)
+    seen = seen_by(camera, 0, camera.height, 0, camera.width)
     return Planes(seen.origin, seen.normals[-2:], seen.offsets[-2:])

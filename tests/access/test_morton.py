@@ -95,6 +95,7 @@ def test_images_and_derivatives_are_those_of_the_particles_given(frames):
         np.testing.assert_allclose(getattr(of_ours, name), expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_eager_images_are_the_same_to_rounding():
     scene, camera = js.scenes.load("mixer", 2000, width=40, height=33)
     prepared = dataclasses.replace(scene, particles=js.prepare(scene.particles))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsph as js
 from jaxsph.access.lists import ListPlan, build_lists
@@ -14,6 +15,7 @@ from jaxsph.access.view import view_particles
 SIDE = 4096  # pixels: 65536 tiles
 
 
+@pytest.mark.slow
 def test_lists_are_those_of_few_particles_however_many_more_there_is_room_for():
     rng, count, capacity = np.random.default_rng(0), 300, 1 << 17
     columns = rng.uniform(-1, 1, (count, 3)), rng.uniform(0.002, 0.02, count), rng.uniform(0, 1, count)

@@ -25,6 +25,7 @@ def errors(image: js.Image, scene: js.Scene, camera: js.Camera) -> np.ndarray:
     return np.maximum(np.abs(color - truth.color).max(-1), np.abs(alpha - truth.alpha))
 
 
+@pytest.mark.slow
 def test_a_tolerance_is_kept_against_the_light_integral() -> None:
     scene, camera = frame()
     with warnings.catch_warnings():

@@ -41,6 +41,7 @@ def require_kept(image, truth, tolerance):
     assert not error[estimate == 0].any(), "where nothing is estimated, nothing is left out"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "times_fewer"), [
     ("radial", 1.6), *(pytest.param(*slow, marks=pytest.mark.slow) for slow in (("mixer", 1.7), ("checker_board", 4.5))),
 ])  # fmt: skip
@@ -103,6 +104,7 @@ def draw(scene, camera, pilot=PILOT):
     return [js.render(scene, camera, settings, plan=plan_of(like)) for settings, like in ((FULL, FULL), (pilot, PILOT))]
 
 
+@pytest.mark.slow
 def test_a_constant_quantity_keeps_its_colour():
     particles, camera = cloud(lambda x: np.full(len(x), 0.3), 0.5)
     scene = js.Scene(particles=particles, transfer=SMOOTH)
@@ -150,6 +152,7 @@ def test_a_jump_of_the_transfer_function_is_kept_sharp():
     assert error_of(image, truth).max() <= PILOT.tolerance
 
 
+@pytest.mark.slow
 def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_allows(stages):
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
@@ -237,6 +240,7 @@ def test_a_plan_with_little_room_for_nodes_saves_less_but_keeps_the_tolerance():
     require_kept(image, truth, PILOT.tolerance)
 
 
+@pytest.mark.slow
 def test_nodes_eight_pixels_apart_save_where_supports_resolve_them_and_keep_the_tolerance():
     particles, camera = cloud(lambda x: x[:, 0], 0.7, count=1500)
     scene = js.Scene(particles=particles, transfer=SMOOTH)

@@ -62,6 +62,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
     assert weight.max() > 0
 
 
+@pytest.mark.slow
 def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     """As far as it reaches: from the first row and column of bundles that are touched."""
     rng = np.random.default_rng(5)

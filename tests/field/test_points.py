@@ -163,6 +163,7 @@ def layers(front):
     return js.Scene(**fog((-2, -2, -0.2), (0.8, 0.7, 0.1), 4.0), points=blue)
 
 
+@pytest.mark.slow
 def test_to_swap_two_layers_in_depth_is_seen_and_no_pasting_of_their_images_shows_it():
     view = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=WIDTH, height=HEIGHT, near=1.5, far=4.5)
     scenes = [layers(front) for front in (True, False)]
@@ -288,6 +289,7 @@ def moved(scene, view, step):
     return dataclasses.replace(scene, points=some, volume=gas), view
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mix", ["extinction", pytest.param("opacity", marks=pytest.mark.slow)])
 def test_derivatives_are_those_of_differences_in_both_modes(mix, x64):
     names = "position", "radius", "color", "extinction", "values", "eye", "opening", "near"

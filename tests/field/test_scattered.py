@@ -72,6 +72,7 @@ def test_sums_are_those_of_tensor_products_bit_for_bit(frames, stages, kernel, p
         assert np.asarray(products[0]).any()
 
 
+@pytest.mark.slow
 def test_light_and_cotangents_are_those_of_tensor_products(frames, stages, x64):
     """By particles, transfer function, depths and opening; room adds nothing."""
     rng = np.random.default_rng(0)

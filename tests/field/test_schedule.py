@@ -6,11 +6,13 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsph as js
 from jaxsph.field.schedule import DENSE, SUBSAMPLED, evaluations, full_rate
 
 
+@pytest.mark.slow
 def test_a_subsampled_slab_takes_a_quarter_of_the_evaluations(stages):
     scene, camera = js.scenes.load("mixer", 500, width=40, height=33)
     plan = js.plan(scene, camera, js.Settings(samples=96))

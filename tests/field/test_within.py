@@ -103,6 +103,7 @@ def test_a_slab_of_constant_extinction_is_cut_to_the_digit(samples):
     np.testing.assert_allclose(outside.transmittance, np.exp(-0.7 * (3.5 - 0.698)), rtol=2e-6)
 
 
+@pytest.mark.slow
 def test_moving_a_face_compiles_nothing():
     shown, settings = scene(PLANE), js.Settings(samples=24, integrator="samples")
     plan = js.plan(shown, camera(), settings)
@@ -112,6 +113,7 @@ def test_moving_a_face_compiles_nothing():
     assert float(jnp.abs(images[0] - images[2]).max()) > 0.05
 
 
+@pytest.mark.slow
 def test_one_of_several_media_may_be_clipped_by_itself():
     """Wrapped, where the scene is not."""
     rng = np.random.default_rng(0)

@@ -104,6 +104,7 @@ def test_means_are_those_of_the_exact_integral_in_float64(count, how, seed):
         assert (got <= high * (1 + 1e-13) + 1e-14).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @draws
 def test_float32_is_right_for_ends_moved_by_a_few_roundings(count, how, seed):

@@ -54,6 +54,7 @@ def test_derivatives_are_those_of_differences(case, which, x64):
     np.testing.assert_allclose(got, (after - before) / (2 * step), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["jumps", "even", "uneven with jumps"])
 def test_cotangents_are_the_transpose(case, x64):
     rng = np.random.default_rng(5)

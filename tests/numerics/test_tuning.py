@@ -53,6 +53,7 @@ def test_what_is_on_an_accelerator_is_tuned_for_one_and_may_take_half_of_it():
     assert memory_for(Held("cpu", 1 << 30)) == memory_for(Held("gpu")) == MEMORY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [pytest.param({}, marks=pytest.mark.slow), {"tolerance": 0.02, "estimator": "pilot"}])
 def test_how_much_is_done_at_once_changes_no_bit(asked):
     scene, camera = js.scenes.load("radial", 2000, width=72, height=60)
