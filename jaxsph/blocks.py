@@ -1,15 +1,14 @@
 """How a picture is cut into blocks, each of which sees no more particles than there is room for.
 
-Flow: sides of some particles, how many all are, room -> [blocks: cut] -> Blocks -> from_disk.
+Flow: sides of some particles, how many all are, room -> [blocks: cut] -> blocks -> from_disk.
 
-Blocks are rectangles of tiles. Rows from one side to the other would be simpler, but see more: what reaches across a border is
-held by both sides, and a square has the shortest border.
+Rows from one side of the image to the other would be simpler, but see more: what reaches across a border is held by both sides,
+and a square has the shortest border. All blocks have the same height, so that one program serves all, and are as wide as there
+is room.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -30,29 +29,6 @@ class Block(NamedTuple):
     right: int
 
 
-@dataclasses.dataclass(frozen=True)
-class Blocks:
-    """How an image is cut; they come row by row, from the left to the right and back: most is near what was there before.
-
-    Attributes:
-        rows, columns: where blocks begin, and the end of the last.
-        most: about how many particles the fullest sees.
-    """
-
-    rows: list[int]
-    columns: list[int]
-    most: int
-
-    def __len__(self) -> int:
-        return (len(self.rows) - 1) * (len(self.columns) - 1)
-
-    def __iter__(self) -> Iterator[Block]:
-        columns = list(itertools.pairwise(self.columns))
-        for number, (top, bottom) in enumerate(itertools.pairwise(self.rows)):
-            for left, right in columns[:: 1 - 2 * (number % 2)]:
-                yield Block(top, bottom, left, right)
-
-
 class Sides(NamedTuple):
     """Pixels that particles can touch: first and last columns and rows; none where these do not ascend."""
 
@@ -62,8 +38,10 @@ class Sides(NamedTuple):
     bottom: np.ndarray
 
 
-def cut(size: tuple[int, int], sides: Sides, particles: int, room: int, *, whole_rows: bool = False) -> Blocks:
-    """As few blocks as there is room for; none has more than `room` particles unless it is a single tile, or a row of them.
+def cut(size: tuple[int, int], sides: Sides, particles: int, room: int, *, whole_rows: bool = False) -> dict[Block, int]:
+    """As few blocks as there is room for, and about how many particles each sees: the fullest first.
+
+    None sees more than `room`, unless the least block does: a tile, or a row of them.
 
     Args:
         size: rows and columns of pixels.
@@ -72,30 +50,51 @@ def cut(size: tuple[int, int], sides: Sides, particles: int, room: int, *, whole
         room: for particles of a block.
         whole_rows: whether blocks must reach from one side of the image to the other.
     """
-    tiles = [-(-pixels // TILE) for pixels in size]
-    most_rows, most_columns = (range((count - 1).bit_length() + 1) for count in tiles)
-    found = None
-    for halvings in range(len(most_rows) + len(most_columns) - 1):
-        splits = [(down, halvings - down) for down in most_rows if halvings - down in most_columns[: 1 if whole_rows else None]]
-        parts = (tuple(-(-count >> half) for count, half in zip(tiles, split, strict=True)) for split in splits)
-        tried = [_blocks(size, part, sides, particles) for part in parts]
-        found = min(tried, key=lambda blocks: blocks.most, default=found)
-        if found is not None and found.most <= room:
-            break
-    assert found is not None
-    return found
+    cutter = _Cutter(size, sides, particles, room, whole_rows)
+    tried = [cutter.blocks(height) for height in cutter.heights()]
+    fitting = [blocks for blocks in tried if max(blocks.values()) <= room]
+    found = min(fitting, key=len, default=tried[-1])
+    return dict(sorted(found.items(), key=lambda one: -one[1]))
 
 
-def _blocks(size: tuple[int, int], tiles: tuple[int, ...], sides: Sides, particles: int) -> Blocks:
-    """The blocks of so many tiles down and across."""
-    down, across = (count * TILE for count in tiles)
-    rows, columns = ([*range(0, pixels, step), pixels] for pixels, step in zip(size, (down, across), strict=True))
-    seen = (sides.right >= sides.left) & (sides.bottom >= sides.top)
-    left, right = (side[seen] // across for side in (sides.left, sides.right))
-    top, bottom = (side[seen] // down for side in (sides.top, sides.bottom))
-    met = np.zeros((len(rows), len(columns)), np.int64)  # as differences, of which there is one more than blocks
-    for row, column, change in ((top, left, 1), (bottom + 1, left, -1), (top, right + 1, -1), (bottom + 1, right + 1, 1)):
-        np.add.at(met, (row, column), change)
-    fullest = int(met.cumsum(0).cumsum(1).max())
-    share = CROWDED * (fullest + 2 * np.sqrt(fullest) + 1) / max(len(sides.left), 1)
-    return Blocks(rows, columns, int(min(share, 1.0) * particles) + 2)
+class _Cutter:
+    """Ways to cut an image into blocks of some height; places are numbers of tiles."""
+
+    def __init__(self, size: tuple[int, int], sides: Sides, particles: int, room: int, whole_rows: bool) -> None:
+        seen = (sides.right >= sides.left) & (sides.bottom >= sides.top)
+        self._tiles = Sides(*(side[seen] // TILE for side in sides))
+        self._size, self._some, self._particles = size, len(sides.left), particles
+        self._room, self._whole_rows = room, whole_rows
+
+    def heights(self) -> list[int]:
+        """Of blocks: the image's, its half, and so on to a tile."""
+        down = -(-self._size[0] // TILE)
+        return list(dict.fromkeys(-(-down >> halvings) for halvings in range((down - 1).bit_length() + 1)))
+
+    def blocks(self, height: int) -> dict[Block, int]:
+        """Those of some height, and how many particles each sees."""
+        found = {}
+        rows, columns = self._size
+        for top in range(0, -(-rows // TILE), height):
+            for left, right, particles in self._across(top, top + height):
+                edges = (min(edge * TILE, end) for edge, end in ((top + height, rows), (left, columns), (right, columns)))
+                found[Block(top * TILE, *edges)] = particles
+        return found
+
+    def _across(self, top: int, bottom: int) -> Iterator[tuple[int, int, int]]:
+        """First and last column of blocks between two rows, as wide as there is room, and how many particles they see."""
+        rows = (self._tiles.bottom >= top) & (self._tiles.top < bottom)
+        across = -(-self._size[1] // TILE)
+        begun, ended = (np.bincount(side[rows], minlength=across).cumsum() for side in (self._tiles.left, self._tiles.right))
+        before = np.append(0, ended)  # that end in front of a column
+        left = 0
+        while left < across:
+            seen = self._in_all(begun[left:] - before[left])  # if the block ends behind each of the columns
+            fitting = across - left if self._whole_rows else max(int((seen <= self._room).sum()), 1)
+            yield left, left + fitting, int(seen[fitting - 1])
+            left += fitting
+
+    def _in_all(self, some: np.ndarray) -> np.ndarray:
+        """How many particles there may be where the sample has so many."""
+        share = CROWDED * (some + 2 * np.sqrt(some) + 1) / max(self._some, 1)
+        return (np.minimum(share, 1.0) * self._particles).astype(np.int64) + 2

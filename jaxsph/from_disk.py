@@ -20,8 +20,9 @@ import numpy as np
 
 from jaxsph.access.lists import TILE
 from jaxsph.along_rays import along_rays
-from jaxsph.blocks import CROWDED, Block, Blocks, Sides, cut
+from jaxsph.blocks import CROWDED, Block, Sides, cut
 from jaxsph.field.in_octree import reachable
+from jaxsph.measures import Measures
 from jaxsph.model.camera import Camera
 from jaxsph.model.frusta import seen_by
 from jaxsph.model.image import Image
@@ -32,7 +33,7 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import free_memory
 from jaxsph.numerics.executors import Clock
 from jaxsph.on_disk import Columns, OnDisk
-from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted
+from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted, in_bands
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
 from jaxsph.render import Progress, image_of
 from jaxsph.tiles import joined, of_columns, of_rows
@@ -81,7 +82,7 @@ def render_from_disk(
     if settings.screen == "quadtree":
         raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
     renderer = _Renderer(on_disk, transfer, camera, settings)
-    blocks = renderer.blocks(memory)
+    blocks = list(renderer.blocks(memory))  # the fullest first: where the plan has room for it, it has for most
     always = on_disk.extremes(camera)
     planes = [seen_by(camera, *block) for block in blocks]
     images: dict[Block, Image] = {}
@@ -118,7 +119,7 @@ class _Renderer:
     capacity: int = 1
     plan: Plan | None = None
 
-    def blocks(self, memory: int) -> Blocks:
+    def blocks(self, memory: int) -> dict[Block, int]:
         """As few as memory allows; the frame may take what particles leave.
 
         Raises:
@@ -130,13 +131,14 @@ class _Renderer:
         room = int((1 - FRAME_SHARE) * memory) // BYTES_A_PARTICLE
         whole_rows = along.estimator == "pilot"  # its lattice reaches from bundle to bundle
         found = cut((self.camera.height, self.camera.width), sides, len(self.on_disk), room, whole_rows=whole_rows)
-        if found.most > room:
-            least = int(BYTES_A_PARTICLE * found.most / (1 - FRAME_SHARE)) + 1
+        most = max(found.values())
+        if most > room:
+            least = int(BYTES_A_PARTICLE * most / (1 - FRAME_SHARE)) + 1
             raise ValueError(
-                f"`memory` = {memory} bytes is too little: {LEAST[whole_rows]} see about {found.most:,} particles, "
+                f"`memory` = {memory} bytes is too little: {LEAST[whole_rows]} see about {most:,} particles, "
                 f"which need {least:,}; give more, or look closer"
             )
-        self.capacity = capacity_class(max(found.most, 1))
+        self.capacity = capacity_class(max(most, 1))
         left = max(memory - READ_BYTES * self.capacity, 1)
         self.settings = dataclasses.replace(self.settings, memory_limit=self.settings.memory_limit or left)
         return found
@@ -152,14 +154,23 @@ class _Renderer:
         seen, measures = measured(seen, self.camera, shape.samples, shape.tuning, stride_of(along))
         rows = dataclasses.replace(shape, height=block.bottom - block.top)
         needed = of_rows(measures, block.top // TILE, -(-block.bottom // TILE))
-        made = fitted(needed, rows, along, self._choices)
-        if self.plan is None or self.plan.height != made.height:
-            self.plan = fitted(needed, dataclasses.replace(rows, headroom=CROWDED), along, self._choices)
-        self.plan = self.plan.grown(made)
+        self.plan = self._plan_for(needed, rows, along)
         clock.mark("plan")
         given = seen, self.camera, self.settings, self.plan, scene.formulas
         image = image_of(*given, clock, None, planned=True, first_row=block.top)
         return of_columns(image, block.left, block.right)
+
+    def _plan_for(self, needed: Measures, shape: FrameShape, along: Settings) -> Plan:
+        """The plan there is, if it serves; else with room for more like this, in as many bands if memory allows."""
+        roomy = dataclasses.replace(shape, headroom=CROWDED)
+        if self.plan is None or self.plan.height != shape.height:
+            return fitted(needed, roomy, along, self._choices)
+        made = in_bands(needed, shape, along, self._choices, self.plan.bands)
+        if self.plan.serves(made):
+            return self.plan
+        if made.bytes > (along.memory_limit or shape.memory):
+            return fitted(needed, shape, along, self._choices)
+        return self.plan.grown(in_bands(needed, roomy, along, self._choices, self.plan.bands))
 
     @functools.cached_property
     def _classes(self) -> int:

@@ -17,7 +17,7 @@ from jaxsph import scenes
 from jaxsph.io.assemble import opacity_of
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
-from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes
+from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera import Camera
 from jaxsph.model.frusta import Planes, between_depths
@@ -142,8 +142,9 @@ class OnDisk:
         held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
         for file, row in always:
             held |= (index.file == file) & (index.begin <= row) & (row < index.end)
-        for run in np.flatnonzero(held):
-            file, begin, end = int(index.file[run]), int(index.begin[run]), int(index.end[run])
+        runs = zip(index.file[held].tolist(), index.begin[held].tolist(), index.end[held].tolist(), strict=True)
+        for file, rows in together(runs):
+            begin, end = rows[0][0], rows[-1][1]
             columns = self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
             kept = planes.meet(columns[0].astype(np.float64), columns[1].astype(np.float64))
             kept[[row - begin for which, row in always if which == file and begin <= row < end]] = True

@@ -232,7 +232,7 @@ def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: C
     tile_rows, bands = -(-shape.height // TILE), 1
     limit = settings.memory_limit or shape.memory
     while True:
-        made = _in_bands(measures, shape, settings, choices, bands)
+        made = in_bands(measures, shape, settings, choices, bands)
         slabs = made.lists.num_bundles * -(-shape.samples // choices.slab_samples)
         fits = made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and slabs < MAX_SLABS
         if fits:
@@ -246,7 +246,8 @@ def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: C
     )
 
 
-def _in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, bands: int) -> Plan:
+def in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, bands: int) -> Plan:
+    """The plan of a frame in so many bands, whatever they take; fewer if so many are not there."""
     tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
     rows = -(-tile_rows // bands)
     bands = -(-tile_rows // rows)

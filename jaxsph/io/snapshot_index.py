@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .replace import written_whole
-from .snapshot_rows import RUN, Snapshot, needed_columns, supports_and_volumes
+from .snapshot_rows import RUN, Snapshot, needed_columns, supports_and_volumes, together
 from .table import ParticleTable
 
 SUFFIX = ".jaxsph-index.npz"
@@ -79,7 +79,7 @@ def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> Snapsho
 
     Args:
         snapshot: what is to be known.
-        progress: called as `progress(done, total)` after each run that is read.
+        progress: called as `progress(done, total)` after each read.
 
     Raises:
         ValueError: damaged files; particles without supports, or without masses and densities.
@@ -120,12 +120,14 @@ def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
 
 
 def _made(snapshot: Snapshot, progress: Progress | None) -> SnapshotIndex:
-    needed, runs = needed_columns(snapshot.first), list(snapshot.runs())
+    needed, reads = needed_columns(snapshot.first), list(together(snapshot.runs()))
     rows = []
-    for done, (file, begin, end) in enumerate(runs, 1):
-        rows.append((file, begin, end, *_known(snapshot.read(file, slice(begin, end), needed), begin)))
+    for done, (file, runs) in enumerate(reads, 1):
+        first = runs[0][0]
+        table = snapshot.read(file, slice(first, runs[-1][1]), needed)
+        rows += [(file, begin, end, *_known(table.rows(slice(begin - first, end - first)), begin)) for begin, end in runs]
         if progress is not None:
-            progress(done, len(runs))
+            progress(done, len(reads))
     columns = [np.array(column) for column in zip(*rows, strict=True)] if rows else [np.zeros(0, np.int64)] * len(ARRAYS)
     return SnapshotIndex(snapshot.files, snapshot.part_type, **dict(zip(ARRAYS, columns, strict=True)))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,10 @@ from .quantities import ROLES, available_quantities, choose_quantity
 from .snapshot_files import files_of
 from .table import ParticleTable, plain
 
-RUN = 1 << 16
-"""Rows of a run: what is read at once, and the least that is read."""
+RUN = 1 << 14
+"""Rows of a run: the least that is read."""
+READ = 1 << 17
+"""Rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run."""
 
 
 class Snapshot:
@@ -71,6 +73,10 @@ class Snapshot:
             names = None if only is None else {plain(name) for name in only}
             return gadget_hdf5.from_hdf5(opened, self.part_type, rows, names)
 
+    def reads(self) -> list[tuple[int, int, int]]:
+        """File, first row and end of what is read at once where all is read."""
+        return [(file, rows[0][0], rows[-1][1]) for file, rows in together(self.runs())]
+
     def runs(self) -> Iterator[tuple[int, int, int]]:
         """File, first row and end of each run."""
         h5py = require("h5py", "reading HDF5 files")
@@ -82,6 +88,20 @@ class Snapshot:
                 count = opened[name]["Coordinates"].shape[0]
                 edges = _edges(count, _cells(opened, name))
             yield from ((number, int(begin), int(end)) for begin, end in itertools.pairwise(edges) if end > begin)
+
+
+def together(runs: Iterable[tuple[int, int, int]]) -> Iterator[tuple[int, list[tuple[int, int]]]]:
+    """Runs that follow on one another in a file, as many as are read at once: number of the file, and rows of each."""
+    held: list[tuple[int, int]] = []
+    last = -1
+    for file, begin, end in runs:
+        if held and (file != last or begin != held[-1][1] or end - held[0][0] > READ):
+            yield last, held
+            held = []
+        last = file
+        held.append((begin, end))
+    if held:
+        yield last, held
 
 
 def _cells(opened: Any, name: str) -> np.ndarray | None:

@@ -49,7 +49,7 @@ def sort_snapshot(
         path: any file of the snapshot, Gadget-like HDF5.
         output: the file to write, whole or not at all.
         part_type: kind of particles; default gas, or the first other kind there is.
-        progress: called as `progress(done, total)` after every run of rows that is read.
+        progress: called as `progress(done, total)` after every read.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -60,7 +60,7 @@ def sort_snapshot(
         raise DataError(f"{output}: a snapshot is written as .hdf5 or .h5")
     if any(output.exists() and output.samefile(file) for file in snapshot.files):
         raise DataError(f"{output}: is the snapshot itself; write the ordered one to another file")
-    runs = list(snapshot.runs())
+    runs = snapshot.reads()
     steps = _Steps(progress, 3 * len(runs))
     grid = _grid(snapshot, runs, steps)
     counts = np.zeros(CELLS**3, np.int64)

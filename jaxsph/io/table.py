@@ -83,6 +83,12 @@ class ParticleTable:
     def __len__(self) -> int:
         return len(self.position)
 
+    def rows(self, which: slice) -> ParticleTable:
+        """Some of the particles."""
+        columns = {name: column[which] for name, column in self.columns.items()}
+        support, volume = (None if column is None else column[which] for column in (self.support, self.volume))
+        return dataclasses.replace(self, position=self.position[which], columns=columns, support=support, volume=volume)
+
     @property
     def scalars(self) -> tuple[str, ...]:
         """Names of the (N,) columns."""

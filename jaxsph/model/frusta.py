@@ -33,8 +33,8 @@ class Planes(NamedTuple):
     def meet(self, position: Float[np.ndarray, "places 3"], reach: Float[np.ndarray, " places"]) -> Bool[np.ndarray, " places"]:
         """Whether spheres can reach into the region: never false where one does, seldom true where none does."""
         offset = position - self.origin
-        slack = SLACK * (np.abs(offset).max(1, initial=0) + reach + np.abs(position).max(1, initial=0))
-        return self._meet(offset, reach + slack)
+        slack = SLACK * (np.abs(offset).max(initial=0) + np.abs(position).max(initial=0))
+        return self._meet(offset, reach * (1 + SLACK) + slack)
 
     def meet_boxes(
         self, lower: Float[np.ndarray, "boxes 3"], upper: Float[np.ndarray, "boxes 3"], reach: Float[np.ndarray, " boxes"]
@@ -47,9 +47,12 @@ class Planes(NamedTuple):
         )
         return self._meet(middle - self.origin, reach * (1 + SLACK) + slack, inside)
 
-    def _meet(self, offset: np.ndarray, reach: np.ndarray, inside: float | np.ndarray = 0.0) -> np.ndarray:
-        length = np.linalg.norm(self.normals, axis=1)
-        return np.asarray((offset @ self.normals.T - inside <= self.offsets + reach[:, None] * length).all(1))
+    def _meet(self, offset: np.ndarray, reach: np.ndarray, inside: np.ndarray | None = None) -> np.ndarray:
+        lengths, met = np.linalg.norm(self.normals, axis=1), np.ones(len(offset), bool)
+        for number, (normal, most, length) in enumerate(zip(self.normals, self.offsets, lengths, strict=True)):
+            beyond = offset @ normal - reach * length
+            met &= (beyond if inside is None else beyond - inside[:, number]) <= most
+        return met
 
 
 def seen_by(camera: Camera, top: int, bottom: int, left: int, right: int) -> Planes:
