@@ -86,7 +86,7 @@ def one_way(options: argparse.Namespace) -> None:
         seconds.append(time.perf_counter() - begun)
     np.save(options.image, color)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    stats = {name: image.stats.get(name) for name in ("parts", "most_particles")}
+    stats = {name: image.stats.get(name) for name in ("panes", "most_particles")}
     print(json.dumps({"opened": opened, "first": seconds[0], "seconds": seconds[1], "peak": peak, **stats}))
 
 

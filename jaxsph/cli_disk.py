@@ -64,9 +64,9 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     camera = cli_scene.camera_of(on_disk, options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
-    with progress("render", " blocks") as show:
+    with progress("render", " panes") as show:
         image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * 2**30), progress=show)
-    say("blocks", f"{image.stats['blocks']}, of at most {image.stats['most_particles']:,} particles")
+    say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
     say("time", time_line(image, time.perf_counter() - started))
     return image
 

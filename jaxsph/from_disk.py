@@ -1,9 +1,9 @@
-"""Pictures of snapshots that are larger than memory: each block of the image has the particles that its rays can meet, no others.
+"""Pictures of snapshots that are larger than memory: each pane of the image has the particles that its rays can meet, no others.
 
-Flow: OnDisk, camera -> blocks -> runs that they can see -> particles -> view -> [from_disk] -> blocks of pixels -> Image.
+Flow: OnDisk, camera -> panes -> runs that they can see -> particles -> view -> [from_disk] -> panes of pixels -> Image.
 
-All rays of a block find what they would find among all particles, in the same order. Two things of a picture depend on
-particles elsewhere, too: classes of supports on the widest, strengths on the strongest. Those two come along with every block. So
+All rays of a pane find what they would find among all particles, in the same order. Two things of a picture depend on
+particles elsewhere, too: classes of supports on the widest, strengths on the strongest. Those two come along with every pane. So
 pixels are the same bits as those of the whole in memory, if what is chosen by how large supports appear, of a sample here, is
 chosen alike; where supports reach around the eye or across near and far, they are so to rounding.
 """
@@ -20,7 +20,6 @@ import numpy as np
 
 from jaxsph.access.lists import TILE
 from jaxsph.along_rays import along_rays
-from jaxsph.blocks import CROWDED, Block, Sides, cut
 from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures
 from jaxsph.model.camera import Camera
@@ -33,6 +32,7 @@ from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import free_memory
 from jaxsph.numerics.executors import Clock
 from jaxsph.on_disk import Columns, OnDisk
+from jaxsph.panes import CROWDED, Pane, Sides, cut
 from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted, in_bands
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
 from jaxsph.render import Progress, image_of
@@ -41,9 +41,9 @@ from jaxsph.viewing import Seen
 
 MEMORY = 1 << 30
 READ_BYTES, BYTES_A_PARTICLE = 96, 430
-"""Of a particle of a block: of columns that are read, with those of the next block; and in all, with its place in lists."""
+"""Of a particle of a pane: of columns that are read, with those of the next pane; and in all, with its place in lists."""
 LEAST = f"{TILE} x {TILE} pixels", f"{TILE} rows of pixels"
-"""The least block, and the least from one side of the image to the other."""
+"""The least pane, and the least from one side of the image to the other."""
 FRAME_SHARE = 0.2
 """Of the memory, that a frame takes whatever its particles."""
 
@@ -59,8 +59,8 @@ def render_from_disk(
 ) -> Image:
     """Render a snapshot that is larger than memory.
 
-    The image is rendered block by block, each with the particles whose supports its rays can meet; those of the next block are
-    read meanwhile. A snapshot whose rows are ordered in space is read a few times, one whose are not once a block: see
+    The image is rendered pane by pane, each with the particles whose supports its rays can meet; those of the next pane are
+    read meanwhile. A snapshot whose rows are ordered in space is read a few times, one whose are not once a pane: see
     `jaxsph.io.sort_snapshot`.
 
     Args:
@@ -68,11 +68,11 @@ def render_from_disk(
         transfer: what its particles look like: `on_disk.transfer()`.
         camera, settings: as for `jaxsph.render`; no quadtree of rays, nor octree integrators.
         memory: bytes that particles and what is made of them may take, beyond the interpreter and compiled programs.
-        progress: called as `progress(done, total)` after every block.
+        progress: called as `progress(done, total)` after every pane.
 
     Returns:
-        As `jaxsph.render` of all particles, not repeated across the faces of a periodic box; `stats["blocks"]` and
-        `stats["most_particles"]` say how many blocks there were, and how many particles the fullest had.
+        As `jaxsph.render` of all particles, not repeated across the faces of a periodic box; `stats["panes"]` and
+        `stats["most_particles"]` say how many panes there were, and how many particles the fullest had.
 
     Raises:
         ValueError: memory that does not suffice for a single tile (how much does), a screen or an integrator that
@@ -82,35 +82,35 @@ def render_from_disk(
     if settings.screen == "quadtree":
         raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
     renderer = _Renderer(on_disk, transfer, camera, settings)
-    blocks = list(renderer.blocks(memory))  # the fullest first: where the plan has room for it, it has for most
+    panes = list(renderer.panes(memory))  # the fullest first: where the plan has room for it, it has for most
     always = on_disk.extremes(camera)
-    planes = [seen_by(camera, *block) for block in blocks]
-    images: dict[Block, Image] = {}
+    planes = [seen_by(camera, *pane) for pane in panes]
+    images: dict[Pane, Image] = {}
     most = 0
-    with ThreadPoolExecutor(1, "jaxsph-read") as reader:
+    with free_memory.given_back_at_once(), ThreadPoolExecutor(1, "jaxsph-read") as reader:
         ahead: Future[Columns] = reader.submit(on_disk.seen_by, planes[0], always)
-        for number, block in enumerate(blocks, 1):
+        for number, pane in enumerate(panes, 1):
             columns = ahead.result()
-            if number < len(blocks):
+            if number < len(panes):
                 ahead = reader.submit(on_disk.seen_by, planes[number], always)
-            images[block] = renderer.block(columns, block)
+            images[pane] = renderer.pane(columns, pane)
             free_memory.give_back()
             most = max(most, len(columns[0]))
             if progress is not None:
-                progress(number, len(blocks))
+                progress(number, len(panes))
     image = _whole(images)
-    return dataclasses.replace(image, stats=image.stats | {"blocks": len(blocks), "most_particles": most})
+    return dataclasses.replace(image, stats=image.stats | {"panes": len(panes), "most_particles": most})
 
 
-def _whole(images: dict[Block, Image]) -> Image:
-    """The image that blocks make."""
-    rows = (list(row) for _, row in itertools.groupby(sorted(images), lambda block: block.top))
-    return joined([joined([images[block] for block in row], axis=1) for row in rows])
+def _whole(images: dict[Pane, Image]) -> Image:
+    """The image that panes make."""
+    rows = (list(row) for _, row in itertools.groupby(sorted(images), lambda pane: pane.top))
+    return joined([joined([images[pane] for pane in row], axis=1) for row in rows])
 
 
 @dataclasses.dataclass
 class _Renderer:
-    """Blocks of one picture, with one plan that grows where it has to."""
+    """Panes of one picture, with one plan that grows where it has to."""
 
     on_disk: OnDisk
     transfer: TransferFunction
@@ -119,11 +119,11 @@ class _Renderer:
     capacity: int = 1
     plan: Plan | None = None
 
-    def blocks(self, memory: int) -> dict[Block, int]:
+    def panes(self, memory: int) -> dict[Pane, int]:
         """As few as memory allows; the frame may take what particles leave.
 
         Raises:
-            ValueError: the least block needs more.
+            ValueError: the least pane needs more.
         """
         seen, along = self._sample.viewed, self._along
         there = np.asarray(self.on_disk.sample.valid)
@@ -143,22 +143,22 @@ class _Renderer:
         self.settings = dataclasses.replace(self.settings, memory_limit=self.settings.memory_limit or left)
         return found
 
-    def block(self, columns: Columns, block: Block) -> Image:
+    def pane(self, columns: Columns, pane: Pane) -> Image:
         """The image of some pixels."""
         self.capacity = max(self.capacity, capacity_class(len(columns[0])))
         particles = self.on_disk.particles(columns, self.capacity)
         scene = reachable(Scene(particles=particles, transfer=self.transfer), self.settings)
         along, clock = along_rays(scene, self.settings), Clock()
         shape = dataclasses.replace(shape_of_scene(scene, self.camera, along), headroom=1.0, num_classes=self._classes)
-        seen = _within(see(scene, self.camera, shape, clock), block)
+        seen = _within(see(scene, self.camera, shape, clock), pane)
         seen, measures = measured(seen, self.camera, shape.samples, shape.tuning, stride_of(along))
-        rows = dataclasses.replace(shape, height=block.bottom - block.top)
-        needed = of_rows(measures, block.top // TILE, -(-block.bottom // TILE))
+        rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
+        needed = of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE))
         self.plan = self._plan_for(needed, rows, along)
         clock.mark("plan")
         given = seen, self.camera, self.settings, self.plan, scene.formulas
-        image = image_of(*given, clock, None, planned=True, first_row=block.top)
-        return of_columns(image, block.left, block.right)
+        image = image_of(*given, clock, None, planned=True, first_row=pane.top)
+        return of_columns(image, pane.left, pane.right)
 
     def _plan_for(self, needed: Measures, shape: FrameShape, along: Settings) -> Plan:
         """The plan there is, if it serves; else with room for more like this, in as many bands if memory allows."""
@@ -208,9 +208,9 @@ class _Renderer:
         return choose(measures, self._along)
 
 
-def _within(seen: Seen, block: Block) -> Seen:
-    """What is seen, with no particle touching any pixel out of a block."""
+def _within(seen: Seen, pane: Pane) -> Seen:
+    """What is seen, with no particle touching any pixel out of a pane."""
     viewed = seen.viewed
-    left, right = jnp.maximum(viewed.left, block.left), jnp.minimum(viewed.right, block.right - 1)
-    top, bottom = jnp.maximum(viewed.top, block.top), jnp.minimum(viewed.bottom, block.bottom - 1)
+    left, right = jnp.maximum(viewed.left, pane.left), jnp.minimum(viewed.right, pane.right - 1)
+    top, bottom = jnp.maximum(viewed.top, pane.top), jnp.minimum(viewed.bottom, pane.bottom - 1)
     return seen._replace(viewed=dataclasses.replace(viewed, left=left, right=right, top=top, bottom=bottom))

@@ -212,17 +212,22 @@ LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
 
 def of_columns(image: Image, left: int, right: int) -> Image:
-    """Some columns alone, from the border of a tile to that of another or of the image."""
-    layers = {name: getattr(image, name)[:, left:right] for name in LAYERS}
-    levels = None if image.levels is None else image.levels[..., left // BUNDLE : -(-right // BUNDLE)]
-    return dataclasses.replace(image, **layers, levels=levels)
+    """Some columns alone, from the border of a tile to that of another or of the image; on the host.
+
+    There because a device would compile a program for every width.
+    """
+    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in LAYERS}
+    layers["levels"] = (
+        None if image.levels is None else np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
+    )
+    return dataclasses.replace(image, **layers)
 
 
 def joined(parts: list[Image], axis: int = 0) -> Image:
     """The image of rows that follow on one another, or of columns."""
-    whole = {name: jnp.concatenate([getattr(part, name) for part in parts], axis) for name in LAYERS}
+    whole = {name: jnp.asarray(np.concatenate([getattr(part, name) for part in parts], axis)) for name in LAYERS}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = jnp.concatenate(of_cells, axis=1 + axis) if len(of_cells) == len(parts) else None
+    levels = jnp.asarray(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

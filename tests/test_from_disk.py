@@ -27,7 +27,7 @@ def in_memory(path, transfer, camera, settings=SETTINGS):
     return js.render(scene, camera, settings)
 
 
-def test_blocks_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
+def test_panes_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
     monkeypatch.setattr(from_disk, "BYTES_A_PARTICLE", 3500)
     columns = particles(6000)
     columns["SmoothingLength"] *= np.float32(0.5)
@@ -40,17 +40,17 @@ def test_blocks_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
     for layer in ("color", "transmittance", "error_bound"):
         np.testing.assert_allclose(getattr(image, layer), getattr(whole, layer), atol=3e-7)
     np.testing.assert_array_equal(image.evaluations, whole.evaluations)
-    assert image.stats["blocks"] == 12 and image.stats["most_particles"] < 4000
-    assert told == [(block, 12) for block in range(1, 13)]
+    assert image.stats["panes"] == 8 and image.stats["most_particles"] < 4000
+    assert told == [(pane, 8) for pane in range(1, 9)]
 
 
-def test_memory_for_all_is_one_block_and_the_same_bits(tmp_path):
+def test_memory_for_all_is_one_pane_and_the_same_bits(tmp_path):
     path = write(tmp_path, particles(2000))
     on_disk = js.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, height=40), on_disk.transfer()
     image = js.render_from_disk(on_disk, transfer, camera, SETTINGS)
     np.testing.assert_array_equal(image.color, in_memory(path, transfer, camera).color)
-    assert image.stats["blocks"] == 1
+    assert image.stats["panes"] == 1
 
 
 def test_memory_that_does_not_suffice_says_how_much_does(tmp_path):
@@ -63,7 +63,7 @@ def test_memory_that_does_not_suffice_says_how_much_does(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [{"integrator": "segments"}, {"tolerance": 0.01}, {"tolerance": 0.03, "estimator": "pilot"}])
-def test_blocks_of_other_ways_are_as_near_as_the_whole(tmp_path, monkeypatch, way):
+def test_panes_of_other_ways_are_as_near_as_the_whole(tmp_path, monkeypatch, way):
     monkeypatch.setattr(from_disk, "BYTES_A_PARTICLE", 3500)
     path, settings = write(tmp_path, particles(6000), files=3), js.Settings(samples=48, **way)
     on_disk = js.OnDisk.open(path, QUANTITY)
@@ -71,4 +71,4 @@ def test_blocks_of_other_ways_are_as_near_as_the_whole(tmp_path, monkeypatch, wa
     image = js.render_from_disk(on_disk, transfer, camera, settings, memory=22 << 20)
     whole = in_memory(path, transfer, camera, settings)
     apart = np.abs(np.asarray(image.color) - whole.color).max(-1)
-    assert image.stats["blocks"] > 1 and (apart <= 1e-6 + np.asarray(image.error_bound) + whole.error_bound).all()
+    assert image.stats["panes"] > 1 and (apart <= 1e-6 + np.asarray(image.error_bound) + whole.error_bound).all()

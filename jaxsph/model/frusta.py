@@ -1,6 +1,6 @@
 """What of a world some pixels of an image can see: which spheres and boxes, by planes (host side).
 
-Flow: camera, pixels -> [frusta: Planes] -> which particles of a snapshot a block of a picture needs.
+Flow: camera, pixels -> [frusta: Planes] -> which particles of a snapshot a pane of a picture needs.
 """
 
 from __future__ import annotations

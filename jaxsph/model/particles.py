@@ -281,7 +281,7 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
     count = given["position"].shape[0]
     require_positive(
         "support",
-        packed["support"][:count],
+        np.asarray(packed["support"])[:count],  # on the host: a device would compile a program for every count
         f"it underflows {packed['support'].dtype}: rescale the scene or use float64",
     )
     tiny = np.finfo(packed["volume"].dtype).tiny

@@ -1,25 +1,46 @@
-"""Memory that was freed, given back to the system: compiling leaves hundreds of megabytes of it with glibc.
+"""Memory that was freed, given back to the system: glibc keeps what each thread has freed for that thread's next use.
 
-XLA compiles on many threads, and glibc keeps what each has freed for that thread's next use. Of the 800 MiB that a process
-holds after its first frames 570 are of that kind.
+XLA compiles on many threads: of the 800 MiB that a process holds after its first frames 570 are of that kind. And each thread's
+part of the heap keeps up to 64 MiB at its end, however often it is asked for all.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
+
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
+"""Numbers by which `mallopt` knows the free bytes at the end of a heap, and the bytes of an array, from which on both are given
+back as soon as they are freed."""
+LARGE = 1 << 20
+GROWN = {TRIM_THRESHOLD: 64 << 20, MMAP_THRESHOLD: 32 << 20}
+"""What glibc comes to by itself in a process that frees large arrays."""
 
 
 def give_back() -> None:
     """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
-    _trim()(0)
+    _of_libc("malloc_trim")(0)
+
+
+@contextlib.contextmanager
+def given_back_at_once() -> Iterator[None]:
+    """Have arrays of 1 MiB or more given back as soon as they are freed, by all threads; each then costs its first touch."""
+    for option in GROWN:
+        _of_libc("mallopt")(option, LARGE)
+    try:
+        yield
+    finally:
+        for option, bytes_ in GROWN.items():
+            _of_libc("mallopt")(option, bytes_)
 
 
 @functools.cache
-def _trim() -> Callable[[int], object]:
+def _of_libc(name: str) -> Callable[..., Any]:
     try:
-        trim: Callable[[int], object] = ctypes.CDLL(None).malloc_trim
+        function: Callable[..., Any] = getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):  # another C library than glibc
-        return lambda _: None
-    return trim
+        return lambda *_: None
+    return function

@@ -17,7 +17,7 @@ def camera_of(perspective, height):
 
 @settings(max_examples=40, deadline=None)
 @given(st.booleans(), st.integers(0, 2**32 - 1), st.floats(-4, 0))
-def test_spheres_that_a_ray_of_a_block_meets_are_met_and_so_are_boxes_around_them(perspective, seed, decade):
+def test_spheres_that_a_ray_of_a_pane_meets_are_met_and_so_are_boxes_around_them(perspective, seed, decade):
     rng, camera = np.random.default_rng(seed), camera_of(perspective, 32)
     (top, left), size = rng.integers(0, (31, 20)), (33, 22)
     bottom, right = (int(rng.integers(first + 1, end)) for first, end in zip((top, left), size, strict=True))

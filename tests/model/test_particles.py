@@ -73,6 +73,15 @@ def test_sets_of_similar_size_have_the_same_capacity_and_keep_their_number():
         assert (particles.num_particles, particles.capacity) == (count, 1024)
 
 
+def test_another_number_in_the_same_capacity_compiles_nothing(caplog):
+    particles = [{name: np.ones((count, *array.shape[1:])) for name, array in good.items()} for count in (17, 18, 19)]
+    js.Particles.from_arrays(**particles[0], capacity=20)
+    with jax.log_compiles():
+        for columns in particles[1:]:
+            js.Particles.from_arrays(**columns, capacity=20)
+    assert "Compiling" not in caplog.text
+
+
 def test_padding_is_the_first_particle_without_volume():
     """So that who forgets what is valid meets no place, support or quantity that nobody gave."""
     for particles in (js.Particles.from_arrays(**good, capacity=8), js.Particles.from_arrays(**good).padded(8)):
