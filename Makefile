@@ -38,11 +38,8 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 SUITE = compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
 	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal
 
-# Most programs of the suite run once or twice: compiling them is what takes time, and optimising a third of that. Slow tests,
-# notebooks and `make test XLA_FLAGS=` have programs as users do.
-test: XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1
 test: lint
-	@export XLA_FLAGS="$(XLA_FLAGS)"; $(SUITE) $(PYTEST_ARGS)
+	@$(SUITE) $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
 	@$(SUITE) -m 'not endurance' $(PYTEST_ARGS)
