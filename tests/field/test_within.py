@@ -66,7 +66,8 @@ def test_point_samples_are_those_of_the_reference(name, projection, parts):
     image, truth = js.render(shown, camera(projection), settings), js.reference.render(shown, camera(projection), settings)
     assert 0.05 < float(truth.alpha.mean()) < 0.98
     assert (worst(image, truth) < 2e-5).mean() > 0.99  # a sample on a face is inside or not
-    assert image.stats["evaluations"] < js.render(scene(None, parts), camera(projection), settings).stats["evaluations"]
+    spent, of_all = (js.render(each, camera(projection), settings).stats["evaluations"] for each in (shown, scene(None, parts)))
+    assert spent <= of_all if name == "outside" else spent < of_all  # what is cut out of the middle may be less than a slab
 
 
 @pytest.mark.slow
