@@ -12,7 +12,7 @@ from jaxsph.frames import render_frames
 from jaxsph.from_disk import render_from_disk
 from jaxsph.met import Met, met
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
-from jaxsph.model.clips import Box, Plane, Sphere
+from jaxsph.model.clip_shapes import Box, Plane, Sphere
 from jaxsph.model.domains import control_values
 from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission

@@ -42,8 +42,8 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
         raise UsageError("--from-disk is for a snapshot file")
     cli_scene.refuse(options, (*OTHERS, *cli_where.OF_PARTICLES), "needs all particles at once; leave out --from-disk")
     if options.progressive or options.screen == "quadtree" or options.annotate:
-        raise UsageError("--from-disk renders parts of the image one by one; leave out --progressive, --screen and --annotate")
-    with progress("index", " runs") as show:
+        raise UsageError("--from-disk renders the image pane by pane; leave out --progressive, --screen and --annotate")
+    with progress("index", " reads") as show:
         on_disk = OnDisk.open(
             options.source,
             options.quantity,
@@ -80,6 +80,6 @@ def add_sort(parser: argparse.ArgumentParser) -> None:
 
 def sort(options: argparse.Namespace) -> None:
     """Order a snapshot in space."""
-    with progress("sort", " runs") as show:
+    with progress("sort", " reads") as show:
         sort_snapshot(options.source, options.output, part_type=options.part_type, progress=show)
     say("sorted", f"{options.output}, {len(Snapshot(options.output, options.part_type)):,} particles")

@@ -22,7 +22,8 @@ from jaxsph.console import UsageError, say, span
 from jaxsph.io.slices import SUFFIXES
 from jaxsph.model import Camera, Image, Particles, Scene
 from jaxsph.model.camera import Bounded
-from jaxsph.model.clips import Box, Clip, Plane, Sphere
+from jaxsph.model.clip_shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Clip
 from jaxsph.slices import slice_of
 from jaxsph.snapshots import center_of
 from jaxsph.survey import Survey

@@ -37,6 +37,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.along_rays import first_samples
 from jaxsph.depth_dealing import Parts, dealt_particles
+from jaxsph.field.schedule import SlabRange
 from jaxsph.frame import Drawn, Frame, over_bands
 from jaxsph.layers import OfShards, assemble, blank_if, crop, of_band
 from jaxsph.model.camera import Camera
@@ -54,7 +55,6 @@ from jaxsph.over_mesh import apart, on_each, over
 from jaxsph.plan import Plan
 from jaxsph.planning import see
 from jaxsph.render import certifies, metadata_of, missed, raise_for, tell, with_ended_rays
-from jaxsph.stages import SlabRange
 from jaxsph.viewing import Seen, half_steps
 
 TIES = 16  # eps that a transmittance may be off one half, where rounding decides which depth slab it crosses in

@@ -21,6 +21,7 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
+from jaxsph.field.schedule import SlabRange
 from jaxsph.host_stages import MAKE_GRID, ORDER
 from jaxsph.layers import OfShards
 from jaxsph.model import registry
@@ -37,7 +38,6 @@ from jaxsph.stages import (
     Cast,
     Decided,
     Limits,
-    SlabRange,
     add_lattices,
     cast_shard,
     decide_by_bounds,

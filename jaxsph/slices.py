@@ -19,7 +19,8 @@ from jaxtyping import Float
 
 from jaxsph.io import slices as files
 from jaxsph.model.camera import Camera
-from jaxsph.model.clips import Clip, Plane
+from jaxsph.model.clip_shapes import Plane
+from jaxsph.model.clips import Clip
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
 from jaxsph.model.scene import Scene

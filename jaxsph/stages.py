@@ -32,7 +32,7 @@ from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.control.probe import Probe, worthwhile
 from jaxsph.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.field.nodes import sum_at_nodes
-from jaxsph.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.field.schedule import SlabRange, SlabSchedule, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.field.within import over_slabs
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
@@ -95,18 +95,6 @@ def least_transmittance(settings: Settings) -> Any:
     """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
     least = settings.min_transmittance
     return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
-
-
-class SlabRange(NamedTuple):
-    """Numbers of slabs, from the first up to the one past the last."""
-
-    first: Int[Array, ""]
-    end: Int[Array, ""]
-
-    def holds(self, slabs: int) -> Bool[Array, " slabs"]:
-        """Which of so many slabs are in it."""
-        number = jnp.arange(slabs, dtype=jnp.int32)
-        return (number >= self.first) & (number < self.end)
 
 
 class BandGrid(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model import kernels
-from jaxsph.model.clips import Box
+from jaxsph.model.clip_shapes import Box
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept

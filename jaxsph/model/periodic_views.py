@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.camera import Camera
-from jaxsph.model.clips import Box
+from jaxsph.model.clip_shapes import Box
 from jaxsph.model.particles import Particles
 
 ALIGNED = 1e-6  # of its length, that a line of sight may be off an axis

@@ -2,7 +2,8 @@
 
 Flow: scene -> [where] -> image, media.
 
-Written apart from `model.clips` and `model.periodic`, which are judged by it: in world space, with all copies of all particles.
+Written apart from `model.clips`, `model.clip_shapes` and `model.periodic`, which are judged by it: in world space, with all
+copies of all particles.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsph.model.camera import Camera
-from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
+from jaxsph.model.clip_shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Both, Clip, Outside
 from jaxsph.model.particles import Particles
 
 
