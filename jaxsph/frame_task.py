@@ -18,6 +18,7 @@ import jax
 
 from jaxsph import io
 from jaxsph.field.in_octree import reachable
+from jaxsph.io.scene_linear import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.plan import Plan
@@ -56,10 +57,13 @@ class FrameTask:
         return self.source if isinstance(self.source, Scene) else self.source()
 
     def fingerprint(self, scene: Scene | None = None) -> str:
-        """A digest of all that the picture depends on; of files, of their names, sizes and times of change."""
+        """A digest of all that the picture depends on; of files, of their names, sizes and times of change.
+
+        What EXR files hold of colours is part of it: frames of a sequence are all of one kind.
+        """
         mark = getattr(self.source, "fingerprint", None) or digest_of(scene or self.scene())
         settings = dataclasses.replace(self.settings, memory_limit=None)
-        return fingerprint("f", __version__, jax.config.read("jax_enable_x64"), settings, digest_of(self.camera), mark)
+        return fingerprint("f", __version__, LIGHT, jax.config.read("jax_enable_x64"), settings, digest_of(self.camera), mark)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.frame_task import FrameTask
 from jaxsph.numerics.programs import PROGRAMS
 
 SETTINGS = js.Settings(samples=16)
@@ -115,6 +116,14 @@ def test_anything_that_a_picture_depends_on_makes_another_frame(tmp_path):
     for source, camera in ((scene, CAMERA), (hotter, CAMERA), (kernel, CAMERA), (scene, moved)):
         (frame,) = js.render_frames([source], [camera], SETTINGS, output=tmp_path / "frames")
         assert frame.rendered
+
+
+def test_frames_whose_files_hold_other_colours_are_made_anew(monkeypatch):
+    task = FrameTask(1, cloud(), CAMERA, SETTINGS)
+    before = task.fingerprint()
+    assert task.fingerprint() == before
+    monkeypatch.setattr("jaxsph.frame_task.LIGHT", "as displayed")
+    assert task.fingerprint() != before
 
 
 def test_files_are_shown_with_one_look(snapshots):

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 
 import numpy as np
+import OpenEXR
 import pytest
 
 import jaxsph as js
@@ -71,11 +72,14 @@ def test_files_of_parts_make_the_same_file_as_the_whole(three, tmp_path):
     for name in LAYERS:
         np.testing.assert_array_equal(getattr(merged, name), getattr(whole, name), name)
     assert dict(merged.metadata) == dict(whole.metadata)
+    files = [OpenEXR.File(str(tmp_path / name), separate_channels=True) for name in ("whole.exr", "merged.exr", "1.exr")]
+    for name, channel in files[0].channels().items():
+        np.testing.assert_array_equal(files[1].channels()[name].pixels, channel.pixels, name)
+    of_colors = [file.header()["jaxsph.color"] for file in files]
+    assert of_colors == ["linear Rec.709", "linear Rec.709", "sRGB, display-referred"]
 
 
 def test_the_file_of_a_part_says_where_it_belongs(three, tmp_path):
-    import OpenEXR
-
     three[1].save(tmp_path / "part.exr")
     header = OpenEXR.File(str(tmp_path / "part.exr")).header()
     metadata = dict(three[1].metadata)

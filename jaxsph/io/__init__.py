@@ -182,6 +182,8 @@ def read_points(
 def write_image(path: str | os.PathLike[str], image: Image) -> None:
     """Write `image` to `path`, whole or not at all: `.exr` (every layer) or `.png` (8 bit colours over black).
 
+    Both show the same: a PNG holds `image.color` as displayed, an EXR the linear light of it, see `jaxsph.io.scene_linear`.
+
     Raises:
         ValueError: another suffix, or a place that cannot be written to.
     """
@@ -193,11 +195,14 @@ Image.writer = staticmethod(write_image)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read an image that `write_image` wrote. Layers that the file does not hold are NaN.
+    """Read an image that `write_image` wrote, or another program. Layers that the file does not hold are NaN.
+
+    `image.color` is display-referred (sRGB), whatever the file holds: to 1e-6 what was written as EXR, to half of 1/255 as PNG.
+    Colours of an EXR file are linear light, and are encoded, unless its header says otherwise or an earlier jaxsph wrote it.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix, or a damaged file.
+        ValueError: another suffix, a damaged file, or colours of a kind that is not known.
     """
     file = Path(path)
     form = _image_format(file)

@@ -2,18 +2,19 @@
 
 | channel | meaning |
 |---|---|
-| `R` `G` `B` | colour, premultiplied, over black; linear numbers as rendered |
+| `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color`, see `scene_linear` |
 | `A` | `1 - transmittance` |
 | `Z` | view depth where transmittance falls to 1/2, inf where it never does |
 | `error.bound` | largest difference to the reference image that a pixel can have |
 | `work.evaluations` | kernel evaluations spent on the pixel |
 
 An image whose metadata say `jaxsph.first_row` and `jaxsph.rows` is some rows of a larger one: its data window is their place in
-the display window, so that EXR tools show it where it belongs.
+the display window, so that EXR tools show it where it belongs. Its colours are `image.color` itself, bit for bit, so that parts
+make the same picture as the whole.
 
 All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
-`jaxsph.version`, `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`, `jaxsph.estimator` (`segments` of that
-integrator) and `certified` (`true` or `false`).
+`jaxsph.version`, `jaxsph.color` (what the colours are), `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`,
+`jaxsph.estimator` (`segments` of that integrator) and `certified` (`true` or `false`).
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ from jaxsph.model.image import Image
 from .damage import DataError, explained
 from .optional import require
 from .replace import written_whole
+from .scene_linear import COLOR_KEY, color_of, header_of, is_light, light_of
 
 SOURCE = "OpenEXR"
 VERSION_KEY = "jaxsph.version"
 FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
 """Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
 RESERVED = (
-    "channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "pixelAspectRatio",
-    "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
+    "channels", "chromaticities", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
+    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
 )  # fmt: skip
 WORDS = {"true": True, "false": False, "none": None}
 
@@ -50,7 +52,8 @@ def write(path: Path, image: Image) -> None:
         ImportError: OpenEXR is not installed.
     """
     openexr = require("OpenEXR", "writing EXR images")
-    color = np.asarray(image.color, np.float32)
+    windows = _windows(image)
+    color = np.asarray(image.color, np.float32) if windows else light_of(image.color)
     layers = {
         **{name: color[..., i] for i, name in enumerate("RGB")},
         "A": 1 - np.asarray(image.transmittance, np.float32),
@@ -60,7 +63,7 @@ def write(path: Path, image: Image) -> None:
     }
     channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
     header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    header |= {**_attributes(image), **_windows(image)}
+    header |= {**_attributes(image), **windows, **header_of(displayed=bool(windows))}
     with written_whole(path) as temporary:
         try:
             openexr.File(header, channels).write(str(temporary))
@@ -71,10 +74,11 @@ def write(path: Path, image: Image) -> None:
 def read(path: Path) -> Image:
     """Read an image that `write` wrote, or any OpenEXR image with `R`, `G` and `B`.
 
-    Layers that the file lacks are NaN. `stats` is empty: the sums of a render are not in the file.
+    Layers that the file lacks are NaN. `stats` is empty: the sums of a render are not in the file. Colours are as displayed: of
+    linear light its sRGB encoding, to 1e-6 what was written. See `scene_linear` for files that do not say what they have.
 
     Raises:
-        ValueError: damaged, or without colour.
+        ValueError: damaged, without colour, or with colours of an unknown kind.
         ImportError: OpenEXR is not installed.
     """
     openexr = require("OpenEXR", "reading EXR images")
@@ -89,8 +93,9 @@ def read(path: Path) -> Image:
             raise DataError(f"has no channel {' '.join(missing)}, only {' '.join(layers)}; a colour image is expected")
         unknown = np.full_like(layers["R"], np.nan)
         metadata = {name: _value(value) for name, value in header.items() if _is_metadata(name, value)}
+        color = np.stack([layers[name] for name in "RGB"], axis=-1)
         return Image(
-            color=jnp.asarray(np.stack([layers[name] for name in "RGB"], axis=-1)),
+            color=jnp.asarray(color_of(color) if is_light(header) else color),
             transmittance=jnp.asarray(1 - layers.get("A", unknown)),
             depth=jnp.asarray(layers.get("Z", unknown)),
             error_bound=jnp.asarray(layers.get("error.bound", unknown)),
@@ -139,7 +144,7 @@ def _attribute(value: Any) -> str | int | float:
 
 
 def _is_metadata(name: str, value: Any) -> bool:
-    return name not in RESERVED and isinstance(value, str | int | float)
+    return name not in (*RESERVED, COLOR_KEY) and isinstance(value, str | int | float)
 
 
 def _value(value: str | int | float) -> str | int | float | bool | None:

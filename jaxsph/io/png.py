@@ -1,6 +1,6 @@
 """PNG images: 8 bit RGB of the colours over black, for looking at.
 
-Colours come from a transfer function, which is made by eye on a display, so they are display-referred: they are written
+Colours come from a transfer function, which is made by eye on a display, so they are display-referred (sRGB): they are written
 as they are, clipped to [0, 1] and rounded to the nearest of 256 steps, with no further encoding. Layers other than
 colour are left out; write EXR to keep them. The metadata goes into text chunks.
 """

@@ -3,7 +3,7 @@
 | channel of `.exr` | meaning |
 |---|---|
 | `value` | the quantity on the plane, NaN where there is none |
-| `R` `G` `B` `A` | its picture, where one is given |
+| `R` `G` `B` `A` | its picture, where one is given: linear light, see `scene_linear` |
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxsph.model.image import Image
 from . import png
 from .optional import require
 from .replace import written_whole
+from .scene_linear import header_of, light_of
 
 SUFFIXES = (".npy", ".exr", ".png")
 
@@ -46,12 +47,13 @@ def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple
 
 def _write_exr(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...]) -> None:
     openexr = require("OpenEXR", "writing EXR images")
-    layers = {"value": values}
+    layers, header = {"value": values}, {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **dict(metadata)}
     if picture is not None:
-        layers |= {name: np.asarray(picture.color)[..., k] for k, name in enumerate("RGB")}
+        light = light_of(picture.color)
+        layers |= {name: light[..., k] for k, name in enumerate("RGB")}
         layers["A"] = 1 - np.asarray(picture.transmittance)
+        header |= header_of(displayed=False)
     channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **dict(metadata)}
     with written_whole(path) as temporary:
         try:
             openexr.File(header, channels).write(str(temporary))

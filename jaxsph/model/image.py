@@ -22,7 +22,7 @@ class Image:
     """A rendered image. Row 0 is the top, column 0 the left; the background is black.
 
     Attributes:
-        color: premultiplied RGB in [0, 1].
+        color: premultiplied RGB in [0, 1], display-referred (sRGB) as colours of the transfer function are.
         transmittance: what is left of the background's light, in [0, 1]; alpha is `1 - transmittance`.
         depth: view depth where transmittance falls to 1/2, inf where it never does, length units.
         error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full

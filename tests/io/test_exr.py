@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image as Pillow
 
 import jaxsph
 import jaxsph.io as io
@@ -31,13 +32,20 @@ def make_image(**changes):
     return Image(**{**fields, **changes})
 
 
+def flat(height, width):
+    """Layers of another size, all 0."""
+    names = "transmittance", "depth", "error_bound", "evaluations"
+    return {name: np.zeros((height, width), np.float32) for name in names}
+
+
 def test_every_layer_comes_back_as_it_was(tmp_path):
     image = make_image()
     io.write_image(tmp_path / "a.exr", image)
     got = io.read_image(tmp_path / "a.exr")
-    for name in ("color", "depth", "error_bound", "evaluations"):
+    for name in ("depth", "error_bound", "evaluations"):
         np.testing.assert_array_equal(getattr(got, name), getattr(image, name))
         assert getattr(got, name).dtype == np.float32
+    np.testing.assert_allclose(got.color, image.color, rtol=0, atol=1e-6)
     np.testing.assert_allclose(got.transmittance, image.transmittance, rtol=0, atol=np.finfo(np.float32).eps)
     assert got.certified is True and got.faults == 0
 
@@ -57,6 +65,60 @@ def test_the_channels_have_the_names_that_compositors_know(tmp_path):
     np.testing.assert_array_equal(file.channels()["A"].pixels, 1 - image.transmittance)
     assert {channel.pixels.dtype for channel in file.channels().values()} == {np.dtype(np.float32)}
     assert file.header()["certified"] == "true"
+
+
+def srgb(light):
+    """IEC 61966-2-1, as tools encode linear light to show it."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def layers_of(path):
+    """Colours and header as another program finds them."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    return np.stack([file.channels()[name].pixels for name in "RGB"], -1), file.header()
+
+
+def test_tools_that_take_a_file_for_linear_light_show_what_the_png_shows(tmp_path):
+    image = make_image(color=np.linspace(0, 1, 768, dtype=np.float32).reshape(16, 16, 3), **flat(16, 16))
+    image.save(tmp_path / "a.exr")
+    image.save(tmp_path / "a.png")
+    light, header = layers_of(tmp_path / "a.exr")
+    with Pillow.open(tmp_path / "a.png") as opened:
+        shown = np.asarray(opened).astype(int)
+    assert np.abs(np.round(255 * srgb(light.astype(np.float64))) - shown).max() <= 1
+    assert header["jaxsph.color"] == "linear Rec.709"
+    np.testing.assert_allclose(header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), rtol=1e-6)
+
+
+def test_a_part_keeps_the_bits_of_its_colours_and_says_so(tmp_path):
+    image = make_image(metadata=(("jaxsph.first_row", 16), ("jaxsph.rows", 40)))
+    image.save(tmp_path / "a.exr")
+    numbers, header = layers_of(tmp_path / "a.exr")
+    assert header["jaxsph.color"] == "sRGB, display-referred" and "chromaticities" not in header
+    np.testing.assert_array_equal(numbers, image.color)
+    np.testing.assert_array_equal(io.read_image(tmp_path / "a.exr").color, image.color)
+
+
+def test_what_a_file_says_of_its_colours_is_not_said_of_the_image(tmp_path):
+    make_image().save(tmp_path / "a.exr")
+    got = io.read_image(tmp_path / "a.exr")
+    assert not {"jaxsph.color", "chromaticities"} & set(dict(got.metadata))
+    got.save(tmp_path / "b.exr")
+    np.testing.assert_allclose(io.read_image(tmp_path / "b.exr").color, got.color, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("header", "expected"), [({"jaxsph.version": "0.1.0"}, 0.5), ({}, 0.7353569830524495)])
+def test_files_that_do_not_say_are_display_referred_if_of_jaxsph_and_linear_if_foreign(tmp_path, header, expected):
+    layer = np.full((2, 2), 0.5, np.float32)
+    OpenEXR.File(header, {"R": layer, "G": layer, "B": layer}).write(str(tmp_path / "a.exr"))
+    np.testing.assert_allclose(io.read_image(tmp_path / "a.exr").color, expected, rtol=1e-6)
+
+
+def test_colours_of_an_unknown_kind_are_refused(tmp_path):
+    layer = np.ones((2, 2), np.float32)
+    OpenEXR.File({"jaxsph.color": "ACEScg"}, {"R": layer, "G": layer, "B": layer}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(ValueError, match=r"a\.exr: has jaxsph\.color = 'ACEScg'"):
+        io.read_image(tmp_path / "a.exr")
 
 
 def test_layers_that_a_foreign_image_lacks_are_unknown(tmp_path):

@@ -35,6 +35,9 @@ def test_exr_files_hold_values_and_the_picture_where_there_is_one(tmp_path):
         np.testing.assert_array_equal(opened.channels()["value"].pixels, made().values)
     image = io.read_image(tmp_path / "b.exr")
     np.testing.assert_allclose(image.color[0, 1], [0.5, 0.25, 0])
+    light = [opened.channels()[name].pixels[0, 1] for name in "RGB"]  # of the sRGB curve, as other tools take it
+    np.testing.assert_allclose(light, [0.21404114, 0.05087609, 0], rtol=1e-6)
+    assert opened.header()["jaxsph.color"] == "linear Rec.709"
     np.testing.assert_array_equal(image.alpha, [[1, 1, 1], [1, 0, 1]])
 
 
