@@ -236,6 +236,7 @@ def _sweep(options: argparse.Namespace) -> None:
         raise UsageError("--frame and --frames exclude each other; name all moments after --frames")
     if options.frames is not None and len(set(options.frames)) < len(options.frames):
         raise UsageError(f"--frames must be different numbers, got {' '.join(f'{moment:g}' for moment in options.frames)}")
+    cli_sweep.require_figures(options)
     views = []
     for moment in options.frames or [options.frame]:
         options.frame = moment

@@ -35,10 +35,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--no-figures", action="store_true", help="write the table only")
 
 
-def run(views: Sequence[tuple[float | None, Scene, Camera]], settings: Settings, name: str, options: argparse.Namespace) -> None:
-    """Sweep, write, and say."""
+def require_figures(options: argparse.Namespace) -> None:
+    """Know before anything is read that figures can be drawn, if they are to be."""
     if not options.no_figures:
         figures.require_matplotlib()
+
+
+def run(views: Sequence[tuple[float | None, Scene, Camera]], settings: Settings, name: str, options: argparse.Namespace) -> None:
+    """Sweep, write, and say."""
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
     chosen = {part: getattr(options, part) for part in parts}
     numbers, scenes, cameras = zip(*views, strict=True)

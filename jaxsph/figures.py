@@ -63,7 +63,7 @@ def require_matplotlib() -> None:
     Raises:
         ImportError: matplotlib is not installed; the message says how to.
     """
-    require("matplotlib", "drawing the figures of a sweep", "color")
+    require("matplotlib", "the figures of a sweep", "color")
 
 
 def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:

@@ -23,7 +23,7 @@ def read(path: Path) -> VolumeTable:
         ValueError: damaged, cut short, another number of axes, or oblique ones.
         ImportError: nibabel is not installed.
     """
-    library = require("nibabel", f"{path}: reading NIfTI")
+    library = require("nibabel", f"reading {path}")
     with explained(path, SOURCE):
         image = library.load(str(path))
         values = np.asanyarray(image.dataobj)

@@ -24,7 +24,7 @@ def read(path: Path) -> VolumeTable:
         ValueError: damaged, cut short, another number of axes, or oblique ones.
         ImportError: pynrrd is not installed.
     """
-    library = require("nrrd", f"{path}: reading NRRD")
+    library = require("nrrd", f"reading {path}")
     with explained(path, SOURCE):
         values, header = library.read(str(path), index_order="F")
         directions = header.get("space directions")

@@ -16,4 +16,4 @@ def require(module: str, purpose: str, extra: str = "io") -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         library = module.partition(".")[0]
-        raise ImportError(f'{purpose} needs the library `{library}`: pip install "jaxsph[{extra}]"') from error
+        raise ImportError(f'the library `{library}` is needed for {purpose}: pip install "jaxsph[{extra}]"') from error
