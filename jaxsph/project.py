@@ -26,7 +26,7 @@ from jaxsph.access.pixel_lists import Placed, footprints, place
 from jaxsph.field.column_sums import ColumnInputs, ColumnMethod, column_sums, pixels_of, subrays_of
 from jaxsph.model.camera import Camera
 from jaxsph.model.columns import depth_share
-from jaxsph.model.held import Held, held_by
+from jaxsph.model.held import Held, held_by, unit_held
 from jaxsph.model.particles import Particles
 from jaxsph.model.periodic import with_sources, wrapped
 from jaxsph.model.periodic_views import between_faces
@@ -35,6 +35,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock
 from jaxsph.numerics.fusion import barriers
+from jaxsph.numerics.given import in_unit
 from jaxsph.projection_plan import SHARES, WANTED, ProjectionPlan, beside, plan_projection
 from jaxsph.render import CapacityError
 from jaxsph.version import __version__
@@ -69,7 +70,8 @@ def project(
             values along the rays through their middles, which miss supports that are smaller than a pixel.
         depth_range: depths that rays begin and end at, for those of the camera.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
-        name, unit: what the values are called in files and figures, and their unit.
+        name, unit: what the values are called in files and figures, and their unit; by default that which `of` carries, if it is
+            an array with one, over that of positions squared without weight. Numbers are in these units, none is converted.
 
     Returns:
         Values in the dtype of the particles, in units of `of`, over length squared without weight; as exact as said above.
@@ -85,8 +87,8 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    camera = _between(camera, depth_range)
-    held = held_by(particles, of, weight)
+    camera = _between(camera, depth_range, particles.length_unit)
+    held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
     traced = is_traced(particles, camera, held.amounts)
     planned, plan = plan is None, plan or _planned(particles, camera, pixel, traced)
     plan.check(particles, camera, pixel)
@@ -109,10 +111,10 @@ def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> 
     return plan_projection(particles, camera, pixel=pixel)
 
 
-def _between(camera: Camera, depths: tuple[Any, Any] | None) -> Camera:
+def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -> Camera:
     if depths is None:
         return camera
-    near, far = depths
+    near, far = (in_unit("depth_range", depth, unit) for depth in depths)
     if not is_traced(near, far) and not (np.isfinite(near) and np.isfinite(far) and float(near) < float(far)):
         raise ValueError(f"`depth_range` must be two finite depths that ascend, got ({near}, {far})")
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:

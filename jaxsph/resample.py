@@ -23,6 +23,7 @@ from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.periodic import with_ghosts
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
+from jaxsph.numerics.given import in_unit
 
 PAIRS = 1 << 19  # (particle, point) pairs of a chunk: its arrays stay in the caches
 ON_FACE = 1e-6  # of a spacing, that points may lie outside of a periodic box
@@ -50,7 +51,8 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
     References:
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2.
     """
-    lower, spacing = (np.asarray(value, np.float64) for value in (lower, spacing))
+    places = {"lower": lower, "spacing": spacing}.items()
+    lower, spacing = (np.asarray(in_unit(name, value, particles.length_unit), np.float64) for name, value in places)
     if len(shape) != 3 or any(int(points) != points or points < 2 for points in shape):
         raise ValueError(f"`shape` must be three integers of at least 2, got {tuple(shape)}; give the points along x, y and z")
     for name, value, shapes in (("lower", lower, [(3,)]), ("spacing", spacing, [(), (3,)]), ("fill", np.asarray(fill), [()])):
@@ -64,7 +66,8 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
         grid.add(*box)
     inside = (grid.weight > 0) & _in_period(particles, lower, spacing, shape)
     quantity = np.where(inside, grid.weighted / np.where(inside, grid.weight, 1), fill)
-    return Volume.from_array(quantity.reshape(shape).astype(particles.dtype), lower, spacing)
+    made = Volume.from_array(quantity.reshape(shape).astype(particles.dtype), lower, spacing)
+    return dataclasses.replace(made, length_unit=particles.length_unit)
 
 
 def _in_period(particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:

@@ -27,6 +27,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics.checks import require_shape
+from jaxsph.numerics.given import in_unit
 from jaxsph.render import render
 from jaxsph.version import __version__
 
@@ -108,7 +109,8 @@ def slice_of(
     """
     if not isinstance(plane, Plane):
         raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
-    normal = np.asarray(plane.normal, np.float64)
+    unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
+    center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
     if up is None:
         up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.checks import is_traced, require_finite
+from jaxsph.numerics.given import plain
 
 PROJECTIONS = ("perspective", "orthographic")
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
@@ -34,6 +35,8 @@ class Bounded(Protocol):
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """A perspective or orthographic camera; make it with `look_at`, `orthographic` or `framing`.
+
+    Lengths are numbers in the unit of positions, which a camera does not know: what carries a unit is refused.
 
     Attributes:
         eye: position of the eye in world space, length units.
@@ -86,6 +89,7 @@ class Camera:
         Raises:
             ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
         """
+        fov_degrees = plain("fov_degrees", fov_degrees, "it is a number of degrees", "of 'deg'")
         _require_fov(fov_degrees)
         half = (
             jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360))
@@ -112,6 +116,7 @@ class Camera:
         Raises:
             ValueError: as `look_at`, and for `view_height` <= 0.
         """
+        view_height = plain("view_height", view_height)
         if not is_traced(view_height) and not (np.isfinite(view_height) and view_height > 0):
             raise ValueError(f"`view_height` must be > 0 and finite, got {view_height}; it is the visible height in length units")
         return _make(eye, target, up, view_height * 0.5, width, height, near, far, "orthographic")
@@ -247,6 +252,8 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= MAX_SIDE:
             raise ValueError(f"`{name}` must be an integer from 1 to {MAX_SIDE} pixels, got {size!r}")
+    given = {"eye": eye, "target": target, "up": up, "near": near, "far": far}
+    eye, target, up, near, far = (plain(name, value) for name, value in given.items())
     parts = (eye, target, up, half, near, far)
     xp: Any = jnp
     if not is_traced(*parts):

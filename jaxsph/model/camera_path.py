@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera import Camera
 from jaxsph.model.camera_leg import Leg, made
+from jaxsph.numerics.given import plain
 
 MAX_TURN = 90.0
 """Degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one."""
@@ -94,7 +95,7 @@ class CameraPath:
         Raises:
             ValueError: neither a camera nor a ball; numbers that are not finite, no axis.
         """
-        axis = _axis(up)
+        axis, center, radius = _axis(up), plain("center", center), plain("radius", radius)
         for name, value in (("degrees", degrees), ("seconds", seconds)):
             if not np.isfinite(value) or (name == "seconds" and not value > 0):
                 raise ValueError(f"`{name}` must be finite{' and > 0' if name == 'seconds' else ''}, got {value}")
@@ -197,14 +198,14 @@ def _pair(key: Any) -> tuple[Any, Any]:
 def _point(point: Any) -> tuple[float, float, float] | None:
     if point is None:
         return None
-    x = np.asarray(point, np.float64)
+    x = np.asarray(plain("around", point), np.float64)
     if x.shape != (3,) or not np.isfinite(x).all():
         raise ValueError(f"a point must be three finite numbers (x, y, z), got {np.asarray(point).tolist()}")
     return float(x[0]), float(x[1]), float(x[2])
 
 
 def _axis(up: Any) -> np.ndarray:
-    axis = np.asarray(up, np.float64)
+    axis = np.asarray(plain("up", up), np.float64)
     length = np.linalg.norm(axis) if axis.shape == (3,) else 0
     if not (np.isfinite(length) and length > 0):
         raise ValueError(f"`up` must be an axis (x, y, z), got {axis.tolist()}")

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.camera import Camera
 from jaxsph.model.clips import Clip, Overlap, Place, Spans, ascending, common, fill, made, register
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.given import plain
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
 
@@ -100,6 +101,7 @@ class Box(Clip):
         Raises:
             ValueError: other shapes, numbers that are not finite, corners that do not ascend.
         """
+        lower, upper = plain("lower", lower), plain("upper", upper)
         (low, low_rest), (high, high_rest) = _vector("lower", lower), _vector("upper", upper)
         dtype = jnp.promote_types(low.dtype, high.dtype)
         if not is_traced(lower, upper):
@@ -213,6 +215,7 @@ class Sphere(Clip):
         Raises:
             ValueError: other shapes, numbers that are not finite, a radius that is not > 0.
         """
+        radius = plain("radius", radius)
         near, rest = _vector("center", center)
         if not is_traced(radius):
             require_shape("radius", radius, (), "give one number")
@@ -261,6 +264,7 @@ class Sphere(Clip):
 
 def _exact(name: str, value: Any) -> tuple[np.ndarray, Any]:
     """A vector in float64, and the dtype that it is to have."""
+    value = plain(name, value)
     given = np.asarray(value)
     if given.shape != (3,):
         raise ValueError(f"`{name}` must have shape (3,), got {given.shape}; give x, y and z")

@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.colormaps import POINTS, TAILS, value_range
+from jaxsph.numerics.given import own
 
 LINEAR_SHARE = 1e-3
 """Width around zero in which `symlog` is about linear, over the largest value, unless it is given."""
@@ -135,10 +136,10 @@ def _known(quantity: Any, weights: Any) -> tuple[np.ndarray | None, np.ndarray |
         if weights is not None:
             raise ValueError("`weights` go with `quantity`, and there is none; give both")
         return None, None
-    values = np.asarray(quantity, np.float64).ravel()
+    values = np.asarray(own("quantity", quantity), np.float64).ravel()
     if weights is None:
         return values[np.isfinite(values)], None
-    weight = np.asarray(weights, np.float64).ravel()
+    weight = np.asarray(own("weights", weights), np.float64).ravel()
     if weight.shape != values.shape or not np.isfinite(weight).all() or (weight < 0).any():
         raise ValueError(f"`weights` must be {values.size} finite numbers >= 0, one for each value of the quantity")
     there = np.isfinite(values) & (weight > 0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxsph.model.camera import Bounded, Camera
+from jaxsph.numerics.given import plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
 """Line of sight and upward direction: images show y and z, x and z, x and y, the first to the right and the second upwards."""
@@ -49,6 +50,7 @@ def along_axis(
     near, far = 0.5 * distance - WIDENED * deep, 1.5 * distance + WIDENED * deep
     eye = middle - forward * distance
     if slab is not None:
+        slab = plain("slab", slab[0]), plain("slab", slab[1])
         if not (np.isfinite(slab[0]) and np.isfinite(slab[1]) and slab[0] < slab[1]):
             raise ValueError(f"`slab` must be two finite coordinates that ascend, got {tuple(slab)}")
         near, far = sorted(float((end - eye["xyz".index(axis)]) * forward.sum()) for end in slab)

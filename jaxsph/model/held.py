@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.particles import Particles
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
+from jaxsph.numerics.given import NO_UNITS, own, plain, unit_of
 
 COLUMNS = ("volume", "quantity")
 
@@ -34,6 +35,15 @@ class Held:
     exponents: tuple[int, ...]
     is_mean: bool
     name: str
+
+
+def unit_held(particles: Particles, of: Any, weight: Any) -> str:
+    """The unit of what is summed up, as far as `of` carries one: of a mean that itself, else of it a unit of area."""
+    unit = unit_of(of)
+    if unit is None or str(unit) in NO_UNITS:
+        return ""
+    area = "a unit of area" if particles.length_unit is None else f"/ ({particles.length_unit})**2"
+    return str(unit) if weight is not None else f"{unit} {area}"
 
 
 def held_by(particles: Particles, of: Any, weight: Any) -> Held:
@@ -63,7 +73,15 @@ def emission(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0
         mass, density: of particles, in the order of their arrays.
         coefficient: A, one number or one a particle, such as a cooling function of the temperature.
         power: n.
+
+    Raises:
+        ValueError: arrays with units, as the unit of what they give is not worked out here; masked arrays.
     """
+    given = {"mass": mass, "density": density, "coefficient": coefficient}
+    mass, density, coefficient = (
+        plain(name, value, "units are not multiplied here", "and name that of the result yourself")
+        for name, value in given.items()
+    )
     if any(is_traced(value) for value in (mass, density, coefficient)):
         return coefficient * jnp.asarray(density) ** (power - 1) * mass
     parts = [np.asarray(value, np.float64) for value in (mass, density, coefficient)]
@@ -77,6 +95,7 @@ def _numbers(particles: Particles, name: str, given: Any) -> Any:
             known = " or ".join(map(repr, COLUMNS))
             raise ValueError(f"`{name}` must be {known}, columns that particles have, or one number a particle; got {given!r}")
         given = getattr(particles, given)
+    given = own(name, given)
     value = given if is_traced(given) else np.asarray(given)
     require_real(name, value)
     count = None if is_traced(particles.valid) else particles.num_particles

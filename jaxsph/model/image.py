@@ -53,6 +53,10 @@ class Image:
     drawer: ClassVar[Callable[..., Any]]
     """How images become figures: given by `jaxsph.image_figure`."""
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""
+        return np.array(np.asarray(self.color), dtype, copy=copy)
+
     @property
     def alpha(self) -> Float[Array, "height width"]:
         """Opacity, `1 - transmittance`."""

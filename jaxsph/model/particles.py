@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model import kernels
 from jaxsph.model.clip_shapes import Box
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 
@@ -49,6 +50,7 @@ class Particles:
             part of every support.
         extinction_quantity: the second carried quantity, by which extinction is looked up; None where there is one alone.
         box: the period, if there is one: supports reach across its faces, and one period is shown. Positions may be outside.
+        length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
     position: Float[Array, "particles 3"]
@@ -60,6 +62,7 @@ class Particles:
     position_rest: Float[Array, "particles 3"] | None = None
     extinction_quantity: Float[Array, " particles"] | None = None
     box: Box | None = None
+    length_unit: str | None = None
 
     @classmethod
     def from_arrays(
@@ -74,6 +77,10 @@ class Particles:
         box: Any = None,
     ) -> Particles:
         """Check and pack arrays of particles.
+
+        Arrays may carry units, such as those of unyt and astropy. Lengths and volumes are then converted to the unit of
+        `position`, and numbers without one are meant in it. Carried quantities keep their own unit, and a transfer function's
+        values are numbers in that.
 
         Args:
             position: (N, 3), length units; N = 0 is an empty scene.
@@ -93,21 +100,15 @@ class Particles:
 
         Raises:
             ValueError: wrong shapes, non-finite values, supports <= 0, volumes < 0, unknown kernel, capacity < N, numbers that
-                the dtype cannot hold, a periodic box with a side that is not > 0 or shorter than a support.
+                the dtype cannot hold, a periodic box with a side that is not > 0 or shorter than a support; masked arrays, units
+                that cannot be converted to that of positions.
         """
         kernels.by_name(kernel)
-        arrays = {"position": position, "support": support, **_quantities(quantity), "volume": volume}
-        arrays = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in arrays.items()}
-        for name, value in arrays.items():
-            require_real(name, value)
-        if arrays["position"].size == 0 and not isinstance(arrays["position"], jax.Array):
-            arrays["position"] = arrays["position"].reshape(0, 3)
-        require_shape("position", arrays["position"], (None, 3), "one row (x, y, z) a particle")
-        count = arrays["position"].shape[0]
-        for name in list(arrays)[1:]:
-            if arrays[name].ndim == 0:
-                arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
-            require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
+        position, unit = with_unit("position", position)
+        given = {"position": position, "support": in_unit("support", support, unit)}
+        given |= {name: own(name, value) for name, value in _quantities(quantity).items()}
+        arrays = _columns(given | {"volume": in_unit("volume", volume, unit, 3)})
+        box, count = box if isinstance(box, Box) else in_unit("box", box, unit), arrays["position"].shape[0]
         _require_usable(arrays)
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
         capacity = capacity_class(count) if capacity is None else capacity
@@ -118,8 +119,8 @@ class Particles:
         if not is_traced(*arrays.values()) and count:
             _require_representable(arrays, packed)
             rest = rest_of(arrays["position"], packed["position"], packed["support"])
-        valid = jnp.arange(capacity) < count
-        return cls(**packed, valid=valid, kernel=kernel, position_rest=rest, box=_period(box, arrays["support"], dtype))
+        valid, period, called = jnp.arange(capacity) < count, _period(box, arrays["support"], dtype), name_of(unit)
+        return cls(**packed, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=called)
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.
@@ -204,6 +205,22 @@ class Particles:
         position = self.exact_position()[valid]
         support = np.asarray(self.support, np.float64)[valid, None]
         return (position - support).min(0), (position + support).max(0)
+
+
+def _columns(given: dict[str, Any]) -> dict[str, Any]:
+    """Arrays of real numbers, positions first, with an entry for each particle."""
+    arrays = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
+    for name, value in arrays.items():
+        require_real(name, value)
+    if arrays["position"].size == 0 and not isinstance(arrays["position"], jax.Array):
+        arrays["position"] = arrays["position"].reshape(0, 3)
+    require_shape("position", arrays["position"], (None, 3), "one row (x, y, z) a particle")
+    count = arrays["position"].shape[0]
+    for name in list(arrays)[1:]:
+        if arrays[name].ndim == 0:
+            arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
+        require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
+    return arrays
 
 
 def _require_usable(arrays: dict[str, Any]) -> None:
@@ -295,6 +312,7 @@ def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> N
         )
 
 
+STATIC = ["kernel", "length_unit"]
 jax.tree_util.register_dataclass(
-    Particles, data_fields=[f.name for f in dataclasses.fields(Particles) if f.name != "kernel"], meta_fields=["kernel"]
+    Particles, data_fields=[f.name for f in dataclasses.fields(Particles) if f.name not in STATIC], meta_fields=STATIC
 )

@@ -25,6 +25,7 @@ from jaxsph.model.clip_shapes import Box
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_shape
+from jaxsph.numerics.given import in_unit
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
 """Periods around the box, in which ghosts can lie."""
@@ -141,6 +142,7 @@ def centered(particles: Particles, at: Any) -> Particles:
         if at != "densest":
             raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
         at = densest(particles)
+    at = in_unit("at", at, particles.length_unit)
     if is_traced(at, particles):
         half = 0.5 * particles.box.sides
         lower = jnp.asarray(at, particles.dtype) - half

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.particles import Particles, capacity_class, rest_of
 from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
 
 SPREADS = "chords", "feet", "centres"
 MAIN = "position", "radius", "color", "extinction"
@@ -45,6 +46,7 @@ class Points:
             between samples has the integral of extinction along it. "feet": all of it at the foot of the centre on the ray
             (Kaehler, Abel & Hege 2007, section 3.2). "centres": all of it at the depth of the centre, as a splat has it. What
             a ray meets in all is the same; how it is ordered in depth is not.
+        length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
     position: Float[Array, "points 3"]
@@ -57,6 +59,7 @@ class Points:
     position_rest: Float[Array, "points 3"] | None = None
     splats_beyond: Float[Array, ""] | None = None
     spread: str = "chords"
+    length_unit: str | None = None
 
     @classmethod
     def from_arrays(
@@ -74,6 +77,9 @@ class Points:
         capacity: int | None = None,
     ) -> Points:
         """Check and pack arrays of points.
+
+        Arrays may carry units, as those of unyt and astropy do. Lengths and extinctions are then converted to that of `position`,
+        in which numbers without one are meant; attributes keep their own.
 
         Args:
             position: (N, 3), length units; N = 0 is an empty set.
@@ -93,32 +99,29 @@ class Points:
 
         Raises:
             ValueError: wrong shapes, numbers that are not finite or out of range, neither or both of extinction and opacity,
-                an unknown profile or spread, capacity < N, an attribute named as what every point has, an opacity of points
-                whose profile has none along a ray through the centre, or is not known by the distance alone.
+                an unknown profile or spread, capacity < N, an attribute named as what every point has, an opacity where the
+                profile has none through the centre, or is not known by distance alone; masks, units of another kind.
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
         if spread == "feet" and splats_beyond is not None:
             raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
-        center = _centers(position)
-        given = {"radius": radius, **_strength(extinction, opacity), **_own_names(attributes or {})}
-        columns = {"position": center, "color": _column("color", color, center.shape[0], (3,))}
-        columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
-        _require_usable(columns)
+        position, unit = with_unit("position", position)
+        given = {"radius": in_unit("radius", radius, unit), **_strength(extinction, opacity, unit)}
+        columns = _columns(_centers(position), color, given | _own_names(attributes or {}))
+        center = columns["position"]
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(center.dtype), jnp.float32)
-        room = capacity_class(center.shape[0]) if capacity is None else capacity
-        if room < max(center.shape[0], 1):
-            raise ValueError(f"`capacity` must be at least the number of points ({center.shape[0]}) and 1, got {room}")
+        room = _room(capacity, center.shape[0])
         shape = profile_of(profile, dtype)
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
-        known = center.shape[0] and not is_traced(center, packed["radius"])
-        rest = rest_of(center, packed["position"], packed["radius"]) if known else None
+        rest = _rest(center, packed)
         packed = {name: jnp.asarray(value) for name, value in packed.items()}
         main = {name: packed.pop(name) for name in MAIN}
-        valid, beyond = jnp.arange(room) < center.shape[0], _distance(splats_beyond, dtype)
-        return cls(**main, valid=valid, attributes=packed, profile=shape, position_rest=rest, splats_beyond=beyond, spread=spread)
+        valid, beyond = jnp.arange(room) < center.shape[0], _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
+        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit)}
+        return cls(**main, valid=valid, attributes=packed, profile=shape, position_rest=rest, **more)
 
     @property
     def capacity(self) -> int:
@@ -181,12 +184,36 @@ def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any
     return value
 
 
-def _strength(extinction: Any, opacity: Any) -> dict[str, Any]:
+def _columns(center: Any, color: Any, given: dict[str, Any]) -> dict[str, Any]:
+    """An entry for each point of all that is given, checked."""
+    columns = {"position": center, "color": _column("color", plain("color", color), center.shape[0], (3,))}
+    columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
+    _require_usable(columns)
+    return columns
+
+
+def _room(capacity: int | None, count: int) -> int:
+    """How many entries there are to be."""
+    room = capacity_class(count) if capacity is None else capacity
+    if room < max(count, 1):
+        raise ValueError(f"`capacity` must be at least the number of points ({count}) and 1, got {room}")
+    return room
+
+
+def _rest(center: Any, packed: dict[str, Any]) -> Array | None:
+    """What rounding centres has left, where they are known."""
+    known = center.shape[0] and not is_traced(center, packed["radius"])
+    return rest_of(center, packed["position"], packed["radius"]) if known else None
+
+
+def _strength(extinction: Any, opacity: Any, unit: Any) -> dict[str, Any]:
     """The one that is given, by name."""
     if (extinction is None) == (opacity is None):
         what = "neither" if extinction is None else "both"
         raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
-    return {"extinction": extinction} if opacity is None else {"opacity": opacity}
+    if opacity is None:
+        return {"extinction": in_unit("extinction", extinction, unit, -1)}
+    return {"opacity": plain("opacity", opacity, "it is a number")}
 
 
 def _own_names(attributes: dict[str, Any]) -> dict[str, Any]:
@@ -194,7 +221,7 @@ def _own_names(attributes: dict[str, Any]) -> dict[str, Any]:
     taken = [name for name in attributes if name in (*MAIN, "opacity")]
     if taken:
         raise ValueError(f"`attributes` must not be named as what every point has, got {taken[0]!r}; give it another name")
-    return attributes
+    return {name: own(name, value) for name, value in attributes.items()}
 
 
 def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
@@ -250,5 +277,5 @@ def _distance(value: Any, dtype: Any) -> Array | None:
 jax.tree_util.register_dataclass(
     Points,
     data_fields=["position", "radius", "color", "extinction", "valid", "attributes", "profile", "position_rest", "splats_beyond"],
-    meta_fields=["spread"],
+    meta_fields=["spread", "length_unit"],
 )

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.given import plain
 
 FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -183,6 +184,7 @@ def profile_of(given: Any, dtype: Any) -> Profile:
         return BY_NAME[given]
     if callable(given):
         return Shaped(given)
+    given = plain("profile", given, "it is a share of the extinction")
     values = given if isinstance(given, jax.Array) else np.asarray(given)
     require_real("profile", values)
     require_shape("profile", values, (None,), "give numbers at distances evenly spaced from the centre to the radius")

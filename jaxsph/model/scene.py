@@ -68,6 +68,7 @@ class Scene:
         media = self.media if isinstance(self.media, tuple) else (self.media,)
         if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
+        _require_one_unit({name: _all_of(getattr(self, name)) for name in ("particles", "volume", "points")})
 
     def check(self) -> None:
         """Raise `ValueError` where there is nothing to look at, or a part without what it looks like."""
@@ -117,6 +118,14 @@ class Scene:
             return self.particles
         entry: dict[str, Any] = {name: jnp.full(1, value, self.dtype) for name, value in NOTHING.items()}
         return Particles(**entry | {"position": jnp.zeros((1, 3), self.dtype)}, valid=jnp.zeros(1, bool))
+
+
+def _require_one_unit(parts: dict[str, tuple[Any, ...]]) -> None:
+    """Raise where parts were given in different units of length; those given as numbers are meant in that of the others."""
+    units = {unit: name for name, of in parts.items() for one in of if (unit := getattr(one, "length_unit", None)) is not None}
+    if len(units) > 1:
+        told = " and ".join(f"`{name}` in {unit}" for unit, name in units.items())
+        raise ValueError(f"all parts of a scene must have one unit of length, got {told}; convert positions to one unit")
 
 
 def _require_looks(particles: Particles, transfer: TransferFunction) -> None:

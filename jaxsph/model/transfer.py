@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.transfer_ways import TransferWays
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.given import plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +42,9 @@ class TransferFunction(TransferWays):
     def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
         """Check and pack control points.
 
+        All are numbers: which unit a scene's quantities and lengths have is not known here, so arrays that carry units are
+        refused.
+
         Args:
             values: (K,) ascending (equal neighbours allowed), K >= 1, units of the quantity.
             colors: (K, 3) in [0, 1].
@@ -54,7 +58,7 @@ class TransferFunction(TransferWays):
                 that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
-        given = {name: value for name, value in given.items() if value is not None}
+        given = {name: numbers(name, value) for name, value in given.items() if value is not None}
         given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
         for name, value in given.items():
             require_real(name, value)
@@ -126,6 +130,12 @@ class TransferFunction(TransferWays):
         even = jnp.linspace(self.values[0], self.values[-1], self.values.shape[0])
         off = jnp.abs(self.values - even) <= EVEN * jnp.finfo(width.dtype).eps * jnp.maximum(jnp.abs(even[0]), jnp.abs(even[-1]))
         return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
+
+
+def numbers(name: str, value: Any) -> Any:
+    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
+    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
+    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
 
 
 def _require_ascending(name: str, given: Any) -> None:

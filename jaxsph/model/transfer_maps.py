@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.colormaps import COLORMAPS, POINTS, colormap
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer import TransferFunction, numbers
 
 
 def from_colormap(colors: Any, values: Any, extinction: Any = 1.0) -> TransferFunction:
@@ -25,7 +25,7 @@ def from_colormap(colors: Any, values: Any, extinction: Any = 1.0) -> TransferFu
         ValueError: an unknown colour map, or what `TransferFunction.from_points` refuses.
     """
     rows = colormap(colors) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
-    values = np.asarray(values, np.float64)
+    values = np.asarray(numbers("values", values), np.float64)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"`values` must be two ends, or control values (K,), got shape {values.shape}")
     if len(values) == 2:
@@ -128,7 +128,7 @@ def _of_rgba(values: np.ndarray, rgba: np.ndarray, extinction: Any) -> TransferF
 
 def _spread(given: Any, points: int) -> np.ndarray:
     """Rows, or numbers, evenly placed from the first to the last, at so many places."""
-    rows = np.asarray(given, np.float64)
+    rows = np.asarray(numbers("extinction", given), np.float64)
     rows = rows[None] if rows.ndim == 0 else rows
     if rows.ndim not in (1, 2) or not len(rows):
         raise ValueError(f"`extinction` must be a number, or some from the low end to the high, got shape {rows.shape}")

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
+from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 
 KEPT = ("uint8", "int8", "uint16", "int16")
 """Integers that stay as they are in memory: float32 holds each of them exactly."""
@@ -31,16 +32,21 @@ class Volume:
         lower: position of the point (0, 0, 0), length units.
         spacing: between neighbouring points along x, y and z, > 0, length units.
         lower_rest: what rounding a float64 `lower` has left, length units.
+        length_unit: what the unit of lengths is called, where the place was given with one (static).
     """
 
     values: Num[Array, "nx ny nz"]
     lower: Float[Array, "3"]
     spacing: Float[Array, "3"]
     lower_rest: Float[Array, "3"]
+    length_unit: str | None = None
 
     @classmethod
     def from_array(cls, values: Any, lower: Any = (0.0, 0.0, 0.0), spacing: Any = 1.0) -> Volume:
         """Check and pack the values of a grid.
+
+        Arrays may carry units, such as those of unyt and astropy. `spacing` is then converted to the unit of `lower`, if that is
+        not the origin, and values keep their own, which control points of the transfer function are numbers in.
 
         Args:
             values: (Nx, Ny, Nz) at the grid points, at least two along each axis; the first index counts along x. Integers of 8
@@ -54,8 +60,9 @@ class Volume:
 
         Raises:
             ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
-                is not > 0 and finite, a `lower` that is not finite.
+                is not > 0 and finite, a `lower` that is not finite; masked arrays, units that cannot be converted.
         """
+        values, (lower, spacing, unit) = own("values", values), _place(lower, spacing)
         given = values if isinstance(values, jax.Array) else np.asarray(values)
         require_real("values", given)
         if given.ndim != 3:
@@ -78,7 +85,8 @@ class Volume:
             require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
             require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
         near = exact.astype(dtype)
-        return cls(packed, jnp.asarray(near), jnp.asarray(steps, dtype), jnp.asarray(exact - near, dtype))
+        rest = jnp.asarray(exact - near, dtype)
+        return cls(packed, jnp.asarray(near), jnp.asarray(steps, dtype), rest, name_of(unit))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -94,6 +102,14 @@ class Volume:
         """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""
         lower = np.asarray(self.lower, np.float64) + np.asarray(self.lower_rest, np.float64)
         return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
+
+
+def _place(lower: Any, spacing: Any) -> tuple[Any, Any, Any]:
+    """Where a grid is, and the unit of both: of `lower`, or of `spacing` where that is the origin, which is it in any unit."""
+    lower, unit = with_unit("lower", lower)
+    if unit is None and not is_traced(lower) and not np.any(lower):
+        return lower, *with_unit("spacing", spacing)
+    return lower, in_unit("spacing", spacing, unit, of="lower"), unit
 
 
 def _kept_dtype(given: Any) -> Any:
@@ -131,4 +147,4 @@ def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:
     return np.broadcast_to(given, shape)
 
 
-jax.tree_util.register_dataclass(Volume, data_fields=["values", "lower", "spacing", "lower_rest"], meta_fields=[])
+jax.tree_util.register_dataclass(Volume, data_fields=["values", "lower", "spacing", "lower_rest"], meta_fields=["length_unit"])
