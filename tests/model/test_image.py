@@ -4,6 +4,8 @@ import dataclasses
 import io
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image as Pillow
@@ -34,7 +36,33 @@ def test_an_image_writes_itself_as_what_its_path_says(tmp_path, suffix):
     if suffix == ".png":
         assert np.asarray(Pillow.open(path)).tolist() == given.to_uint8().tolist()
     else:
-        np.testing.assert_array_equal(js.io.read_image(path).color, given.color)
+        np.testing.assert_allclose(js.io.read_image(path).color, given.color, rtol=0, atol=1e-6)
+
+
+def test_numpy_takes_it_for_the_picture():
+    color = np.random.default_rng(0).random((3, 5, 3), np.float32)
+    found = np.asarray(image(color))
+    assert found.dtype == np.float32 and found.shape == (3, 5, 3)
+    np.testing.assert_array_equal(found, color)
+    np.testing.assert_array_equal(np.asarray(image(jnp.asarray(color)), np.float64), color.astype(np.float64))
+    copied = np.array(image(color))
+    copied[:] = 0
+    assert color.max() > 0
+    with pytest.raises(ValueError, match="copy"):
+        np.array(image(color), np.float64, copy=False)
+
+
+def test_matplotlib_shows_it():
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    shown = figure.add_subplot().imshow(image(np.full((3, 5, 3), 0.5, np.float32)))
+    np.testing.assert_array_equal(shown.get_array(), np.full((3, 5, 3), 0.5))
+
+
+def test_jax_takes_it_for_a_tree_of_layers():
+    given = image(np.full((3, 5, 3), 0.5, np.float32))
+    assert len(jax.tree.leaves(given)) == 7
+    doubled = jax.jit(lambda shown: jax.tree.map(lambda layer: 2 * layer, shown))(given)
+    assert isinstance(doubled, js.Image) and float(doubled.color[0, 0, 0]) == 1
 
 
 def test_alpha_is_what_is_not_transmitted():

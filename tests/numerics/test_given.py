@@ -71,8 +71,9 @@ def test_lengths_and_volumes_become_those_of_positions(made):
 
 @LIBRARIES
 def test_extinctions_of_points_are_a_unit_of_their_positions(made):
-    found = js.Points.from_arrays(made(POSITION, "kpc"), made(100, "pc"), extinction=made(0.002, "pc", -1),
-                                  splats_beyond=made(3000, "pc"), attributes={"age": unyt.unyt_array([1, 2, 3], "Myr")})  # fmt: skip
+    ages = {"age": unyt.unyt_array([1.0, 2, 3], "Myr")}
+    lengths = {"radius": made(100, "pc"), "extinction": made(0.002, "pc", -1), "splats_beyond": made(3000, "pc")}
+    found = js.Points.from_arrays(made(POSITION, "kpc"), **lengths, attributes=ages)
     np.testing.assert_allclose(found.radius[:3], 0.1, rtol=1e-6)
     np.testing.assert_allclose(found.extinction[:3], 2, rtol=1e-6)
     np.testing.assert_allclose(found.splats_beyond, 3, rtol=1e-6)
