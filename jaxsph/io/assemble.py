@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.particles import Particles
+from jaxsph.numerics.given import plain
 
 from .damage import DataError
 from .quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
@@ -24,6 +25,7 @@ from .where import select
 ROUNDING_NOTED = 1e-3
 """Rounding of positions to float32, in units of the smallest support, from which it is worth a note."""
 FROM_FILE = "file"
+OF_FILE = "lengths are numbers in the unit of the file"
 OUTSIDE = 1e-3
 """Of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then."""
 ROUNDING_REFUSED = 0.25
@@ -120,6 +122,7 @@ def particles_from_table(
 
 def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     """The table with the periodic box asked for, and a note on that."""
+    box = plain("box", box, OF_FILE)
     sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
     if sides is None:
         return dataclasses.replace(table, box_size=None), []
@@ -227,7 +230,7 @@ def _spreads(thinness: np.ndarray) -> bool:
 
 def _supports(table: ParticleTable, support: float | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
     if support is not None:
-        given = np.asarray(support, np.float64)
+        given = np.asarray(plain("support", support, OF_FILE), np.float64)
         if given.ndim and given.shape != (len(table),):
             raise DataError(f"`support` must be a number or have shape ({len(table)},), got shape {given.shape}")
         bad = ~(np.isfinite(given) & (given > 0))

@@ -19,8 +19,9 @@ import numpy as np
 from jaxsph.model.colormaps import colormap as colors_of_map
 from jaxsph.model.colormaps import value_range
 from jaxsph.model.points import Points
+from jaxsph.numerics import given
 
-from .assemble import rounding_note
+from .assemble import OF_FILE, rounding_note
 from .damage import DataError
 from .quantities import choose_quantity
 from .table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, plain
@@ -106,6 +107,8 @@ def points_from_table(
 def _assemble(
     table: ParticleTable, color: Any, radius: Any, strength: dict[str, Any], profile: Any, colormap: str
 ) -> tuple[Points, PointsReport]:
+    radius, color = (given.plain(name, value, OF_FILE) for name, value in (("radius", radius), ("color", color)))
+    strength = {name: given.plain(name, value, OF_FILE) for name, value in strength.items()}
     radii, radius_origin = _radii(table, radius)
     colors, color_origin = _colors(table, color, colormap)
     kind, strengths, strength_origin, noted = _strengths(table, strength)

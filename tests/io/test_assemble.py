@@ -161,3 +161,13 @@ def test_what_is_shown_by_log_density_anyway_carries_it_once():
 def test_opacity_by_a_quantity_that_is_not_there_lists_those_that_are():
     with pytest.raises(ValueError, match=r"no quantity 'dust'; there are rho"):
         io.particles_from_table(gas(3), opacity_by="dust")
+
+
+@pytest.mark.parametrize("name", ["support", "box"])
+def test_lengths_with_a_unit_are_refused_as_a_file_has_its_own(name):
+    unyt = pytest.importorskip("unyt")
+    length = unyt.unyt_array([400.0, 400, 400] if name == "box" else 400.0, "pc")
+    with pytest.raises(ValueError, match=rf"`{name}` is in pc, but lengths are numbers in the unit of the file"):
+        io.particles_from_table(ParticleTable(position), **{name: length})
+    with pytest.raises(ValueError, match=r"`radius` is in pc, but lengths are numbers in the unit of the file"):
+        io.points_from_table(ParticleTable(position), radius=unyt.unyt_quantity(400, "pc"))
