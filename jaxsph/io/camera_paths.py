@@ -72,7 +72,8 @@ def read_camera_path(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no regular file; no JSON; a name that is missing or unknown; times that do not ascend; what `Camera.look_at` refuses.
+        ValueError: no regular file; no JSON; a name that is missing or unknown; times that do not ascend; what
+            `Camera.look_at` refuses.
     """
     file = regular_file(path)
     try:

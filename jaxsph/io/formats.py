@@ -101,7 +101,8 @@ def find_format(path: Path) -> Format:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no regular file; a folder that is no snapshot; neither content nor suffix are known, and the message lists those that are.
+        ValueError: no regular file; a folder that is no snapshot; neither content nor suffix are known, and the message lists
+            those that are.
     """
     path = regular_file_or_folder(path)
     formats = (*added_formats(), *FORMATS)

@@ -29,8 +29,8 @@ def read(path: Path) -> ParticleTable:
     """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits.
 
     Raises:
-        ValueError: whole numbers that would be rounded, not text, empty, rows of different length, words among numbers, fewer than three columns, or an XYZ
-            file with another number of rows than it announces.
+        ValueError: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded, fewer
+            than three columns, or an XYZ file with another number of rows than it announces.
     """
     with explained(path, SOURCE):
         content = path.read_bytes()

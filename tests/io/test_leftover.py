@@ -15,15 +15,16 @@ VALUES = np.random.default_rng(0).random((6, 7, 8)).astype(np.float32)
 
 def test_what_is_left_is_told_and_nothing_left_is_fine():
     refuse_leftover(0, "60 vertices")
-    with pytest.raises(io.DataError, match="has 4 more bytes than 60 vertices and what its header announces: .*copy it again"):
+    with pytest.raises(io.DataError, match=r"has 4 more bytes than 60 vertices and what its header announces: .*copy it again"):
         refuse_leftover(4, "60 vertices")
 
 
 def test_the_rest_of_a_stream_is_counted_and_its_check_sum_compared():
     packed = gzip.compress(bytes(1000))
-    assert count_rest(gzip.open(memory_io.BytesIO(packed))) == 1000
-    with pytest.raises(gzip.BadGzipFile, match="CRC"):
-        count_rest(gzip.open(memory_io.BytesIO(packed[:-8] + bytes(8))))
+    with gzip.open(memory_io.BytesIO(packed)) as stream:
+        assert count_rest(stream) == 1000
+    with gzip.open(memory_io.BytesIO(packed[:-8] + bytes(8))) as stream, pytest.raises(gzip.BadGzipFile, match="CRC"):
+        count_rest(stream)
 
 
 def volume(path):
