@@ -159,7 +159,8 @@ def write_appended(path, particles):
     arrays = [particles.position.astype("<f4").tobytes(), particles.density.astype("<f4").tobytes()]
     stored = [len(array).to_bytes(4, "little") + array for array in arrays]
     head = f"""<VTKFile type="PolyData" byte_order="LittleEndian" header_type="UInt32"><PolyData>
-<Piece NumberOfPoints="60"><Points><DataArray type="Float32" NumberOfComponents="3" format="appended" offset="0"/></Points><PointData>
+<Piece NumberOfPoints="60"><Points>
+<DataArray type="Float32" NumberOfComponents="3" format="appended" offset="0"/></Points><PointData>
 <DataArray type="Float32" Name="density" format="appended" offset="{len(stored[0])}"/></PointData></Piece></PolyData>
 <AppendedData encoding="raw">_"""
     path.write_bytes(head.encode() + b"".join(stored) + b"\n</AppendedData></VTKFile>\n")
