@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from PIL import Image as Pillow
+from png_chunks import with_check_sum_apart
 
 import jaxsph.io as io
 from jaxsph.model.image import Image
@@ -40,6 +41,7 @@ def test_a_cut_image_is_refused_by_name(tmp_path):
 def test_no_bit_of_a_png_file_changes_colours_unseen(tmp_path):
     path = tmp_path / "a.png"
     io.write_image(path, make_image(np.random.default_rng(0).random((30, 40, 3)).astype(np.float32)))
+    path.write_bytes(with_check_sum_apart(path.read_bytes()))
     whole, color = path.read_bytes(), io.read_image(path).color
     for bit in np.random.default_rng(1).integers(0, 8 * len(whole), 200):
         damaged = bytearray(whole)
