@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from jaxsph.io.regular import regular_file
 from jaxsph.io.replace import written_whole
 
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
@@ -116,12 +117,12 @@ def read_journal(path: str | Path) -> list[Measurement]:
     Lines from before the light integral was taken are of 0 pixels of it.
 
     Raises:
-        ValueError: a line that is not a measurement of this version.
+        ValueError: no regular file, or a line that is not a measurement of this version.
     """
     path = Path(path)
     if not path.exists():
         return []
-    *lines, _ = path.read_text(encoding="utf-8").split("\n")
+    *lines, _ = regular_file(path).read_text(encoding="utf-8").split("\n")
     return [_parsed(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
 
 

@@ -6,9 +6,10 @@ import pickle
 
 import numpy as np
 import pytest
+from png_chunks import with_check_sum_apart
 
 import jaxsph as js
-from jaxsph.frame_task import FrameTask
+from jaxsph.frame_task import FINGERPRINT, FrameTask, fingerprint_of
 from jaxsph.numerics.programs import PROGRAMS
 
 SETTINGS = js.Settings(samples=16)
@@ -179,3 +180,19 @@ def test_in_double_precision_all_is(tmp_path):
     with jax.enable_x64(True):
         path = js.CameraPath.orbit(center=(0, 0, 0), radius=2.0, degrees=30, width=8, height=8)
         assert path.at(2.0).dtype == np.float64
+
+
+def test_a_frame_of_which_a_bit_is_damaged_is_made_again(tmp_path):
+    """Whatever bit it is: decoding alone lets some through."""
+    pixels, layer = np.random.default_rng(0).random((16, 24, 3)).astype(np.float32), np.zeros((16, 24), np.float32)
+    path = tmp_path / "00001.png"
+    js.io.write_image(path, js.Image(pixels, layer, layer, layer, layer, True, 0, {}, ((FINGERPRINT, "mark"),)))
+    whole = with_check_sum_apart(path.read_bytes())
+    path.write_bytes(whole)
+    assert fingerprint_of(path) == "mark"
+    start = whole.index(b"IDAT") + 4
+    for bit in range(8 * start, 8 * (len(whole) - 16), 29):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        assert fingerprint_of(path) is None

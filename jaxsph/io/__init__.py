@@ -25,6 +25,7 @@ from jaxsph.io.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.points import PointsReport, points_from_table
 from jaxsph.io.projections import read_projection, write_projection
 from jaxsph.io.quantities import available_quantities
+from jaxsph.io.regular import regular_file
 from jaxsph.io.snapshot_sort import sort_snapshot
 from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
@@ -202,13 +203,11 @@ def read_image(path: str | os.PathLike[str]) -> Image:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix, a damaged file, or colours of a kind that is not known.
+        ValueError: another suffix, no regular file, a damaged one, or colours of a kind that is not known.
     """
     file = Path(path)
     form = _image_format(file)
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: there is no such file")
-    image: Image = form.read(file)
+    image: Image = form.read(regular_file(file))
     return image
 
 

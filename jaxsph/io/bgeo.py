@@ -16,11 +16,14 @@ from typing import IO, cast
 import numpy as np
 
 from .damage import DataError, explained
+from .leftover import count_rest, refuse_leftover
 from .table import ParticleTable, table_from_columns
-from .unpack import read_to_end, read_up_to
+from .unpack import read_up_to
 
 SOURCE = "Houdini bgeo"
 GZIP_MAGIC = b"\x1f\x8b"
+END = b"\x00\xff"
+"""What follows where there are neither primitives nor groups."""
 MAX_HEADER_BYTES = 2**24
 """More than names and strings of any header: what is unpacked before the number of points is known."""
 FLOAT, INTEGER, STRING, MIXED, INDEX, VECTOR = range(6)
@@ -31,17 +34,20 @@ def read(path: Path) -> ParticleTable:
     """Read positions and point attributes; weights `w` are ignored, string indices stay integers.
 
     Raises:
-        ValueError: damaged or of another version; positions that are integers written over floats.
+        ValueError: damaged, longer than its header says or of another version; positions that are integers written over floats.
     """
     with explained(path, SOURCE), _opened(path) as stream:
         begin = bytes(read_up_to(stream, MAX_HEADER_BYTES))
-        count, layout, start = _header(begin)
+        count, layout, start, is_alone = _header(begin)
         record = np.dtype(layout)
-        content = read_up_to(stream, count * record.itemsize, begin[start : start + count * record.itemsize])
+        stop = start + count * record.itemsize
+        content = read_up_to(stream, count * record.itemsize, begin[start:stop])
         available = len(content) // record.itemsize
         if available < count:
             raise DataError(f"is cut short: {count} points are announced, {available} are there; copy it again")
-        read_to_end(stream)
+        rest = max(len(begin) - stop, 0) + count_rest(stream)
+        if is_alone:
+            refuse_leftover(rest - len(END), f"{count} points")
         points = np.frombuffer(content, dtype=record, count=count)
         columns = {name: np.ascontiguousarray(points[name]) for name, *_ in layout[1:]}
         position = np.ascontiguousarray(points["\0position"][:, :3])
@@ -55,14 +61,14 @@ def _opened(path: Path) -> IO[bytes]:
     return cast(IO[bytes], gzip.open(path)) if zipped else path.open("rb")
 
 
-def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]], int]:
-    """Number of points, record layout (position first), and the offset of the first record."""
+def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]], int, bool]:
+    """Number of points, record layout (position first), the offset of the first record, and whether nothing else follows."""
     if content[:5] != b"BgeoV":
         raise DataError(
             "is not a classic bgeo file (it does not begin with `BgeoV`); newer Houdini files must be saved as "
             "`.bgeo` version 5 (classic)"
         )
-    version, count, _, _, _, num_attributes, *_ = struct.unpack_from(">9i", content, 5)
+    version, count, *others, num_attributes, _, _, num_details = struct.unpack_from(">9i", content, 5)
     if version != 5:
         raise DataError(f"has bgeo version {version}; only version 5 is known: save it as classic bgeo")
     if count < 0 or not 0 <= num_attributes < 2**15:
@@ -79,7 +85,8 @@ def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]]
         if width == 0 or not name:
             raise DataError(f"has attribute `{name}` of width {width}, so its header is damaged; export it again")
         layout[name] = ">f4" if kind in (FLOAT, VECTOR) else ">i4", width
-    return count, [(name, kind, (width,)) for name, (kind, width) in layout.items()], at
+    is_alone = not any(others) and not num_details
+    return count, [(name, kind, (width,)) for name, (kind, width) in layout.items()], at, is_alone
 
 
 def _skip_defaults(content: bytes, at: int, name: str, width: int, kind: int) -> int:

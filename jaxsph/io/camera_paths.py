@@ -28,6 +28,7 @@ from jaxsph.model.camera import Bounded, Camera
 from jaxsph.model.camera_leg import Leg
 from jaxsph.model.camera_path import CameraPath
 
+from .regular import regular_file
 from .replace import written_whole
 
 FORMAT, VERSION = "jaxsph camera path", 1
@@ -71,11 +72,10 @@ def read_camera_path(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no JSON; a name that is missing or unknown; times that do not ascend; what `Camera.look_at` refuses.
+        ValueError: no regular file; no JSON; a name that is missing or unknown; times that do not ascend; what
+            `Camera.look_at` refuses.
     """
-    file = Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: there is no such file")
+    file = regular_file(path)
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

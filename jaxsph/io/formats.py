@@ -17,6 +17,7 @@ from typing import Any
 from . import nchilada, tipsy
 from .damage import DataError
 from .gadget_binary import looks_like
+from .regular import regular_file_or_folder
 from .snapshot_files import joined
 from .table import ParticleTable
 
@@ -100,10 +101,10 @@ def find_format(path: Path) -> Format:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a folder that is no snapshot; neither content nor suffix are known, and the message lists those that are.
+        ValueError: no regular file; a folder that is no snapshot; neither content nor suffix are known, and the message lists
+            those that are.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
+    path = regular_file_or_folder(path)
     formats = (*added_formats(), *FORMATS)
     if path.is_dir():
         form = next((form for form in formats if form.folder is not None and form.folder(path)), None)
@@ -129,6 +130,7 @@ def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
     reader: Any = importlib.import_module(form.module if "." in form.module else f".{form.module}", __package__)
 
     def read(file: Path, part_type: int | None) -> ParticleTable:
+        file = regular_file_or_folder(file)
         table: ParticleTable = reader.read(file, part_type=part_type) if form.typed else reader.read(file)
         return table
 

@@ -25,6 +25,7 @@ from jaxsph.model.image import Image
 
 from .damage import DataError
 from .optional import require
+from .regular import regular_file
 from .replace import written_whole
 
 SUFFIX = ".mp4"
@@ -90,9 +91,7 @@ def movie_info(path: str | os.PathLike[str]) -> MovieInfo:
         ValueError: it is no movie.
         ImportError: `imageio-ffmpeg` is not installed.
     """
-    file, program = Path(path), encoder()
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: there is no such file")
+    program, file = encoder(), regular_file(path)
     command = [program, "-nostdin", "-i", str(file), "-map", "0:v:0", "-progress", "pipe:1", "-f", "null", "-"]
     found = subprocess.run(command, capture_output=True, text=True, errors="replace")
     counts = re.findall(r"^frame=(\d+)", found.stdout, re.MULTILINE)

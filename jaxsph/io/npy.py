@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import os
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from .damage import DataError, explained
+from .leftover import refuse_leftover
 from .volume_table import VolumeTable
 
 SOURCE = "NumPy array"
@@ -15,14 +19,37 @@ SOURCE = "NumPy array"
 def read(path: Path) -> VolumeTable:
     """Read an array; pickled objects are not loaded.
 
+    It is read into memory: a file that another program writes again would kill whoever had mapped it.
+
     Raises:
-        ValueError: damaged, cut short, not of numbers, or another number of axes.
+        ValueError: damaged, cut short, longer than its header says, not of numbers, or another number of axes.
     """
-    with explained(path, SOURCE):
-        values = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(values, np.ndarray) or values.ndim not in (3, 4):
-            raise DataError(f"must hold an array of 3 axes, got {getattr(values, 'shape', 'an archive')}; reshape it")
-        return VolumeTable({"values": values}, np.zeros(3), np.ones(3), SOURCE)
+    with explained(path, SOURCE), path.open("rb") as file:
+        shape, is_fortran, dtype = array_header(file)
+        if dtype.hasobject:
+            raise DataError("holds Python objects, which are not loaded; write it as numbers")
+        if len(shape) not in (3, 4) or min(shape) < 0:
+            raise DataError(f"must hold an array of 3 axes, got {shape}; reshape it")
+        count, held = math.prod(shape), os.fstat(file.fileno()).st_size - file.tell()
+        refuse_leftover(held - count * dtype.itemsize, f"{shape} of {dtype}")
+        values = np.fromfile(file, dtype, count) if held >= count * dtype.itemsize else np.zeros(0, dtype)
+        if len(values) < count:
+            raise DataError(
+                f"is cut short: {shape} of {dtype} need {count * dtype.itemsize} bytes, {held} are there; copy it again"
+            )
+        return VolumeTable({"values": values.reshape(shape, order="F" if is_fortran else "C")}, np.zeros(3), np.ones(3), SOURCE)
+
+
+def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether its first index runs fastest, and dtype; the stream stands at the data then."""
+    read_header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    version = np.lib.format.read_magic(stream)
+    if version not in read_header:
+        raise DataError(f"holds an array of `.npy` version {version}; write it again with numpy.save or numpy.savez")
+    return read_header[version](stream)
 
 
 def write(path: Path, values: np.ndarray, lower: np.ndarray, spacing: np.ndarray, name: str) -> None:

@@ -18,11 +18,11 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from .damage import DataError, explained
+from .npy import array_header
 from .quantities import ROLES
 from .table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns, time_of
 from .unpack import DEFLATE_RATIO, read_up_to
@@ -67,7 +67,7 @@ class _Array:
 
     def load(self) -> np.ndarray:
         with self.archive.open(self.entry) as stream:
-            _header(stream)
+            array_header(stream)
             content = read_up_to(stream, self.entry.file_size)
         values = np.frombuffer(content, self.dtype)
         return values.reshape(self.shape, order="F" if self.is_fortran else "C")
@@ -120,22 +120,10 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Arra
             f"it is damaged: copy it again"
         )
     with archive.open(entry) as stream:
-        shape, is_fortran, dtype = _header(stream)
+        shape, is_fortran, dtype = array_header(stream)
         held = entry.file_size - stream.tell()
     if dtype.hasobject:
         raise DataError(f"`{name}` holds Python objects, which are not loaded; write it as numbers, or leave it out")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != held:
         raise DataError(f"`{name}` has shape {shape} of {dtype}, but its entry holds {held} bytes; write it again")
     return _Array(name, archive, entry, shape, is_fortran, dtype)
-
-
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether its first index runs fastest, and dtype; the stream stands at the data then."""
-    read_header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    version = np.lib.format.read_magic(stream)
-    if version not in read_header:
-        raise DataError(f"holds an array of `.npy` version {version}; write it again with numpy.savez")
-    return read_header[version](stream)

@@ -5,13 +5,16 @@ Source: the NRRD file format, teem.sourceforge.net/nrrd/format.html.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .damage import DataError, explained
+from .leftover import refuse_leftover
 from .optional import require
+from .regular import regular_file
 from .volume_table import VolumeTable, along_axes
 
 SOURCE = "NRRD"
@@ -21,12 +24,12 @@ def read(path: Path) -> VolumeTable:
     """Read a grid of three axes, or of four of which one is no space: components, named by their number.
 
     Raises:
-        ValueError: damaged, cut short, another number of axes, or oblique ones.
+        ValueError: damaged, cut short, longer than its header says, another number of axes, or oblique ones.
         ImportError: pynrrd is not installed.
     """
     library = require("nrrd", f"reading {path}")
     with explained(path, SOURCE):
-        values, header = library.read(str(path), index_order="F")
+        values, header = _whole(library, path)
         directions = header.get("space directions")
         spatial = _spatial_axes(header, values.ndim)
         if len(spatial) != 3 or values.ndim > 4:
@@ -43,6 +46,39 @@ def read(path: Path) -> VolumeTable:
         origin = np.nan_to_num(np.asarray(header.get("space origin", np.zeros(3)), np.float64))
         said = (f"coordinates are those of its space, {header['space']}",) if "space" in header else ()
         return along_axes({"values": values}, origin, steps, SOURCE, said)
+
+
+def _whole(library: Any, path: Path) -> tuple[np.ndarray, Any]:
+    """Values and header; nothing may be left over behind the values, where pynrrd does not look."""
+    with path.open("rb") as file:
+        header = library.read_header(file)
+        beside = header.get("data file", header.get("datafile"))
+        stored = path if beside is None else regular_file(path.parent / beside)
+        start = file.tell() if beside is None else 0
+        values = library.read_data(header, file, str(path), index_order="F")
+    lines, skipped = (int(header.get(f"{what} skip", header.get(f"{what}skip", 0))) for what in ("line", "byte"))
+    if skipped >= 0 and header["encoding"] == "raw":
+        _refuse_rest(stored, start, lines, skipped + values.nbytes)
+    elif skipped >= 0 and header["encoding"] in ("gzip", "gz"):
+        _refuse_other_end(stored, skipped + values.nbytes)
+    return values, header
+
+
+def _refuse_rest(stored: Path, start: int, lines: int, size: int) -> None:
+    """Refuse what follows `size` bytes; pynrrd refuses no more than whole numbers of them."""
+    with stored.open("rb") as file:
+        file.seek(start)
+        for _ in range(lines):
+            file.readline()
+        refuse_leftover(os.path.getsize(stored) - file.tell() - size, f"{size} bytes of values")
+
+
+def _refuse_other_end(stored: Path, size: int) -> None:
+    """Refuse gzip that does not end with its length: what follows it, or what its end lacks, is not looked at."""
+    with stored.open("rb") as file:
+        file.seek(-4, os.SEEK_END)
+        if int.from_bytes(file.read(), "little") != size % 2**32:
+            raise DataError(f"does not end with its length of {size} bytes, as gzip does: it is cut short, or something follows")
 
 
 def _spatial_axes(header: Any, axes: int) -> list[int]:

@@ -5,11 +5,13 @@ Source: G. Turk, The PLY Polygon File Format, 1994.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from .damage import UNENDED_NOTE, DataError, explained
+from .leftover import refuse_leftover
 from .table import ParticleTable, table_from_columns
 from .vectors import gather_vectors
 
@@ -21,27 +23,37 @@ TYPES = {
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
+"""A line of its own: a comment may hold the word, too."""
 
 
 def read(path: Path) -> ParticleTable:
-    """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns."""
+    """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns.
+
+    Raises:
+        ValueError: damaged, cut short, longer than its header says, or other elements first.
+    """
     with explained(path, SOURCE):
         content = path.read_bytes()
-        encoding, count, record, start = _header(content)
+        encoding, count, record, start, others = _header(content)
         if encoding == "ascii":
-            points = _ascii_points(content[start:], count, record)
+            points = _ascii_points(content[start:], count, record, others)
         else:
             _refuse_missing(count, (len(content) - start) // record.itemsize)
+            if not others:
+                refuse_leftover(len(content) - start - count * record.itemsize, f"{count} vertices")
             points = np.frombuffer(content, record, count, start)
         position, columns = gather_vectors({name: np.ascontiguousarray(points[name]) for name in record.names or ()})
         said = [UNENDED_NOTE] if encoding == "ascii" and not content.endswith(b"\n") else []
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
 
 
-def _ascii_points(content: bytes, count: int, record: np.dtype) -> np.ndarray:
+def _ascii_points(content: bytes, count: int, record: np.dtype, others: int) -> np.ndarray:
     """The first `count` lines that are not blank, each number read as its own type: an id has more digits than float64."""
-    rows = [row for row in content.split(b"\n") if row.strip()][:count]
+    filled = [row for row in content.split(b"\n") if row.strip()]
+    rows = filled[:count]
     _refuse_missing(count, len(rows))
+    refuse_leftover(len(filled) - count - others, f"{count} vertices", "lines")
     if not rows:
         return np.zeros(0, record)
     width, num_properties = len(rows[0].split()), len(record.names or ())
@@ -55,15 +67,14 @@ def _refuse_missing(count: int, available: int) -> None:
         raise DataError(f"is cut short: {count} vertices are announced, {available} are there; copy it again")
 
 
-def _header(content: bytes) -> tuple[str, int, np.dtype, int]:
-    """Encoding, number of vertices, the record of one vertex, and the offset of the first."""
+def _header(content: bytes) -> tuple[str, int, np.dtype, int, int]:
+    """Encoding, number of vertices, the record of one vertex, the offset of the first, and how many other entries follow."""
     if not content.startswith(b"ply"):
         raise DataError("does not begin with `ply`, so it is no PLY file")
-    end = content.find(b"end_header")
-    start = content.find(b"\n", end) + 1
-    if end < 0 or start == 0:
+    end = END_OF_HEADER.search(content)
+    if end is None:
         raise DataError("is cut short: its header does not end; copy it again")
-    lines = [line.split() for line in content[:end].decode("ascii", errors="replace").splitlines()]
+    lines = [line.split() for line in content[: end.start()].decode("ascii", errors="replace").splitlines()]
     formats = [words[1] for words in lines if words[:1] == ["format"]]
     if not formats or formats[0] not in BYTE_ORDERS:
         raise DataError(f"has the PLY format {formats}, expected one of {', '.join(BYTE_ORDERS)}")
@@ -81,4 +92,5 @@ def _header(content: bytes) -> tuple[str, int, np.dtype, int]:
     count = int(lines[elements[0]][2])
     if count < 0:
         raise DataError(f"announces {count} vertices, so its header is damaged")
-    return formats[0], count, record, start
+    others = sum(max(int(lines[index][2]), 0) for index in elements[1:])
+    return formats[0], count, record, end.end(), others

@@ -40,6 +40,8 @@ def read(path: Path) -> Image:
     pillow = require("PIL.Image", "reading PNG images")
     with explained(path, SOURCE):
         with pillow.open(path, formats=["PNG"]) as opened:
+            opened.verify()  # the check sum of every chunk, which decoding does not compare
+        with pillow.open(path, formats=["PNG"]) as opened:
             color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
             metadata = tuple(getattr(opened, "text", {}).items())
         unknown = jnp.full(color.shape[:2], jnp.nan, jnp.float32)

@@ -23,6 +23,7 @@ from jaxsph.model.projection import Projection
 
 from .damage import DataError, explained
 from .optional import require
+from .regular import regular_file
 from .replace import written_whole
 
 SUFFIXES = (".exr", ".npy", ".png")
@@ -58,9 +59,7 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
         ValueError: damaged, or not of a projection.
         ImportError: OpenEXR is not installed.
     """
-    openexr, file = require("OpenEXR", "reading EXR images"), Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: there is no such file")
+    openexr, file = require("OpenEXR", "reading EXR images"), regular_file(path)
     with explained(file, "OpenEXR projection"):
         if file.read_bytes()[:4] != b"\x76\x2f\x31\x01":
             raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")

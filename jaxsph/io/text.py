@@ -18,17 +18,19 @@ from .vectors import gather_vectors
 
 SOURCE = "text table"
 DELIMITERS = (",", ";", "\t")
+WHOLE = re.compile(r"[+-]?[0-9]{1,400}")
+"""Of more digits than any float64 has."""
 MAX_COLUMNS = 2**16
 """Columns that a comment of a few bytes may ask for."""
 ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
 
 
 def read(path: Path) -> ParticleTable:
-    """Read a table of numbers; columns of words are left out.
+    """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits.
 
     Raises:
-        ValueError: not text, empty, rows of different length, words among numbers, fewer than three columns, or an XYZ
-            file with another number of rows than it announces.
+        ValueError: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded, fewer
+            than three columns, or an XYZ file with another number of rows than it announces.
     """
     with explained(path, SOURCE):
         content = path.read_bytes()
@@ -96,7 +98,7 @@ def _begins_with_element(row: str) -> bool:
 
 
 def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns of numbers by name, and the names of the columns that hold words."""
+    """Columns of numbers by name, and the names of the columns that hold words; whole numbers keep all their digits."""
     if not rows:
         return {name: np.zeros(0) for name in names or ("x", "y", "z")}, []
     first = _split(rows[0], delimiter)
@@ -116,7 +118,31 @@ def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> 
     clean = [row.replace('"', "") for row in rows] if '"' in rows[0] else rows
     values = np.loadtxt(clean, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None)
     fields = {names[index]: values[:, column] for column, index in enumerate(numeric)}
+    for column, index in enumerate(numeric):
+        if (abs(values[:, column]) >= 2.0**53).any():
+            fields[names[index]] = _exact([_split(row, delimiter)[index] for row in clean], values[:, column], names[index])
     return fields, [name for index, name in enumerate(names) if index not in numeric]
+
+
+def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:
+    """The numbers of a column where some are too large for float64 to hold every whole number: whole ones keep their digits.
+
+    Raises:
+        ValueError: whole numbers that neither 64 bits nor float64 hold, or that stand among others.
+    """
+    whole = [int(word) if WHOLE.fullmatch(word) else None for word in words]
+    numbers = [number for number in whole if number is not None]
+    for kind in (np.int64, np.uint64) if len(numbers) == len(words) else ():
+        if np.iinfo(kind).min <= min(numbers) and max(numbers) <= np.iinfo(kind).max:
+            return np.array(numbers, kind)
+    kept = [value.is_integer() and int(value) == number for number, value in zip(whole, values.tolist(), strict=True)]
+    lost = next((words[row] for row, number in enumerate(whole) if number is not None and not kept[row]), None)
+    if lost is not None:
+        raise DataError(
+            f"has the whole number {lost[:40]} in the column `{name}`, which float64 cannot hold and 64 bits only in a column of "
+            f"whole numbers: write ids as such, and quantities with a decimal point"
+        )
+    return values
 
 
 def _extended_names(comment: str) -> list[str] | None:

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from .damage import DataError, NoParticlesError, explained
+from .leftover import refuse_leftover
 from .table import ParticleTable
 
 SOURCE = "Tipsy"
@@ -51,6 +52,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             if begin not in (HEADER.itemsize, HEADER.itemsize + 4):
                 stated = ", ".join(f"{counts[number]} {name}" for number, (name, _) in RECORDS.items())
                 raise DataError(f"is damaged or cut short: its header states {stated}, but its size is another; copy it again")
+            _refuse_padding(order, file.read(begin - HEADER.itemsize))
             present = [number for number in RECORDS if counts[number]]
             chosen = part_type if part_type is not None else (present or [0])[0]
             if part_type is not None and chosen not in present:
@@ -59,6 +61,12 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             kind, fields = RECORDS[chosen]
             values = np.frombuffer(file.read(counts[chosen] * sizes[chosen]), f"{order}f4").reshape(-1, len(fields))
         return _table(values.astype(np.float32), chosen, kind, fields, float(header["time"]))
+
+
+def _refuse_padding(order: Order, padding: bytes) -> None:
+    """Refuse what is no padding of the standard, which is zero; machines leave what they have between header and records."""
+    if order == ">":
+        refuse_leftover(len(padding.strip(b"\0")), "its header and its records")
 
 
 def _table(values: np.ndarray, chosen: int, kind: str, fields: tuple[str, ...], time: float) -> ParticleTable:

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxsph.model.transfer import TransferFunction
 
+from .regular import regular_file
 from .replace import written_whole
 
 FORMAT, VERSION = "jaxsph transfer function", 1
@@ -52,12 +53,10 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: no JSON, of another format or version, a field that is missing or unknown, or what
+        ValueError: no regular file, no JSON, of another format or version, a field that is missing or unknown, or what
             `TransferFunction.from_points` refuses.
     """
-    file = Path(path)
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: there is no such file")
+    file = regular_file(path)
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

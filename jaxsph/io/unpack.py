@@ -58,9 +58,3 @@ def read_up_to(stream: IO[bytes], size: int, begin: bytes = b"") -> bytearray:
     while len(content) < size and (part := stream.read(min(size - len(content), CHUNK_BYTES))):
         content += part
     return content
-
-
-def read_to_end(stream: IO[bytes]) -> None:
-    """Read the rest and forget it: only at its end does a gzip stream compare its check sum."""
-    while stream.read(CHUNK_BYTES):
-        pass

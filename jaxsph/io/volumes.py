@@ -15,6 +15,7 @@ import numpy as np
 from jaxsph.model.volume import Volume
 
 from .damage import DataError
+from .regular import regular_file
 from .replace import written_whole
 from .volume_table import VolumeTable
 
@@ -33,11 +34,7 @@ def read_volume_table(path: str | os.PathLike[str]) -> VolumeTable:
     file, suffix = Path(path), _suffix(path)
     if suffix is None:
         raise DataError(f"{path}: volumes are read from {', '.join(READERS)}, not from {file.suffix!r}; convert it")
-    if file.is_dir():
-        raise DataError(f"{path}: is a folder; give the name of a file in it")
-    if not file.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    table: VolumeTable = importlib.import_module(f".{READERS[suffix]}", __package__).read(file)
+    table: VolumeTable = importlib.import_module(f".{READERS[suffix]}", __package__).read(regular_file(file))
     return table
 
 

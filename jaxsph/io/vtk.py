@@ -73,6 +73,9 @@ class _Cursor:
             raise DataError(f"is cut short: {what} need {stop - self.at} bytes, {len(self.content) - self.at} are left")
         values = np.frombuffer(self.content, dtype, count, self.at)
         self.at = stop
+        rest = self.content[stop : stop + 2]
+        if count and rest and not rest.startswith((b"\n", b"\r\n")):
+            raise DataError(f"has no end of the line after {what}, so that bytes are missing or too many; copy it again")
         return values
 
     def _tokens(self, count: int, what: str) -> list[bytes]:

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from .damage import DataError, explained
+from .leftover import refuse_leftover
 from .table import ParticleTable, table_from_columns
 from .tokens import numbers
 from .unpack import DEFLATE_RATIO, LZMA_RATIO, Decompressor, inflating, unlzma, unpack_blocks
@@ -60,16 +61,25 @@ def read(path: Path) -> ParticleTable:
 def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[ElementTree.Element, Decoder]:
     """The XML of a file of one of those types of data set, and what reads its arrays."""
     content = path.read_bytes()
-    head, mark, tail = content.partition(b"<AppendedData")
-    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else content)
+    start, stop = content.find(b"<AppendedData"), content.rfind(b"</AppendedData>")
+    if stop < start:
+        raise DataError("is cut short inside its data: `<AppendedData>` has no end; copy it again")
+    root = ElementTree.fromstring(content if start < 0 else content[:start] + b"</VTKFile>")
     kind = root.get("type", "unknown")
     if root.tag != "VTKFile" or kind not in datasets:
         raise DataError(f"is XML of type {kind}; save it as {' or '.join(datasets)} ({suffixes})")
-    return root, Decoder(root, tail, len(content))
+    mark = content.find(b"_", max(start, 0), max(stop, 0))
+    tag, appended = (b"", b"") if mark < 0 else (content[start:mark], memoryview(content)[mark + 1 : stop])
+    decoder = Decoder(root, tag, appended, len(content))
+    decoder.refuse_leftover_data(root)
+    return root, decoder
 
 
 def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    count = int(piece.get("NumberOfPoints", "0"))
+    stated = piece.get("NumberOfPoints")
+    if stated is None:
+        raise DataError("has a Piece that does not say its NumberOfPoints, so it is damaged; copy it again, or write it again")
+    count = int(stated)
     if count < 0:
         raise DataError(f"announces {count} points, so it is damaged; copy it again")
     points = piece.find("Points/DataArray")
@@ -92,7 +102,7 @@ def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, di
 class Decoder:
     """What all data arrays of a file share: byte order, compression, and the appended data."""
 
-    def __init__(self, root: ElementTree.Element, tail: bytes, file_bytes: int) -> None:
+    def __init__(self, root: ElementTree.Element, tag: bytes, appended: bytes | memoryview, file_bytes: int) -> None:
         order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
         self.order = order
         self.length = np.dtype(order + TYPES[root.get("header_type", "UInt32")])
@@ -101,7 +111,6 @@ class Decoder:
             raise DataError(f"is compressed by {compressor}, which is not supported; save it with zlib")
         self.decompressor, ratio = COMPRESSORS[compressor]
         self.file_bytes, self.room = file_bytes, ratio * file_bytes
-        tag, _, appended = tail.partition(b"_")
         self.appended = memoryview(appended)
         self.appended_is_text = b"base64" in tag
         self.words: list[str] = []
@@ -132,6 +141,7 @@ class Decoder:
             return numbers(text.split(), dtype)
         if encoding == "binary":
             stored = memoryview("".join(text.split()).encode("ascii"))
+            refuse_leftover(len(stored) - self._span_of(stored, True), f"`{name}`", "characters")
             return np.frombuffer(self._decode(stored, True, need, name), dtype)
         if encoding == "appended":
             offset = int(element.get("offset", "0"))
@@ -139,6 +149,30 @@ class Decoder:
                 raise DataError(f"has `{name}` at the offset {offset} of its appended data; it is damaged: copy it again")
             return np.frombuffer(self._decode(self.appended[offset:], self.appended_is_text, need, name), dtype)
         raise DataError(f"has data of format {encoding!r}; known are ascii, binary and appended")
+
+    def refuse_leftover_data(self, root: ElementTree.Element) -> None:
+        """Refuse appended data whose last array does not end where all of it does, but for white space."""
+        offsets = [int(each.get("offset", "0")) for each in root.iter() if each.get("format") == "appended"]
+        last = self.appended[max(offsets, default=0) :]
+        if not offsets or not bytes(last[: self.length.itemsize]).strip():
+            return
+        stop = self._span_of(last, self.appended_is_text)
+        refuse_leftover(len(bytes(last[stop:]).strip()), "its appended arrays")
+        if stop > len(last) or (stop == len(last) and bytes(last[-1:]).isspace()):
+            raise DataError(
+                "is cut short inside its data: the last array reaches into the end of `<AppendedData>`; copy it again"
+            )
+
+    def _span_of(self, data: memoryview, is_text: bool) -> int:
+        """How many bytes of the file one array takes that begins with `data`."""
+        size = self.length.itemsize
+        first = int(np.frombuffer(_take(data, 0, size, is_text), self.length)[0])
+        if self.decompressor is None:
+            apart = is_text and b"=" in bytes(data[: _span(size, True)])
+            return _span(size, True) + _span(first, True) if apart else _span(size + first, is_text)
+        header_size = (3 + first) * size
+        sizes = np.frombuffer(_take(data, 0, header_size, is_text), self.length)[3:].tolist()
+        return _span(header_size, is_text) + _span(sum(sizes), is_text)
 
     def _decode(self, data: memoryview, is_text: bool, need: int, name: str) -> bytes | memoryview:
         """The bytes of one array: a header of lengths, then the data, in blocks if compressed."""

@@ -147,11 +147,12 @@ def write_phantom(path, p, h=None, itype=None):
         file.create_group("sinks")
 
 
-def write_points(path, p):
+def write_points(path, p, **options):
     import h5py
 
     with h5py.File(path, "w") as file:
-        file["Coordinates"], file["velocity"], file["density"] = p.position, p.velocity, p.density
+        for name, values in {"Coordinates": p.position, "velocity": p.velocity, "density": p.density}.items():
+            file.create_dataset(name, data=values, **options)
 
 
 def write_gadget_binary(path, p, order="<", form=2, dark=0, masses=False):

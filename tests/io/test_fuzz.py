@@ -15,10 +15,12 @@ import zipfile
 
 import numpy as np
 import pytest
+from fuzzing import KINDS, counted, write_all
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 NUMBERS = (0, 1, -1, 2, 6, 8, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 10**10, 2**62, 2**63 - 1, 2**63, 10**25)
+CHANGES = 12
 SECONDS_A_FILE = 5
 """A guard against what never ends; none of these files takes a hundredth of it."""
 
@@ -202,3 +204,19 @@ def test_hdf5_of_another_structure_is_read_or_refused_by_name(name, data, writte
     shutil.copy(written / name, tmp_path / name)
     damage_hdf5(data.draw, tmp_path / name)
     reader_holds(tmp_path / name)
+
+
+@pytest.fixture(scope="module")
+def originals(samples, tmp_path_factory):
+    for library in ("nibabel", "nrrd", "h5py", "meshio", "OpenEXR"):
+        pytest.importorskip(library)
+    folder = tmp_path_factory.mktemp("originals")
+    write_all(folder, samples)
+    return folder
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_no_change_that_a_file_betrays_is_read(name, originals, tmp_path):
+    """A share of `test_fuzz_counts`, of volumes and images too."""
+    counts, wrong = counted(name, originals / name, tmp_path, CHANGES, seed=1)
+    assert not wrong and counts.total() == CHANGES, wrong

@@ -68,3 +68,15 @@ def test_another_number_of_values_than_of_properties_is_refused(tmp_path):
     (tmp_path / "a.ply").write_text(HEADER.format(count=1, properties=XYZ) + "1 2 3 4\n")
     with pytest.raises(ValueError, match="has 4 numbers a vertex, but 3 properties are announced"):
         io.read_table(tmp_path / "a.ply")
+
+
+def test_only_a_line_of_its_own_ends_the_header(samples, tmp_path):
+    p = samples.particles()
+    for encoding in ("binary_little_endian", "ascii"):
+        samples.write_ply(tmp_path / "a.ply", p, encoding)
+        content = (tmp_path / "a.ply").read_bytes()
+        comment = b"comment the end_header follows\ncomment end_header\nproperty float density\n"
+        (tmp_path / "a.ply").write_bytes(content.replace(b"property float density\n", comment))
+        table = io.read_table(tmp_path / "a.ply")
+        np.testing.assert_array_equal(table.position, p.position)
+        np.testing.assert_array_equal(table.columns["density"], p.density)

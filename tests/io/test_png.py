@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from PIL import Image as Pillow
+from png_chunks import with_check_sum_apart
 
 import jaxsph.io as io
 from jaxsph.model.image import Image
@@ -35,3 +36,20 @@ def test_a_cut_image_is_refused_by_name(tmp_path):
         (tmp_path / "a.png").write_bytes(whole[:stop])
         with pytest.raises(ValueError, match=r"a\.png"):
             io.read_image(tmp_path / "a.png")
+
+
+def test_no_bit_of_a_png_file_changes_colours_unseen(tmp_path):
+    path = tmp_path / "a.png"
+    io.write_image(path, make_image(np.random.default_rng(0).random((30, 40, 3)).astype(np.float32)))
+    path.write_bytes(with_check_sum_apart(path.read_bytes()))
+    whole, color = path.read_bytes(), io.read_image(path).color
+    for bit in np.random.default_rng(1).integers(0, 8 * len(whole), 200):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            found = io.read_image(path).color
+        except ValueError as error:
+            assert "a.png: " in str(error)
+        else:
+            np.testing.assert_array_equal(found, color)

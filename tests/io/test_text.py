@@ -116,3 +116,32 @@ def test_a_vector_does_not_take_the_place_of_a_scalar_of_its_name(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z,B,B_x,B_y,B_z\n1,2,3,13,3,4,12\n")
     columns = io.read_table(tmp_path / "a.csv").columns
     assert columns["B"].tolist() == [13] and columns["B_xyz"].tolist() == [[3, 4, 12]]
+
+
+@pytest.mark.parametrize(
+    ("ids", "kind"),
+    [
+        ([2**53 + nth for nth in range(6)], np.int64),
+        ([-(2**63), 2**63 - 1, 0], np.int64),
+        ([2**64 - 1, 0, 2**63 + 1], np.uint64),
+    ],
+)
+@pytest.mark.parametrize("row", ["{},1,2,3\n", '"{}","1","2","3"\n', "{} 1 2 3\n"])
+def test_whole_numbers_keep_all_their_digits(ids, kind, row, tmp_path):
+    names = row.format("id").translate(str.maketrans("123", "xyz"))
+    (tmp_path / "a.csv").write_text(names + "".join(map(row.format, ids)))
+    column = io.read_table(tmp_path / "a.csv").columns["id"]
+    assert column.dtype == kind and column.tolist() == ids
+
+
+def test_numbers_that_float64_holds_stay_such(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,a,b,c\n1,2,3,4,1e300,9007199254740992\n1,2,3,5,1,2.5\n")
+    columns = io.read_table(tmp_path / "a.csv").columns
+    assert all(columns[name].dtype == np.float64 for name in "abc") and columns["c"].tolist() == [2.0**53, 2.5]
+
+
+@pytest.mark.parametrize("words", [(str(2**64 + 1), "1"), (str(2**53 + 1), "0.5"), (str(2**53 + 1), "nan")])
+def test_whole_numbers_that_would_be_rounded_are_refused(words, tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,id\n" + "".join(f"1,2,3,{word}\n" for word in words))
+    with pytest.raises(ValueError, match=rf"a\.csv: has the whole number {words[0]} in the column `id`.*decimal point"):
+        io.read_table(tmp_path / "a.csv")

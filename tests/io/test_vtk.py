@@ -82,3 +82,14 @@ def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
     with measured() as memory:
         table = io.read_table(tmp_path / "a.vtk")
     assert table.position[-1, -1] == 2 and memory.peak < 2**24
+
+
+def test_binary_data_that_does_not_end_with_its_line_is_refused(samples, tmp_path):
+    """A byte less, and the end of the line is taken for data."""
+    samples.write_vtk(tmp_path / "a.vtk", samples.particles())
+    content = (tmp_path / "a.vtk").read_bytes()
+    start = content.index(b"POINTS 7 float\n") + 20
+    for damaged in (content[:start] + content[start + 1 :], content[:start] + b"\1" + content[start:]):
+        (tmp_path / "a.vtk").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"a\.vtk: has no end of the line after points"):
+            io.read_table(tmp_path / "a.vtk")

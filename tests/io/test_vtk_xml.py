@@ -178,3 +178,33 @@ def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
     with measured() as memory:
         table = io.read_table(tmp_path / "a.vtp")
     assert table.position[-1, -1] == 2 and memory.peak < 2**24
+
+
+@pytest.mark.parametrize("white", [b"", b"\n  "])
+@pytest.mark.parametrize("encoding", ["raw", "appended"])
+def test_appended_data_ends_with_its_last_array(encoding, white, tmp_path):
+    write_by_hand(tmp_path / "a.vtu", encoding=encoding)
+    whole = (tmp_path / "a.vtu").read_bytes()
+    stop = whole.index(b"</AppendedData>")
+    (tmp_path / "a.vtu").write_bytes(whole[:stop] + white + whole[stop:])
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.vtu").columns["a"], DATA)
+    for rest in (whole[stop - 4 : stop] + b"AAAA", b""):
+        (tmp_path / "a.vtu").write_bytes(whole[: stop - 4] + rest + white + whole[stop:])
+        with pytest.raises(ValueError, match=r"a\.vtu: (is cut short inside its data|has 4 more bytes than its appended arrays)"):
+            io.read_table(tmp_path / "a.vtu")
+
+
+def test_a_piece_says_how_many_points_it_has(tmp_path):
+    write_by_hand(tmp_path / "a.vtu")
+    (tmp_path / "a.vtu").write_bytes((tmp_path / "a.vtu").read_bytes().replace(b"NumberOfPoints", b"NumberOfPonts"))
+    with pytest.raises(ValueError, match=r"a\.vtu: has a Piece that does not say its NumberOfPoints"):
+        io.read_table(tmp_path / "a.vtu")
+
+
+def test_text_behind_an_array_in_place_is_refused(tmp_path):
+    write_by_hand(tmp_path / "a.vtu")
+    whole = (tmp_path / "a.vtu").read_bytes()
+    place = whole.index(b"</DataArray>") - 12
+    (tmp_path / "a.vtu").write_bytes(whole[:place] + b"AAAA" + whole[place:])
+    with pytest.raises(ValueError, match=r"a\.vtu: has 4 more characters than `a`"):
+        io.read_table(tmp_path / "a.vtu")
