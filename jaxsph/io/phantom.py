@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError
-from .datasets import numeric_datasets, read_dataset, read_positions
+from .datasets import columns_of, numeric_datasets, read_dataset, read_positions
 from .table import ParticleTable, scalar_of_width_one, time_of
 from .units import of_phantom
 
@@ -34,6 +34,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
         if name not in holder:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
+    columns_of(header)
     position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
     count = len(position)
     kind = np.full(count, GAS)

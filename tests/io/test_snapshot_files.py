@@ -69,6 +69,8 @@ def test_a_name_without_its_number_is_read_alone_and_says_so(tmp_path):
 
 
 def test_names_of_files_of_a_snapshot_keep_their_suffix(tmp_path):
+    for number in range(2):
+        (tmp_path / f"snap.{number}").touch()
     assert [file.name for file in files_of(tmp_path / "snap.1", 2)] == ["snap.0", "snap.1"]
     assert files_of(tmp_path / "snap.hdf5", 2) is None
     assert files_of(tmp_path / "snap.7.hdf5", 2) is None
