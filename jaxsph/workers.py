@@ -77,10 +77,11 @@ class Share(WorkerPlugin):  # type: ignore[misc]
         self._workers, self._cores, self._accelerators, self._config = workers, cores, accelerators, config
 
     def setup(self, worker: Any) -> None:
-        """Keep to some cores; leave interrupts to the process that started this one, which closes it."""
+        """Keep to some cores; leave it to the process that started this one, which closes it, to hear of signals."""
         place = int(worker.name)
         with contextlib.suppress(ValueError):  # only the main thread may
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            for number in (signal.SIGINT, signal.SIGTERM):  # those of a job get both at once, to all of its processes
+                signal.signal(number, signal.SIG_IGN)
         for name, value in self._config.items():
             jax.config.update(name, value)
         if self._accelerators:

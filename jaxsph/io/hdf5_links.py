@@ -51,7 +51,9 @@ def members(group: Any) -> dict[str, Any]:
 
 def member(group: Any, name: str) -> Any:
     """What a group holds by a name that is there; `ValueError` where it is a link that cannot be followed."""
-    found = group.get(name)
+    found = None
+    with contextlib.suppress(KeyError, RuntimeError, OSError):  # a link to itself, a file that is none of HDF5
+        found = group.get(name)
     if found is None:
         target = _target(group.get(name, getlink=True))
         where = f"{group.name.rstrip('/')}/{name}"

@@ -152,6 +152,8 @@ def _source_file(dataset: Any, name: str) -> Path:
 
 def _refuse_gaps(dataset: Any) -> None:
     """A view is whole where all that it shows is there, and what it shows is all of it."""
+    if None in dataset.maxshape:
+        raise DataError(f"`{dataset.name}` is a view of what grows: how much there must be is not said; {COPY}")
     mapped = dataset.virtual_sources()
     for source, mapping in zip(_sources(dataset), mapped, strict=True):
         known = source.path.stat()

@@ -31,10 +31,11 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         ValueError: missing data sets, no particles of that type, data sets of other lengths.
     """
     header, group = file["header"], file["particles"]
+    for each in (header, group):
+        columns_of(each)
     for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
         if name not in holder:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
-    columns_of(header)
     position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
     count = len(position)
     kind = np.full(count, GAS)

@@ -1,6 +1,6 @@
 """Write a file whole or not at all: fill a temporary sibling, then rename it over the target.
 
-A process that is killed leaves its sibling, `.NAME.jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
+A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
 that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
 """
 
@@ -63,7 +63,7 @@ def _make(temporary: Path, path: Path) -> None:
 
 
 def _before(path: Path) -> str:
-    return f".{path.stem[:MAX_STEM]}."
+    return f".{path.stem[:MAX_STEM]}-"
 
 
 def _host() -> str:
