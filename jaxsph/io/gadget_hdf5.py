@@ -129,7 +129,9 @@ def _table_mass(header: Any, chosen: int) -> float:
     masses = np.ravel(header.get("MassTable", ()))
     mass = float(masses[chosen]) if chosen < len(masses) else 0.0
     if not 0 <= mass < np.inf:
-        raise DataError(f"has mass {mass:g} for particles of type {chosen} in `MassTable` of its header; correct that number there")
+        raise DataError(
+            f"has mass {mass:g} for particles of type {chosen} in `MassTable` of its header; correct that number there"
+        )
     return mass
 
 

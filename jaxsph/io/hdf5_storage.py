@@ -159,7 +159,9 @@ def _refuse_gaps(dataset: Any) -> None:
         known = source.path.stat()
         there = _source_shape(source, known.st_mtime_ns, known.st_size, known.st_ino)
         if not _has_all(there, mapping):
-            raise DataError(f"{source.said}, which has the shape {there} there: too little for what is shown; write the file again")
+            raise DataError(
+                f"{source.said}, which has the shape {there} there: too little for what is shown; write the file again"
+            )
     spaces = [mapping.vspace for mapping in mapped]
     numbers = sum(space.get_select_npoints() for space in spaces)
     if numbers < math.prod(dataset.shape):

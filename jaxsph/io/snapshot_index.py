@@ -139,12 +139,12 @@ def _fits(index: SnapshotIndex, snapshot: Snapshot) -> bool:
         return False
     begin, end = runs[:, 1], runs[:, 2]
     ascending = (
-        (0 < index.least, index.least <= index.support),
+        (index.least > 0, index.least <= index.support),
         (begin <= index.widest, index.widest < end),
         (begin <= index.strongest, index.strongest < end),
-        (0 <= index.volume[:, 0], index.volume[:, 0] <= index.volume[:, 1]),
+        (index.volume[:, 0] >= 0, index.volume[:, 0] <= index.volume[:, 1]),
         (index.outer_lower <= index.lower, index.lower <= index.upper),
-        (index.upper <= index.outer_upper, 0 <= index.strength),
+        (index.upper <= index.outer_upper, index.strength >= 0),
     )
     numbers = all(np.isfinite(array).all() for array in arrays)
     same = (np.stack([index.file, index.begin, index.end], 1) == runs).all()

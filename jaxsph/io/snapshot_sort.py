@@ -88,7 +88,9 @@ def sort_snapshot(
     if any(output.exists() and output.samefile(file) for file in snapshot.files):
         raise DataError(f"{output}: is the snapshot itself; write the ordered one to another file")
     if output.exists() and not output.is_dir() and _sorted_from(output) != snapshot.files[0].name:
-        raise DataError(f"{output}: is there, and was not sorted from {snapshot.files[0].name}; remove it, or write to another file")
+        raise DataError(
+            f"{output}: is there, and was not sorted from {snapshot.files[0].name}; remove it, or write to another file"
+        )
     runs = snapshot.reads()
     steps = _Steps(progress, 3 * len(runs))
     grid = _grid(snapshot, runs, steps)
@@ -170,9 +172,7 @@ def _reading(path: Path) -> Iterator[Any]:
         raise DataError(f"{path}: {error.strerror or error}; it is needed until all of it is sorted") from error
 
 
-def _rows(
-    path: Path, name: str, rows: slice, grid: Grid, columns: dict[str, Column]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _rows(path: Path, name: str, rows: slice, grid: Grid, columns: dict[str, Column]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The cells of some rows, ascending, and the rows of all columns in that order."""
     with _reading(path) as file:
         group = file[name]

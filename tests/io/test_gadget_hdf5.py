@@ -123,7 +123,9 @@ def with_header(path, samples, **attributes):
 def test_another_number_of_particles_in_the_header_is_refused(told, samples, tmp_path):
     path = with_header(tmp_path / "a.hdf5", samples, NumPart_ThisFile=told)
     number = np.ravel(told)[0]
-    with pytest.raises(ValueError, match=rf"has 7 particles of type 0, but `NumPart_ThisFile` in its header says {number}; copy it"):
+    with pytest.raises(
+        ValueError, match=rf"has 7 particles of type 0, but `NumPart_ThisFile` in its header says {number}; copy it"
+    ):
         io.read_table(path)
 
 

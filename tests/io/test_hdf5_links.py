@@ -33,8 +33,8 @@ def link(path, target, name="PartType0/Density"):
 
 def test_a_link_to_a_file_beside_is_followed(tmp_path):
     path = snapshot(tmp_path)
-    before = io.read_table(path).columns["Density"]
-    for target in ("other.hdf5", str(tmp_path / "other.hdf5"), "/gone/from/here/other.hdf5"):  # as HDF5 does where files were moved
+    before = io.read_table(path).columns["Density"]  # an absolute name that is gone is looked for here, as HDF5 does
+    for target in ("other.hdf5", str(tmp_path / "other.hdf5"), "/gone/from/here/other.hdf5"):
         link(path, h5py.ExternalLink(target, "/Density"))
         np.testing.assert_array_equal(io.read_table(path).columns["Density"], before)
     link(path, h5py.SoftLink("/PartType0/Masses"))
@@ -89,7 +89,7 @@ def test_a_link_out_of_the_folder_is_not_opened(name, absolute, tmp_path):
     other = tmp_path / "secret.hdf5"
     os.rename(tmp_path / "inner" / "other.hdf5", other)
     link(path, h5py.ExternalLink(str(other) if absolute else "../secret.hdf5", "/Density"), name)
-    with pytest.raises(ValueError, match="secret.hdf5`, which lies outside of the folder of this file"):
+    with pytest.raises(ValueError, match=r"secret\.hdf5`, which lies outside of the folder of this file"):
         io.read_table(path)
 
 

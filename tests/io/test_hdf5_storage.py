@@ -94,7 +94,7 @@ def test_a_view_by_a_pattern_of_names_is_refused(file, dataset, tmp_path):
     layout.dcpl.set_virtual(shown, file.encode(), dataset.encode(), source)
     with h5py.File(tmp_path / "a.h5", "w") as made:
         made.create_virtual_dataset("Coordinates", layout)
-    with pytest.raises(ValueError, match="a pattern.*how many there must be is not said"):
+    with pytest.raises(ValueError, match=r"a pattern.*how many there must be is not said"):
         io.read_table(tmp_path / "a.h5")
 
 

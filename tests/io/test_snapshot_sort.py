@@ -64,7 +64,9 @@ def test_where_there_is_no_room_the_output_is_named_and_nothing_is_left(share, t
 def test_a_disk_that_is_too_small_is_known_before_anything_is_written(tmp_path, monkeypatch):
     path = write(tmp_path, particles(700), files=1)
     monkeypatch.setattr(reserved.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
-    with pytest.raises(ValueError, match=r"cannot write .*sorted\.hdf5: about 1\.\d MB are needed, and its disk has room for 0\.0 MB"):
+    with pytest.raises(
+        ValueError, match=r"cannot write .*sorted\.hdf5: about 1\.\d MB are needed, and its disk has room for 0\.0 MB"
+    ):
         js.io.sort_snapshot(path, tmp_path / "sorted.hdf5")
     assert list(tmp_path.iterdir()) == [path]
 
