@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jaxsph
 from jaxsph import (
@@ -46,6 +46,7 @@ from jaxsph.model import Camera, Settings
 
 IMAGE_SUFFIXES = (".exr", ".png")
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+AGAIN_SECONDS = 0.02
 DEMO_TOLERANCE = 0.004
 DEMO_CHECK = 64
 """Rows and columns of pixels, about, that `demo` compares with the float64 reference."""
@@ -92,15 +93,25 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
     def end(*_: object) -> None:
         raise _Terminated
 
+    def lost(told: Any) -> None:  # what is raised while an object is thrown away goes no further: ask again
+        if not isinstance(told.exc_value, _Terminated):
+            before(told)
+            return
+        again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), signal.SIGTERM))
+        again.daemon = True
+        again.start()
+
     mine = own_process and threading.current_thread() is threading.main_thread()
     if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
+    before, sys.unraisablehook = sys.unraisablehook, lost
     signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        sys.unraisablehook = before
 
 
 def _failed(options: argparse.Namespace, reason: str, code: int) -> int:

@@ -42,6 +42,7 @@ class Moment:
         self.calls += 1
         if self.at is not None and self.calls >= self.at and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
             self.at = None
+            sys.setprofile(None)
             os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -68,6 +69,7 @@ def test_a_command_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
     for _ in range(2):  # the first compiles
         whole = Moment()
         assert run(whole, arguments, monkeypatch) == 0
+        content = (folder / arguments[-1]).read_bytes()
         (folder / arguments[-1]).unlink()
         for frame in folder.glob("out_frames/*"):
             frame.unlink()
@@ -77,7 +79,8 @@ def test_a_command_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
         codes.append(run(Moment((moment * whole.calls) // MOMENTS + 1), arguments, monkeypatch))
         outputs, files = left(folder)
         assert not [path for path in files if path.name.startswith(".")], (moment, files)
-        assert outputs == ([] if codes[-1] else [arguments[-1]]), (moment, codes)
+        assert outputs == [arguments[-1]] * (not codes[-1] or len(outputs)), (moment, codes)
+        assert all((folder / name).read_bytes() == content for name in outputs), (moment, codes)  # it was whole by then
         if codes[-1]:
             assert capsys.readouterr().err.splitlines()[-1] == f"jaxsph {command}: terminated"
         for name in outputs:
@@ -86,6 +89,23 @@ def test_a_command_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
             frame.unlink()
     assert set(codes) <= {0, 143} and codes.count(143) >= MOMENTS - 2, codes
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@posix
+def test_asking_is_heard_while_an_object_is_thrown_away(folder, capsys, monkeypatch):
+    class Asking:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def work(**_):
+        Asking()
+        time.sleep(60)
+
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "info", "--cache"])
+    monkeypatch.setattr(cli_cache, "begin", work)
+    started, hook = time.monotonic(), sys.unraisablehook
+    assert cli.main() == 143 and time.monotonic() - started < 50
+    assert capsys.readouterr().err.splitlines() == ["jaxsph info: terminated"] and sys.unraisablehook is hook
 
 
 @posix
@@ -105,7 +125,7 @@ def test_signals_that_are_ignored_or_somebody_elses_are_left_alone(handler, fold
 @pytest.mark.parametrize("command", [*COMMANDS, "workers"])
 def test_a_process_that_is_asked_to_end_at_any_moment_leaves_nothing(command, folder):
     if command == "sort":
-        write(folder, particles(400_000, ordered=False))
+        write(folder, particles(100_000, ordered=False))
     more = ["--workers", "2"] if command == "workers" else []
     arguments = [*COMMANDS[{"workers": "movie"}.get(command, command)], *more]
     output = folder / arguments[arguments.index("-o") + 1]
@@ -113,7 +133,7 @@ def test_a_process_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
     for _ in range(2):
         started = time.monotonic()
         subprocess.run(program, check=True, capture_output=True)
-        seconds = time.monotonic() - started
+        seconds, content = time.monotonic() - started, output.read_bytes()
         output.unlink()
         for frame in folder.glob("out_frames/*"):
             frame.unlink()
@@ -126,7 +146,8 @@ def test_a_process_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
         codes.append(process.returncode)
         outputs, files = left(folder)
         assert not [path for path in files if path.name.startswith(".")], (moment, files)
-        assert outputs == ([output.name] if codes[-1] == 0 else []), (moment, codes)
+        assert outputs == [output.name] * (not codes[-1] or len(outputs)), (moment, codes)
+        assert all((folder / name).read_bytes() == content for name in outputs), (moment, codes)  # it was whole by then
         assert "resource_tracker" not in err and len(err.splitlines()) <= 1, err
         with pytest.raises(ProcessLookupError):
             os.killpg(process.pid, 0)

@@ -98,11 +98,11 @@ def test_an_index_that_cannot_be_of_these_rows_is_made_again(name, change, tmp_p
 
 def test_a_file_that_was_written_over_with_its_old_size_and_time_is_noticed(tmp_path):
     snapshot = Snapshot(write(tmp_path, particles(300)))
-    before, stands = index_of(snapshot), snapshot.files[1].stat()
+    before, stood = index_of(snapshot), [path.stat() for path in snapshot.files]
     write(tmp_path, particles(300, seed=1))
-    assert snapshot.files[1].stat().st_size == stands.st_size
-    for path in snapshot.files:
-        os.utime(path, ns=(stands.st_atime_ns, stands.st_mtime_ns))
+    for path, known in zip(snapshot.files, stood, strict=True):
+        os.utime(path, ns=(known.st_atime_ns, known.st_mtime_ns))
+        assert path.stat().st_size == known.st_size
     assert not np.array_equal(index_of(Snapshot(snapshot.files[0])).lower, before.lower)
 
 
