@@ -222,6 +222,23 @@ def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_start
             signal.signal(number, handler)
 
 
+def test_an_interrupt_while_processes_are_started_comes_when_they_can_be_closed(monkeypatch):
+    class Cluster:
+        def __init__(self, **_):
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            self.started = True
+
+        def close(self, timeout):
+            closed.append(self.started)
+
+    closed, handler = [], signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(workers.distributed, "LocalCluster", Cluster)
+    with pytest.raises(KeyboardInterrupt), workers.local_client(1):
+        pass
+    assert closed == [True] and signal.getsignal(signal.SIGINT) is handler
+
+
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_the_sequence_and_says_so(tmp_path):
     cluster = distributed.LocalCluster(**IN_THIS_PROCESS)
