@@ -62,8 +62,8 @@ def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterato
     with dask.config.set({PROFILE: False}), _held_back() as came:
         cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
     try:
-        for number in came[:1]:
-            signal.raise_signal(number)
+        for late in came[:1]:
+            signal.raise_signal(late)
         with distributed.Client(cluster) as client:
             client.register_plugin(share)
             yield client
@@ -75,7 +75,7 @@ def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterato
 def _held_back() -> Iterator[list[int]]:
     """Note signals that come in the block, for later: processes that are half started cannot be closed."""
     came: list[int] = []
-    before: dict[int, Any] = {}
+    before: dict[signal.Signals, Any] = {}
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
             handler = signal.getsignal(number)
