@@ -160,7 +160,9 @@ def test_a_process_that_is_asked_to_end_at_any_moment_leaves_nothing(command, fo
         assert not [path for path in files if path.name.startswith(".")], (moment, files)
         assert outputs == [output.name] * (not codes[-1] or len(outputs)), (moment, codes)
         assert all((folder / name).read_bytes() == content for name in outputs), (moment, codes)  # it was whole by then
-        assert "resource_tracker" not in err and len(err.splitlines()) <= 1, err
+        assert "resource_tracker" not in err and "atexit" not in err, err
+        assert more or len(err.splitlines()) <= 1, err  # Dask tells of connections that its workers had
+        assert codes[-1] != 143 or f"jaxsph {arguments[0]}: terminated" in err.splitlines(), err
         assert ends(process.pid), moment
         output.unlink(missing_ok=True)
         for frame in folder.glob("out_frames/*"):
