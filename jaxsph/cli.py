@@ -2,20 +2,24 @@
 
 Flow: file or scene -> [cli] -> render -> EXR or PNG.
 
-Exit codes: 0 done, 1 the work failed, 2 wrong usage; one line on stderr says why.
+Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted (SIGINT), 143 asked to end (SIGTERM); one line on stderr
+says why.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import jaxsph
 from jaxsph import (
@@ -41,27 +45,35 @@ from jaxsph.console import UsageError, camera_line, error_line, largest, largest
 from jaxsph.model import Camera, Settings
 
 IMAGE_SUFFIXES = (".exr", ".png")
-DONE, FAILED, WRONG_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+AGAIN_SECONDS = 0.02
 DEMO_TOLERANCE = 0.004
 DEMO_CHECK = 64
 """Rows and columns of pixels, about, that `demo` compares with the float64 reference."""
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process is asked to end, by a scheduler of jobs perhaps: all that an interrupt tidies up is tidied up."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the result is the exit code.
 
     Args:
-        arguments: those of the process if not given. Only then are compiled programs kept for other processes, as a caller
-            may have set up JAX otherwise.
+        arguments: those of the process if not given. Only then are compiled programs kept for other processes, and SIGTERM
+            heard, as a caller may have set up JAX and signals otherwise.
     """
     try:
         options = _parser().parse_args(arguments)
     except SystemExit as stop:  # --help, --version and what argparse refuses
         return int(stop.code or DONE)
     try:
-        if arguments is None:
-            cli_cache.begin(keep=not options.no_cache)
-        options.run(options)
+        with _ending_in_order(arguments is None):
+            if arguments is None:
+                cli_cache.begin(keep=not options.no_cache)
+            options.run(options)
+    except _Terminated:
+        return _failed(options, "terminated", TERMINATED)
     except KeyboardInterrupt:
         return _failed(options, "interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output went away, as in `jaxsph info FILE | head`
@@ -72,6 +84,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         return _failed(options, _reason(error), FAILED)
     return DONE
+
+
+@contextlib.contextmanager
+def _ending_in_order(own_process: bool) -> Iterator[None]:
+    """Have SIGTERM raise in the block, as SIGINT does; not where it is ignored, or is somebody else's to handle."""
+
+    def end(*_: object) -> None:
+        raise _Terminated
+
+    def lost(told: Any) -> None:  # what is raised while an object is thrown away goes no further: ask again
+        if not isinstance(told.exc_value, _Terminated):
+            before(told)
+            return
+        again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), signal.SIGTERM))
+        again.daemon = True
+        again.start()
+
+    mine = own_process and threading.current_thread() is threading.main_thread()
+    if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    before, sys.unraisablehook = sys.unraisablehook, lost
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        sys.unraisablehook = before
 
 
 def _failed(options: argparse.Namespace, reason: str, code: int) -> int:

@@ -74,7 +74,8 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
 def add_sort(parser: argparse.ArgumentParser) -> None:
     """Options of the command `sort`."""
     parser.add_argument("source", metavar="FILE", help="Gadget-like HDF5; any file of a snapshot in several")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.hdf5", help="one file, ordered in space")
+    where = "one file, ordered in space; one that is there is replaced only if it was sorted from a FILE of this name"
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.hdf5", help=where)
     parser.add_argument("--part-type", type=int, metavar="N", help="kind of particles (default: gas, else the first)")
 
 

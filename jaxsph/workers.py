@@ -9,6 +9,7 @@ import contextlib
 import logging
 import os
 import signal
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,14 +59,33 @@ def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterato
     )
     how = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "silence_logs": logging.CRITICAL}
     no_pages = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # at any free port, as several may run
-    with dask.config.set({PROFILE: False}):
+    with dask.config.set({PROFILE: False}), _held_back() as came:
         cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
     try:
+        for late in came[:1]:
+            signal.raise_signal(late)
         with distributed.Client(cluster) as client:
             client.register_plugin(share)
             yield client
     finally:
         cluster.close(timeout=CLOSING)
+
+
+@contextlib.contextmanager
+def _held_back() -> Iterator[list[int]]:
+    """Note signals that come in the block, for later: processes that are half started cannot be closed."""
+    came: list[int] = []
+    before: dict[signal.Signals, Any] = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if callable(handler) and threading.current_thread() is threading.main_thread():
+                before[number] = handler
+                signal.signal(number, lambda late, _: came.append(late))
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Share(WorkerPlugin):  # type: ignore[misc]
@@ -77,10 +97,11 @@ class Share(WorkerPlugin):  # type: ignore[misc]
         self._workers, self._cores, self._accelerators, self._config = workers, cores, accelerators, config
 
     def setup(self, worker: Any) -> None:
-        """Keep to some cores; leave interrupts to the process that started this one, which closes it."""
+        """Keep to some cores; leave it to the process that started this one, which closes it, to hear of signals."""
         place = int(worker.name)
         with contextlib.suppress(ValueError):  # only the main thread may
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            for number in (signal.SIGINT, signal.SIGTERM):  # those of a job get both at once, to all of its processes
+                signal.signal(number, signal.SIG_IGN)
         for name, value in self._config.items():
             jax.config.update(name, value)
         if self._accelerators:

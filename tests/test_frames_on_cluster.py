@@ -211,13 +211,32 @@ def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_start
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     before = jax.config.jax_compilation_cache_dir
     shares = Share(4, [], workers._accelerators(), {"jax_compilation_cache_dir": str(tmp_path)})
-    handler = signal.getsignal(signal.SIGINT)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         shares.setup(argparse.Namespace(name=3))
         assert os.environ["CUDA_VISIBLE_DEVICES"] == "5" and jax.config.jax_compilation_cache_dir == str(tmp_path)
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
-        signal.signal(signal.SIGINT, handler)
+        for number, handler in handlers.items():
+            assert signal.getsignal(number) is signal.SIG_IGN
+            signal.signal(number, handler)
+
+
+def test_an_interrupt_while_processes_are_started_comes_when_they_can_be_closed(monkeypatch):
+    class Cluster:
+        def __init__(self, **_):
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            self.started = True
+
+        def close(self, timeout):
+            closed.append(self.started)
+
+    closed, handler = [], signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(workers.distributed, "LocalCluster", Cluster)
+    with pytest.raises(KeyboardInterrupt), workers.local_client(1):
+        pass
+    assert closed == [True] and signal.getsignal(signal.SIGINT) is handler
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .damage import DataError, NoParticlesError, explained
-from .table import ParticleTable, time_of
+from .table import ParticleTable, box_of, time_of
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
@@ -46,6 +46,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         counts = header["count"].astype(np.int64)
         chosen = _choose(counts, part_type)
         said = [f"particles of type {chosen}"]
+        _refuse_mass(float(header["mass"][chosen]), chosen)
         columns: dict[str, np.ndarray] = {}
         for name, raw in blocks.items():
             values = _block(name, raw, counts, header["mass"], chosen, order)
@@ -61,8 +62,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         support = columns.pop("HSML", None)
         if support is not None:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
-        edge = float(header["box"])
-        box_size = (edge, edge, edge) if edge > 0 else None
+        box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
+        said += notes
         more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
         more |= {"part_type": chosen, "num_files": max(int(header["files"]), 1)}
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
@@ -125,6 +126,11 @@ def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
 def _header(record: np.ndarray, order: Order) -> np.void:
     dtype = np.dtype(HEADER).newbyteorder(order)
     return record[: dtype.itemsize].view(dtype)[0]
+
+
+def _refuse_mass(mass: float, chosen: int) -> None:
+    if not 0 <= mass < np.inf:
+        raise DataError(f"has mass {mass:g} for particles of type {chosen} in its header; correct that number there")
 
 
 def _choose(counts: np.ndarray, part_type: int | None) -> int:

@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError, NoParticlesError
-from .datasets import read_dataset, read_positions
-from .table import ParticleTable, plain, time_of
+from .datasets import columns_of, read_dataset, read_positions
+from .hdf5_links import holds, member
+from .table import ParticleTable, box_of, plain, time_of
 from .units import of_gadget
 
 SOURCE = "Gadget HDF5"
@@ -52,13 +53,13 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     chosen, group = _choose(file, part_type)
     position = read_positions(group["Coordinates"], rows)
     count = group["Coordinates"].shape[0]
+    header = file["Header"].attrs if "Header" in file else {}
+    _refuse_other_count(header, chosen, count)
     said = [f"particles of PartType{chosen}"]
     swift = _is_swift(file)
     columns, dropped = {}, []
-    for name, dataset in group.items():
-        if name == "Coordinates" or not hasattr(dataset, "shape") or dataset.ndim not in (1, 2):
-            continue
-        if only is not None and plain(name) not in only:
+    for name, dataset in columns_of(group).items():
+        if name == "Coordinates" or (only is not None and plain(name) not in only):
             continue
         if dataset.dtype.kind not in "fiub":
             dropped.append(name)
@@ -68,7 +69,6 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
             columns[name] = read_dataset(dataset, rows)
     if dropped:
         said.append(f"left out {', '.join(dropped)}: not numbers")
-    header = file["Header"].attrs if "Header" in file else {}
     if not any(plain(name) in ("mass", "masses") for name in columns):
         mass = _table_mass(header, chosen)
         if mass:
@@ -79,7 +79,8 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     if smoothing is not None:
         support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
         said.append(sentence)
-    box_size = _box(header) if _is_periodic(file) else None
+    box_size, notes = _box(header) if _is_periodic(file) else (None, [])
+    said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
     more |= {"part_type": chosen, "num_files": max(_num_files(header), 1)}
@@ -88,13 +89,14 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
 
 def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:
     found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
-    usable = sorted(number for number, group in found.items() if "Coordinates" in group)
+    usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
     if not usable:
         raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
     if part_type is None:
         part_type = usable[0]
     if part_type not in usable:
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, usable))}")
+    member(found[part_type], "Coordinates")
     return part_type, found[part_type]
 
 
@@ -125,7 +127,22 @@ def _num_files(header: Any) -> int:
 
 def _table_mass(header: Any, chosen: int) -> float:
     masses = np.ravel(header.get("MassTable", ()))
-    return float(masses[chosen]) if chosen < len(masses) else 0.0
+    mass = float(masses[chosen]) if chosen < len(masses) else 0.0
+    if not 0 <= mass < np.inf:
+        raise DataError(
+            f"has mass {mass:g} for particles of type {chosen} in `MassTable` of its header; correct that number there"
+        )
+    return mass
+
+
+def _refuse_other_count(header: Any, chosen: int, count: int) -> None:
+    """A file that was rewritten in part, or not to its end, says so here alone."""
+    told = np.ravel(np.asarray(header.get("NumPart_ThisFile", ())))
+    if chosen < len(told) and told.dtype.kind in "iuf" and told[chosen] != count:
+        raise DataError(
+            f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g}; copy it again, "
+            f"or correct that number if rows were added or left out on purpose"
+        )
 
 
 def _is_periodic(file: Any) -> bool:
@@ -136,12 +153,12 @@ def _is_periodic(file: Any) -> bool:
     return told is None or text(told).strip() != "0"
 
 
-def _box(header: Any) -> tuple[float, float, float] | None:
+def _box(header: Any) -> tuple[tuple[float, float, float] | None, list[str]]:
+    """The sides of the box, if the header has them; a note where what it has are none."""
     edges = np.ravel(header.get("BoxSize", 0.0)).astype(np.float64)
-    if len(edges) not in (1, 3) or not (edges > 0).all():
-        return None
-    x, y, z = np.broadcast_to(edges, 3).tolist()
-    return x, y, z
+    if not edges.any():
+        return None, []
+    return box_of(edges)
 
 
 def text(value: Any) -> str:

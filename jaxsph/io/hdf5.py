@@ -12,9 +12,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from . import gadget_hdf5, phantom
-from .damage import DataError, explained
+from .damage import DataError
 from .datasets import numeric_datasets, read_positions
-from .optional import require
+from .hdf5_links import opened
 from .table import ParticleTable, plain, table_from_columns
 
 SOURCE = "HDF5 points"
@@ -28,8 +28,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         ValueError: damaged, or of none of these flavours; `part_type` for a file without types.
         ImportError: h5py is not installed.
     """
-    h5py = require("h5py", "reading HDF5 files")
-    with explained(path, "HDF5"), h5py.File(path, "r") as file:
+    with opened(path) as file:
         if any(name.startswith("PartType") for name in file):
             return gadget_hdf5.from_hdf5(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:

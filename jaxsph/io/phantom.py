@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError
-from .datasets import numeric_datasets, read_dataset, read_positions
+from .datasets import columns_of, numeric_datasets, read_dataset, read_positions
 from .table import ParticleTable, scalar_of_width_one, time_of
 from .units import of_phantom
 
@@ -31,6 +31,8 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         ValueError: missing data sets, no particles of that type, data sets of other lengths.
     """
     header, group = file["header"], file["particles"]
+    for each in (header, group):
+        columns_of(each)
     for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
         if name not in holder:
             raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")

@@ -1,19 +1,36 @@
-"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target."""
+"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target.
+
+A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
+that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import os
-import tempfile
+import re
+import secrets
+import socket
+import stat
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+STALE_SECONDS = 24 * 3600.0
+"""Since the last write to a temporary file; a process of another machine, which cannot be asked for, writes more often."""
+MAX_STEM = 40
+"""Letters of a name that are kept in that of its temporary file, of at most 255 bytes."""
+MARK = re.compile(r"jaxsph-([0-9a-f]{8})-([0-9a-f]+)-[0-9a-f]{8}")
 
 
 @contextlib.contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Give the block a temporary path beside `path`, of the same suffix; rename it to `path` when the block succeeds.
 
-    When the block fails, the temporary file is removed and what stood at `path` before still stands there.
+    When the block fails, the temporary file is removed and what stood at `path` before still stands there. So it is when the
+    process is asked to end, if it hears (`jaxsph.cli`).
 
     Raises:
         ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.
@@ -23,14 +40,10 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: the folder {path.parent} does not exist; make it first")
+    _sweep(path)
+    temporary = path.with_name(f"{_before(path)}jaxsph-{_host()}-{os.getpid():x}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
+        _make(temporary, path)
         yield temporary
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
@@ -39,6 +52,59 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: {reason}; choose another place") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _make(temporary: Path, path: Path) -> None:
+    try:
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
+
+
+def _before(path: Path) -> str:
+    return f".{path.stem[:MAX_STEM]}-"
+
+
+def _host() -> str:
+    return hashlib.blake2b(socket.gethostname().encode(), digest_size=4).hexdigest()
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed processes have left of this name."""
+    before, now = _before(path), time.time()
+    for name in _left_in(os.path.abspath(path.parent)):
+        mark = MARK.fullmatch(name, len(before), max(len(name) - len(path.suffix), 0))
+        if mark is None or not (name.startswith(before) and name.endswith(path.suffix)) or _is_at_work(mark[1], int(mark[2], 16)):
+            continue
+        left = path.with_name(name)
+        with contextlib.suppress(OSError):
+            known = left.lstat()
+            if stat.S_ISREG(known.st_mode) and now - known.st_mtime > STALE_SECONDS:
+                left.unlink()
+
+
+@functools.lru_cache(maxsize=256)
+def _left_in(folder: str) -> tuple[str, ...]:
+    """Names of temporary files in a folder, listed once: thousands of frames are written to one."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        return tuple(entry.name for entry in entries if entry.name.startswith(".") and MARK.search(entry.name))
+    return ()
+
+
+def _is_at_work(host: str, process: int) -> bool:
+    """Whether a process of this machine runs; of others that is not known."""
+    if host != _host():
+        return False
+    if os.name != "posix":  # there a signal of 0 is none
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is somebody else's
+        return True
+    return True
 
 
 def _umask() -> int:

@@ -8,6 +8,8 @@ Any of the files stands for all. Files may lack a type of particles that others 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +20,8 @@ import numpy as np
 from .damage import DataError, NoParticlesError
 from .table import ParticleTable
 
+NAMED = 3
+"""Missing files that are named at most."""
 PART = re.compile(r"(.*\.)(\d+)(\.[A-Za-z]\w*)?")
 Reader = Callable[[Path, int | None], ParticleTable]
 
@@ -38,9 +42,6 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
     if files is None:
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
         return dataclasses.replace(table, conventions=(*table.conventions, note))
-    missing = [file.name for file in files if not file.exists()]
-    if missing:
-        raise DataError(f"{path}: is one of {len(files)} files of a snapshot; beside it {_some(missing)} cannot be found")
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
     chosen = min(found.part_type for found in tables if found.part_type is not None)
     of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
@@ -48,11 +49,30 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
 
 
 def files_of(path: Path, number: int) -> list[Path] | None:
-    """All files of the snapshot that a file is one of; None where its name does not say which it is."""
+    """All files of the snapshot that a file is one of; None where its name does not say which it is.
+
+    Raises:
+        ValueError: some are not there, or no regular files. The folder is listed once: a header may ask for any number.
+    """
     match = PART.fullmatch(path.name)
     if match is None or int(match[2]) >= number:
         return None
+    there = _numbers_beside(path, match[1], match[3] or "", number)
+    missing = (f"{match[1]}{nth}{match[3] or ''}" for nth in range(number) if nth not in there)
+    named, num_missing = list(itertools.islice(missing, NAMED)), number - len(there)
+    if named:
+        more = f" and {num_missing - NAMED} more" if num_missing > NAMED else ""
+        raise DataError(f"{path}: is one of {number} files of a snapshot; beside it {', '.join(named)}{more} cannot be found")
     return [path.with_name(f"{match[1]}{nth}{match[3] or ''}") for nth in range(number)]
+
+
+def _numbers_beside(path: Path, before: str, after: str, number: int) -> set[int]:
+    """Numbers below `number` of the regular files that are called as this one but for that."""
+    with os.scandir(path.parent) as entries:
+        matches = [(entry, PART.fullmatch(entry.name)) for entry in entries if entry.name.startswith(before)]
+        alike = [(entry, match[2]) for entry, match in matches if match and (match[1], match[3] or "") == (before, after)]
+        numbers = {int(text) for entry, text in alike if text == str(int(text)) and entry.is_file()}
+    return {nth for nth in numbers if nth < number}
 
 
 def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
@@ -86,7 +106,3 @@ def _read(read: Reader, file: Path, part_type: int | None) -> ParticleTable | No
         return dataclasses.replace(read(file, part_type), path=str(file))
     except NoParticlesError:
         return None
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

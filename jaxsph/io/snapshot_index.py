@@ -4,12 +4,14 @@ Flow: files -> [snapshot_index: one pass, run by run] -> SnapshotIndex -> disk -
 
 A run is a few ten thousand neighbouring rows of one file: those of a cell, or of several, where the code (SWIFT) stores particles
 cell by cell and says so. Of each are kept the box around its particles, and the largest support, which no code's own tables have.
-The index lies beside the snapshot, and is made again when a file has another size or time of change.
+The index lies beside the snapshot, and is made again when a file has another size or time of change, and when it is damaged or
+does not fit the rows that the files have.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -24,7 +26,7 @@ from .table import ParticleTable
 
 SUFFIX = ".jaxsph-index.npz"
 OF_RUNS = "run_"
-VERSION = 1
+VERSION = 2
 Progress = Callable[[int, int], None]
 
 
@@ -110,13 +112,43 @@ def _marked(snapshot: Snapshot) -> np.ndarray:
 
 
 def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
+    path = index_path(snapshot)
+    if not path.is_file():
+        return None
     try:
-        with np.load(index_path(snapshot), allow_pickle=False) as kept:
+        with zipfile.ZipFile(path) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):  # as it is never written
+                return None
+        with np.load(path, allow_pickle=False) as kept:
             if str(kept["identity"]) != str(_marked(snapshot)):
                 return None
-            return SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[OF_RUNS + name] for name in ARRAYS})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            found = SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[OF_RUNS + name] for name in ARRAYS})
+    except Exception:  # whatever a damaged archive raises: it is made again
         return None
+    return found if _fits(found, snapshot) else None
+
+
+def _fits(index: SnapshotIndex, snapshot: Snapshot) -> bool:
+    """Whether an index can be of these files: of their runs, with boxes, supports and volumes that particles can have."""
+    runs = np.array(list(snapshot.runs()), np.int64).reshape(-1, 3)
+    shapes = [(len(runs), *((3,) if name in CORNERS else (2,) if name == "volume" else ())) for name in ARRAYS]
+    arrays = [getattr(index, name) for name in ARRAYS]
+    if not len(runs):
+        return all(len(array) == 0 for array in arrays)
+    if any(array.shape != shape or array.dtype.kind not in "iuf" for array, shape in zip(arrays, shapes, strict=True)):
+        return False
+    begin, end = runs[:, 1], runs[:, 2]
+    ascending = (
+        (index.least > 0, index.least <= index.support),
+        (begin <= index.widest, index.widest < end),
+        (begin <= index.strongest, index.strongest < end),
+        (index.volume[:, 0] >= 0, index.volume[:, 0] <= index.volume[:, 1]),
+        (index.outer_lower <= index.lower, index.lower <= index.upper),
+        (index.upper <= index.outer_upper, index.strength >= 0),
+    )
+    numbers = all(np.isfinite(array).all() for array in arrays)
+    same = (np.stack([index.file, index.begin, index.end], 1) == runs).all()
+    return bool(numbers and same and all(each.all() for each in itertools.chain.from_iterable(ascending)))
 
 
 def _made(snapshot: Snapshot, progress: Progress | None) -> SnapshotIndex:

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from . import gadget_hdf5
-from .damage import DataError, explained
-from .optional import require
+from .damage import DataError
+from .datasets import position_shape, read_dataset
+from .hdf5_links import holds, member, opened
 from .quantities import ROLES, available_quantities, choose_quantity
 from .snapshot_files import files_of
 from .table import ParticleTable, plain
@@ -41,8 +42,7 @@ class Snapshot:
         path = Path(path)
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such file")
-        h5py = require("h5py", "reading HDF5 files")
-        with explained(path, "HDF5"), h5py.File(path, "r") as file:
+        with opened(path) as file:
             if not any(name.startswith("PartType") for name in file):
                 raise DataError("is not a Gadget-like HDF5 snapshot; particles of other formats are read as a whole")
             first = gadget_hdf5.from_hdf5(file, part_type, slice(0, 1))
@@ -50,28 +50,27 @@ class Snapshot:
         self.part_type: int = first.part_type
         self.files = tuple(files_of(path, first.num_files) or (path,)) if first.num_files > 1 else (path,)
         self.first = first
-        missing = [each.name for each in self.files if not each.exists()]
-        if missing:
-            raise DataError(f"{path}: is one of {len(self.files)} files of a snapshot; beside it {missing[0]} cannot be found")
 
     def __len__(self) -> int:
         return sum(end - begin for _, begin, end in self.runs())
 
     @property
-    def identity(self) -> tuple[tuple[str, int, int], ...]:
-        """Names, sizes in bytes and times of change of the files."""
+    def identity(self) -> tuple[tuple[str, int, int, int], ...]:
+        """Names, sizes in bytes and times of change of the files: of their data as is said, and of anything as the system knows.
+
+        The first can be set, and is where a file is copied over another. Numbers of files (inodes) are other ones at every
+        mount on some systems, so they are not asked.
+        """
         told = ((file.name, file.stat()) for file in self.files)
-        return tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in told)
+        return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for name, stat in told)
 
     def read(self, file: int, rows: slice, only: Sequence[str] | None = None) -> ParticleTable:
         """Some rows of a file; besides positions `only` the columns of those names."""
-        h5py = require("h5py", "reading HDF5 files")
-        path = self.files[file]
-        with explained(path, "HDF5"), h5py.File(path, "r") as opened:
-            if f"PartType{self.part_type}" not in opened:
+        with opened(self.files[file]) as source:
+            if f"PartType{self.part_type}" not in source:
                 return dataclasses.replace(self.first, position=np.zeros((0, 3), np.float32), columns={}, support=None)
             names = None if only is None else {plain(name) for name in only}
-            return gadget_hdf5.from_hdf5(opened, self.part_type, rows, names)
+            return gadget_hdf5.from_hdf5(source, self.part_type, rows, names)
 
     def reads(self) -> list[tuple[int, int, int]]:
         """File, first row and end of what is read at once where all is read."""
@@ -79,14 +78,13 @@ class Snapshot:
 
     def runs(self) -> Iterator[tuple[int, int, int]]:
         """File, first row and end of each run."""
-        h5py = require("h5py", "reading HDF5 files")
         for number, path in enumerate(self.files):
-            with explained(path, "HDF5"), h5py.File(path, "r") as opened:
+            with opened(path) as source:
                 name = f"PartType{self.part_type}"
-                if name not in opened or "Coordinates" not in opened[name]:
+                if name not in source or not holds(source[name], "Coordinates"):
                     continue
-                count = opened[name]["Coordinates"].shape[0]
-                edges = _edges(count, _cells(opened, name))
+                count = position_shape(member(source[name], "Coordinates"))[0]
+                edges = _edges(count, _cells(source, name))
             yield from ((number, int(begin), int(end)) for begin, end in itertools.pairwise(edges) if end > begin)
 
 
@@ -104,15 +102,14 @@ def together(runs: Iterable[tuple[int, int, int]]) -> Iterator[tuple[int, list[t
         yield last, held
 
 
-def _cells(opened: Any, name: str) -> np.ndarray | None:
+def _cells(file: Any, name: str) -> np.ndarray | None:
     """First rows of the cells of a SWIFT snapshot, ascending; None where it has none, or its cells leave rows out."""
-    cells = opened.get("Cells")
+    cells = file.get("Cells")
     if cells is None or any(part not in cells or name not in cells[part] for part in ("Counts", "OffsetsInFile")):
         return None
-    counts, offsets = (np.asarray(cells[part][name][()], np.int64) for part in ("Counts", "OffsetsInFile"))
+    counts, offsets = (read_dataset(cells[part][name]).astype(np.int64) for part in ("Counts", "OffsetsInFile"))
     if "Files" in cells and name in cells["Files"]:  # of a snapshot in several files, those that lie in this one
-        here = _number_of(opened)
-        inside = np.asarray(cells["Files"][name][()]) == here
+        inside = read_dataset(cells["Files"][name]) == _number_of(file)
         counts, offsets = counts[inside], offsets[inside]
     order = np.argsort(offsets, kind="stable")
     counts, offsets = counts[order], offsets[order]
@@ -122,9 +119,9 @@ def _cells(opened: Any, name: str) -> np.ndarray | None:
     return offsets if whole else None
 
 
-def _number_of(opened: Any) -> int:
+def _number_of(file: Any) -> int:
     """The number of a file among those of its snapshot."""
-    header = opened["Header"].attrs if "Header" in opened else {}
+    header = file["Header"].attrs if "Header" in file else {}
     return int(np.ravel(header.get("ThisFile", 0))[0])
 
 

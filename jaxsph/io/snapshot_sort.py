@@ -3,24 +3,51 @@
 Flow: files -> [snapshot_sort: count cells, place rows] -> one file, with a table of its cells.
 
 Particles are moved to coarse cells of a box around all; in a cell they keep their order. Positions are read three times and all
-else once, run by run, and never more than a run is held. The cells are told as SWIFT tells them.
+else once, run by run, and never more than a run is held. The cells are told as SWIFT tells them. Room for all is taken before
+anything is written, as HDF5 that cannot write may end the process.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .damage import DataError, explained
+from .damage import DataError
+from .datasets import read_dataset
+from .hdf5_links import holds, member, members, opened
+from .hdf5_storage import shape_of
 from .optional import require
 from .replace import written_whole
+from .reserved import reserve
 from .snapshot_index import Progress
 from .snapshot_rows import Snapshot
 
 BITS = 4
 CELLS = 1 << BITS  # along each edge of the box
+SORTED_FROM = "jaxsph_sorted_from"
+"""Attribute of a file that was sorted: the name of the first file of its source."""
+PURPOSE = "writing HDF5 files"
+SLACK = 1 << 20
+"""Bytes of what HDF5 notes beside data: of this tool's own groups and tables."""
+
+
+class Column(NamedTuple):
+    """What is known of a column before it is read.
+
+    Attributes:
+        shape: of all its rows.
+        dtype: of its numbers.
+        attributes: of its data set.
+    """
+
+    shape: tuple[int, ...]
+    dtype: Any
+    attributes: dict[str, Any]
 
 
 class Grid(NamedTuple):
@@ -47,19 +74,23 @@ def sort_snapshot(
 
     Args:
         path: any file of the snapshot, Gadget-like HDF5.
-        output: the file to write, whole or not at all.
+        output: the file to write, whole or not at all; one that is there is replaced if it was sorted from files of that name.
         part_type: kind of particles; default gas, or the first other kind there is.
         progress: called as `progress(done, total)` after every read.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another format, a damaged file, a place that cannot be written to.
+        ValueError: another format, a damaged file, a place that cannot be written to or has no room, where something else is.
     """
     snapshot, output = Snapshot(path, part_type), Path(output)
     if output.suffix.lower() not in (".hdf5", ".h5"):
         raise DataError(f"{output}: a snapshot is written as .hdf5 or .h5")
     if any(output.exists() and output.samefile(file) for file in snapshot.files):
         raise DataError(f"{output}: is the snapshot itself; write the ordered one to another file")
+    if output.exists() and not output.is_dir() and _sorted_from(output) != snapshot.files[0].name:
+        raise DataError(
+            f"{output}: is there, and was not sorted from {snapshot.files[0].name}; remove it, or write to another file"
+        )
     runs = snapshot.reads()
     steps = _Steps(progress, 3 * len(runs))
     grid = _grid(snapshot, runs, steps)
@@ -92,33 +123,112 @@ def _grid(snapshot: Snapshot, runs: list[tuple[int, int, int]], steps: _Steps) -
     return Grid(np.where(np.isfinite(lower), lower, 0), CELLS / np.where(np.isfinite(extent), extent, 1))
 
 
+def _sorted_from(path: Path) -> str | None:
+    """Of a sorted snapshot, the name of the first file of its source; None of any other file."""
+    h5py = require("h5py", PURPOSE)
+    try:
+        with h5py.File(path if path.is_file() else "", "r") as file:
+            return str(file.attrs.get(SORTED_FROM))
+    except OSError:
+        return None
+
+
 def _write(
     snapshot: Snapshot, runs: list[tuple[int, int, int]], grid: Grid, counts: np.ndarray, path: Path, steps: _Steps
 ) -> None:
-    h5py = require("h5py", "writing HDF5 files")
+    h5py = require("h5py", PURPOSE)
     name, begins = f"PartType{snapshot.part_type}", np.cumsum(counts) - counts
-    with explained(snapshot.files[0], "HDF5"), h5py.File(snapshot.files[0], "r") as source, h5py.File(path, "w") as made:
-        for group in source:
-            if not group.startswith("PartType") and group != "Cells":
-                source.copy(group, made)
+    columns = _columns(snapshot, name, int(counts.sum()))
+    _make_room(snapshot.files[0], columns, path)
+    with h5py.File(path, "r+") as made:
+        made.attrs[SORTED_FROM] = snapshot.files[0].name
+        _copy_others(snapshot.files[0], made)
         _one_file(made, name, int(counts.sum()), snapshot.part_type)
-        columns = _columns(snapshot, name, made, int(counts.sum()))
+        targets = {}
+        for column, known in columns.items():
+            targets[column] = made[name].create_dataset(column, known.shape, known.dtype)
+            targets[column].attrs.update(known.attributes)
         cells = made.create_group("Cells")
         for part, numbers in (("Counts", counts), ("OffsetsInFile", begins)):
             cells.create_group(part)[name] = numbers
         free = begins.copy()
         for file, begin, end in runs:
-            with h5py.File(snapshot.files[file], "r") as opened:
-                group = opened[name]
-                cell = grid.cells_of(group["Coordinates"][begin:end])
-                order = np.argsort(cell, kind="stable")
-                which, first, number = np.unique(cell[order], return_index=True, return_counts=True)
-                for column, target in columns.items():
-                    rows = group[column][begin:end][order]
-                    for at, start, many in zip(free[which], first, number, strict=True):
-                        target[at : at + many] = rows[start : start + many]
-                free[which] += number
+            cell, rows = _rows(snapshot.files[file], name, slice(begin, end), grid, columns)
+            which, first, number = np.unique(cell, return_index=True, return_counts=True)
+            for column, target in targets.items():
+                for at, start, many in zip(free[which], first, number, strict=True):
+                    target[at : at + many] = rows[column][start : start + many]
+            free[which] += number
             steps.done()
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[Any]:
+    """An open file; what the system says of it is no trouble of the file that is written."""
+    try:
+        with opened(path) as file:
+            yield file
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}; it is needed until all of it is sorted") from error
+
+
+def _rows(path: Path, name: str, rows: slice, grid: Grid, columns: dict[str, Column]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The cells of some rows, ascending, and the rows of all columns in that order."""
+    with _reading(path) as file:
+        group = file[name]
+        cell = grid.cells_of(read_dataset(group["Coordinates"], rows))
+        order = np.argsort(cell, kind="stable")
+        found = {}
+        for column in columns:
+            if not holds(group, column):
+                raise DataError(f"has no {name}/{column}, which other files of the snapshot have; write it again")
+            values = read_dataset(member(group, column), rows)
+            if len(values) != len(cell):
+                raise DataError(f"{name}/{column} has other numbers of rows than there are particles; write it again")
+            found[column] = values[order]
+    return cell[order], found
+
+
+def _make_room(source: Path, columns: dict[str, Column], path: Path) -> None:
+    """An HDF5 file with nothing in it, as large as what will be written: HDF5 cuts off what it did not need."""
+    h5py = require("h5py", PURPOSE)
+    with h5py.File("empty", "w", driver="core", backing_store=False) as empty:
+        empty.flush()
+        path.write_bytes(empty.id.get_file_image())
+    with _reading(source) as file:
+        particles = sum(_stored(file[group]) for group in file if _is_written_anew(group))
+        linked = sum(_stored(file[group]) for group in file if _is_of(file, group, "ExternalLink"))
+    others = max(source.stat().st_size - particles, 0) + linked
+    data = sum(math.prod(column.shape) * column.dtype.itemsize for column in columns.values())
+    reserve(path, data + others + others // 4 + SLACK)
+
+
+def _is_written_anew(group: str) -> bool:
+    return group.startswith("PartType") or group == "Cells"
+
+
+def _is_of(file: Any, name: str, kind: str) -> bool:
+    return isinstance(file.get(name, getlink=True), getattr(require("h5py", PURPOSE), kind))
+
+
+def _stored(thing: Any) -> int:
+    """Bytes of all data sets of a group, as they are stored; views have none."""
+    found = [thing]
+    if hasattr(thing, "visititems"):
+        thing.visititems(lambda _, each: found.append(each))
+    return sum(each.id.get_storage_size() for each in found if hasattr(each, "is_virtual") and not each.is_virtual)
+
+
+def _copy_others(path: Path, made: Any) -> None:
+    """All that is not of particles; soft links stay what they are."""
+    with _reading(path) as source:
+        for name in source:
+            if _is_written_anew(name):
+                continue
+            if _is_of(source, name, "SoftLink"):
+                made[name] = source.get(name, getlink=True)
+            else:
+                source.copy(name, made)
 
 
 def _one_file(made: Any, name: str, count: int, part_type: int) -> None:
@@ -133,17 +243,16 @@ def _one_file(made: Any, name: str, count: int, part_type: int) -> None:
     made.create_group(name)
 
 
-def _columns(snapshot: Snapshot, name: str, made: Any, count: int) -> dict[str, Any]:
-    """Data sets to be filled, as the first file that has this type has them."""
-    h5py = require("h5py", "reading HDF5 files")
+def _columns(snapshot: Snapshot, name: str, count: int) -> dict[str, Column]:
+    """Columns to be filled, as the first file that has this type has them."""
     for path in snapshot.files:
-        with h5py.File(path, "r") as opened:
-            if name not in opened or "Coordinates" not in opened[name]:
+        with _reading(path) as file:
+            if name not in file or not holds(file[name], "Coordinates"):
                 continue
-            found = {}
-            for column, dataset in opened[name].items():
-                if getattr(dataset, "shape", None):
-                    found[column] = made[name].create_dataset(column, (count, *dataset.shape[1:]), dataset.dtype)
-                    found[column].attrs.update(dataset.attrs)
-            return found
+            found = {column: (dataset, shape_of(dataset)) for column, dataset in members(file[name]).items()}
+            return {
+                column: Column((count, *shape[1:]), dataset.dtype, dict(dataset.attrs))
+                for column, (dataset, shape) in found.items()
+                if shape
+            }
     return {}

@@ -150,6 +150,15 @@ def time_of(value: Any) -> float | None:
     return float(stored[0]) if usable else None
 
 
+def box_of(edges: np.ndarray) -> tuple[tuple[float, float, float] | None, list[str]]:
+    """Sides of a periodic box from one stored length or three; where they are none, a note that says so."""
+    if len(edges) not in (1, 3) or not (np.isfinite(edges) & (edges > 0)).all():
+        stored = ", ".join(f"{edge:g}" for edge in edges[:4].tolist())
+        return None, [f"not periodic: a box of {stored} (in the header) has no volume; `box=` or --box sets one"]
+    x, y, z = np.broadcast_to(edges, 3).tolist()
+    return (x, y, z), []
+
+
 def scalar_of_width_one(column: np.ndarray) -> np.ndarray:
     """(N,) for (N, 1), as VTK and many codes store scalars; any other shape as it is."""
     return column[:, 0] if column.ndim == 2 and column.shape[1] == 1 else column

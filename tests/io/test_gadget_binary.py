@@ -68,3 +68,28 @@ def test_a_tail_of_zeros_is_not_read_as_a_million_empty_blocks(form, samples, tm
         file.write(bytes(2**22))
     with pytest.raises(ValueError, match=r"a\.gadget: has more than 512 records .*at byte"):
         io.read_table(tmp_path / "a.gadget")
+
+
+MASS, BOX = 4 + 24, 4 + 128
+"""Where they stand in the header of format 1, after its first length and the counts."""
+
+
+def with_number(folder, samples, place, value):
+    samples.write_gadget_binary(folder / "a.gadget", samples.particles(), form=1)
+    content = bytearray((folder / "a.gadget").read_bytes())
+    content[place : place + 8] = np.float64(value).tobytes()
+    (folder / "a.gadget").write_bytes(content)
+    return folder / "a.gadget"
+
+
+@pytest.mark.parametrize("mass", [-1.0, np.nan, np.inf])
+def test_a_mass_in_the_header_that_is_none_is_refused(mass, samples, tmp_path):
+    with pytest.raises(ValueError, match=rf"a\.gadget: has mass {mass:g} for particles of type 0 in its header; correct"):
+        io.read_table(with_number(tmp_path, samples, MASS, mass))
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf, -1.0, 0.0])
+def test_a_box_that_is_none_is_said(size, samples, tmp_path):
+    table = io.read_table(with_number(tmp_path, samples, BOX, size))
+    said = any(f"not periodic: a box of {size:g}" in sentence for sentence in table.conventions)
+    assert table.box_size is None and said == (size != 0)

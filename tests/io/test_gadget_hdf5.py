@@ -110,3 +110,44 @@ def test_the_time_in_the_header_is_that_of_the_snapshot(stored, samples, tmp_pat
     with h5py.File(tmp_path / "a.hdf5", "r+") as file:
         file["Header"].attrs["Time"] = stored
     assert io.read_table(tmp_path / "a.hdf5").time == 0.25
+
+
+def with_header(path, samples, **attributes):
+    samples.write_gadget_hdf5(path, samples.particles())
+    with h5py.File(path, "r+") as file:
+        file["Header"].attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize("told", [[90, 0, 0, 0, 0, 0], [3], 6, np.array([8, 0], np.uint64)])
+def test_another_number_of_particles_in_the_header_is_refused(told, samples, tmp_path):
+    path = with_header(tmp_path / "a.hdf5", samples, NumPart_ThisFile=told)
+    number = np.ravel(told)[0]
+    with pytest.raises(
+        ValueError, match=rf"has 7 particles of type 0, but `NumPart_ThisFile` in its header says {number}; copy it"
+    ):
+        io.read_table(path)
+
+
+@pytest.mark.parametrize("told", [[7, 1, 0], [7], [], "seven"])
+def test_a_header_that_says_the_same_number_or_none_is_read(told, samples, tmp_path):
+    assert len(io.read_table(with_header(tmp_path / "a.hdf5", samples, NumPart_ThisFile=told))) == 7
+
+
+@pytest.mark.parametrize("mass", [-1.0, np.nan, np.inf])
+def test_a_mass_in_the_header_that_is_none_is_refused(mass, samples, tmp_path):
+    path = with_header(tmp_path / "a.hdf5", samples, MassTable=[mass, 1.0])
+    with pytest.raises(ValueError, match=rf"has mass {mass:g} for particles of type 0 in `MassTable` of its header; correct"):
+        io.read_table(path)
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf, -1.0, [1.0, 1.0, 0.0], [1.0, 2.0]])
+def test_a_box_that_is_none_is_said(size, samples, tmp_path):
+    table = io.read_table(with_header(tmp_path / "a.hdf5", samples, BoxSize=size))
+    assert table.box_size is None and any("not periodic: a box of" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("size", [0.0, [0.0, 0.0, 0.0]])
+def test_of_no_box_nothing_is_said(size, samples, tmp_path):
+    table = io.read_table(with_header(tmp_path / "a.hdf5", samples, BoxSize=size))
+    assert table.box_size is None and not any("box" in sentence for sentence in table.conventions)

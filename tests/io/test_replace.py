@@ -1,9 +1,13 @@
 import os
 import stat
+import subprocess
+import sys
+import time
 
 import pytest
 
-from jaxsph.io.replace import written_whole
+from jaxsph.io import replace
+from jaxsph.io.replace import MARK, STALE_SECONDS, written_whole
 
 
 def test_a_file_is_replaced_when_the_block_succeeds(tmp_path):
@@ -36,3 +40,55 @@ def test_others_may_read_the_file_as_far_as_the_user_wishes(tmp_path):
 def test_a_place_that_cannot_be_written_to_is_refused_by_name(where, why, tmp_path):
     with pytest.raises(ValueError, match=why), written_whole(tmp_path / where):
         pass
+
+
+@pytest.fixture(scope="module")
+def ended():
+    """The number of a process that has ended."""
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    return child.pid
+
+
+def leave(folder, name, days=2.0):
+    """A file that nobody has written to for some days."""
+    path = folder / name
+    path.write_text("half")
+    os.utime(path, (time.time() - days * STALE_SECONDS,) * 2)
+    return path
+
+
+def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_name(tmp_path, ended):
+    host = replace._host()
+    gone = [f".a-jaxsph-{host}-{ended:x}-0123abcd.txt", ".a-jaxsph-00000000-1-0123abcd.txt"]
+    kept = [
+        f".a-jaxsph-{host}-{os.getpid():x}-0123abcd.txt",  # at work
+        f".a-jaxsph-{host}-{os.getppid():x}-0123abcd.txt",
+        f".another-jaxsph-{host}-{ended:x}-0123abcd.txt",
+        f".a.b-jaxsph-{host}-{ended:x}-0123abcd.txt",
+        f".a-jaxsph-{host}-{ended:x}-0123abcd.png",
+        f"a-jaxsph-{host}-{ended:x}-0123abcd.txt",  # of a user
+        f".a-jaxsph-{host}-{ended:x}-0123abcd.bak.txt",
+        ".a.0123abcd.txt",
+        ".a.txt",
+    ]
+    for name in gone + kept:
+        leave(tmp_path, name)
+    fresh = leave(tmp_path, f".a-jaxsph-{host}-{ended:x}-f5e5f000.txt", days=0.9)
+    folder = tmp_path / f".a-jaxsph-{host}-{ended:x}-01234567.txt"
+    folder.mkdir()
+    os.utime(folder, (0, 0))
+    with written_whole(tmp_path / "a.txt") as temporary:
+        temporary.write_text("new")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", fresh.name, folder.name, *kept}
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a", "long" * 60 + ".txt", "\N{GREEK SMALL LETTER RHO}" * 120 + ".txt", "a.tar.txt"])
+def test_temporary_files_of_any_name_are_told_from_those_of_users(name, tmp_path):
+    with written_whole(tmp_path / name) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == (tmp_path / name).suffix and MARK.search(temporary.name)
+        leave(tmp_path, temporary.name)
+        replace._left_in.cache_clear()
+        replace._sweep(tmp_path / name)  # it is at work
+        assert temporary.exists()
+    assert [path.name for path in tmp_path.iterdir()] == [name]

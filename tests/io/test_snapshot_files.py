@@ -1,11 +1,14 @@
 """Snapshots in several files are read as one."""
 
+import os
+
 import h5py
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.io.snapshot_files import files_of
+from jaxsph.io.snapshot_rows import Snapshot
 
 
 def write(path, nth, total, gas, dark=2):
@@ -69,6 +72,40 @@ def test_a_name_without_its_number_is_read_alone_and_says_so(tmp_path):
 
 
 def test_names_of_files_of_a_snapshot_keep_their_suffix(tmp_path):
+    for number in range(2):
+        (tmp_path / f"snap.{number}").touch()
     assert [file.name for file in files_of(tmp_path / "snap.1", 2)] == ["snap.0", "snap.1"]
     assert files_of(tmp_path / "snap.hdf5", 2) is None
     assert files_of(tmp_path / "snap.7.hdf5", 2) is None
+
+
+@pytest.mark.parametrize("number", [5, 10**7, 2**31 - 1])
+def test_a_header_may_ask_for_any_number_of_files(number, tmp_path, measured):
+    write(tmp_path / "snap_002.0.hdf5", 0, number, 5)
+    for read in (js.io.read_table, Snapshot):
+        with measured() as memory, pytest.raises(ValueError) as caught:
+            read(tmp_path / "snap_002.0.hdf5")
+        missing = "snap_002.1.hdf5, snap_002.2.hdf5, snap_002.3.hdf5"
+        assert f"is one of {number} files of a snapshot; beside it {missing} and {number - 4} more cannot be" in str(caught.value)
+        assert memory.peak < 2**22
+
+
+def test_a_gadget_header_may_ask_for_any_number_of_files(samples, tmp_path, measured):
+    samples.write_gadget_binary(tmp_path / "snap_002.0.gadget", samples.particles(), form=1)
+    content = bytearray((tmp_path / "snap_002.0.gadget").read_bytes())
+    content[4 + 124 : 4 + 128] = (2**31 - 1).to_bytes(4, "little")  # `files` of the header
+    (tmp_path / "snap_002.0.gadget").write_bytes(content)
+    with measured() as memory, pytest.raises(ValueError, match=r"one of 2147483647 files .* snap_002\.1\.gadget"):
+        js.io.read_table(tmp_path / "snap_002.0.gadget")
+    assert memory.peak < 2**22
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")
+def test_what_is_no_regular_file_is_no_file_of_a_snapshot(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].unlink()
+    os.mkfifo(files[2])
+    (tmp_path / "snap_002.02.hdf5").touch()
+    (tmp_path / "snap_002.2.hdf5.bak").touch()
+    with pytest.raises(ValueError, match=r"beside it snap_002\.2\.hdf5 cannot be found"):
+        js.io.read_table(files[0])
