@@ -1,4 +1,4 @@
-"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target."""
+"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target (of a link, what it points to)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+
+MAX_STEM = 40
+"""Characters that the temporary file's name takes of the target's: a name as long as a disk takes has no room for more."""
 
 
 @contextlib.contextmanager
@@ -18,13 +22,13 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     Raises:
         ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if path.is_dir():
         raise ValueError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: the folder {path.parent} does not exist; make it first")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:MAX_STEM]}.", suffix=path.suffix, dir=path.parent)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error

@@ -36,3 +36,20 @@ def test_others_may_read_the_file_as_far_as_the_user_wishes(tmp_path):
 def test_a_place_that_cannot_be_written_to_is_refused_by_name(where, why, tmp_path):
     with pytest.raises(ValueError, match=why), written_whole(tmp_path / where):
         pass
+
+
+def test_of_a_link_the_file_that_it_points_to_is_written(tmp_path):
+    (tmp_path / "there").mkdir()
+    link = tmp_path / "link.png"
+    link.symlink_to("there/target.png")
+    for text in ("first", "second"):
+        with written_whole(link) as temporary:
+            temporary.write_text(text)
+        assert link.is_symlink() and (tmp_path / "there" / "target.png").read_text() == text
+
+
+def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
+    path = tmp_path / ("n" * 251 + ".txt")
+    with written_whole(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"
