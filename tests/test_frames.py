@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import pickle
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -170,3 +171,21 @@ def test_in_double_precision_all_is(tmp_path):
     with jax.enable_x64(True):
         path = js.CameraPath.orbit(center=(0, 0, 0), radius=2.0, degrees=30, width=8, height=8)
         assert path.at(2.0).dtype == np.float64
+
+
+def test_cameras_that_are_made_when_asked_for_are_looked_at_ahead():
+    from jaxsph.frames import AHEAD, _some
+
+    path = js.CameraPath.orbit(center=(0, 0, 0), radius=1, seconds=1)
+
+    class Lazy(Sequence):
+        asked = 0
+
+        def __len__(self):
+            return 1_000_000
+
+        def __getitem__(self, frame):
+            Lazy.asked += 1
+            return path.at(frame / 1_000_000)
+
+    assert len(_some(Lazy())) == AHEAD == Lazy.asked

@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-
 MAX_STEM = 40
 """Characters that the temporary file's name takes of the target's: a name as long as a disk takes has no room for more."""
 

@@ -248,7 +248,7 @@ def test_particles_are_chosen_after_all_have_made_volumes_and_supports(tmp_path)
 
 
 def test_what_is_nested_too_deeply_is_refused_in_one_line():
-    with pytest.raises(ConditionError, match="too deeply|cannot be read"):
+    with pytest.raises(ConditionError, match=r"too deeply|cannot be read"):
         select(TABLE, "not " * 900 + "(x > 0)")
 
 
