@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph import cli_cluster, cli_frames, cli_particles, cli_transfer, cli_where, io, scenes
 from jaxsph.cli_points import Together
-from jaxsph.console import UsageError, camera_line, progress, say, span
+from jaxsph.console import UsageError, camera_line, progress, say, span, tell_if_unseen
 from jaxsph.frame_task import FramesError, Source, Still
 from jaxsph.frames import render_frames
 from jaxsph.model import Camera, CameraPath, Scene, Settings
@@ -85,7 +85,7 @@ def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, o
     frames = _number_of_frames(options, path, number)
     cameras = _cameras(path, options, camera, shown, frames)
     sources: Still | Sequence[Source] = Still(scene) if snapshots is None else _moments(snapshots, frames)
-    say("camera", camera_line(cameras[0]))
+    say("camera", camera_line(cameras[0], options))
     folder = output.with_name(f"{output.stem}_frames")
     pattern = folder / f"{{:05d}}.{options.frame_format}"
     at_once = 1 if client is None else max(len(client.nthreads()), 1)
@@ -94,6 +94,8 @@ def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, o
     if files:
         io.write_movie(output, files, options.fps)
         _say_movie(output, len(files), frames, options.fps, cameras[0])
+        some = {files[0], files[len(files) // 2], files[-1]}
+        tell_if_unseen(options.command, output, [io.read_image(path).color for path in some])
     _require_all(failed, () if snapshots is None else snapshots.survey.unread)
 
 

@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from jaxsph.io.replace import written_whole
 
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
@@ -133,9 +135,14 @@ def _parsed(line: str, where: str) -> Measurement:
 
 
 def append(path: str | Path, measurement: Measurement) -> None:
-    """Add a line to a journal, and see it written; what an interrupted write left at its end is cut off first."""
+    """Add a line to a journal that does not hold this measurement yet, and see it written; one process at a time.
+
+    What an interrupted write left at its end is cut off first.
+    """
     line = json.dumps(dataclasses.asdict(measurement), allow_nan=False) + "\n"
-    with open(path, "ab+") as file:
+    with filelock.FileLock(Path(path).with_name(f".{Path(path).name}.lock")), open(path, "ab+") as file:
+        if measurement.key in {row.key for row in read_journal(path)}:  # another process was faster
+            return
         file.seek(0)
         file.truncate(file.read().rfind(b"\n") + 1)
         file.write(line.encode())

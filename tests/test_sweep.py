@@ -230,6 +230,13 @@ def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(row
         read_journal(path)
 
 
+def test_two_processes_that_measured_the_same_leave_one_line_of_it(rows, tmp_path):
+    path = tmp_path / JOURNAL
+    for row in (rows[0], rows[1], rows[0], rows[1]):
+        append(path, row)
+    assert read_journal(path) == rows[:2]
+
+
 def test_lines_from_before_there_was_an_integral_are_read(rows, tmp_path):
     new = {name: getattr(rows[1], name) for name in COLUMNS}
     old = {name: value for name, value in new.items() if not name.startswith("integral")}
