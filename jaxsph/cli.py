@@ -150,7 +150,7 @@ def _parser() -> argparse.ArgumentParser:
     cli_transfer.add_command(transfer)
     info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
     cli_options.add_source(info, optional=True, surface=False)
-    _add_parts(info)
+    _add_parts(info, mixed=False)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
     cli_disk.add_sort(command("sort", cli_disk.sort, "order a snapshot in space", "So that parts of it can be read alone."))
     cli_project.add_options(
@@ -177,10 +177,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_parts(parser: argparse.ArgumentParser) -> None:
+def _add_parts(parser: argparse.ArgumentParser, *, mixed: bool = True) -> None:
     cli_where.add_selection(parser)
     cli_volume.add_options(parser)
-    cli_points.add_options(parser)
+    cli_points.add_options(parser, mixed=mixed)
 
 
 def _render(options: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from jaxsph import scenes
 from jaxsph.model import Settings, registry
 
-SAMPLES = 256
+SAMPLES = Settings().samples
 INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registry.BOUNDING)
 
 

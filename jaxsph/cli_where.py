@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph import io
-from jaxsph.cli_options import SAMPLES
 from jaxsph.console import UsageError, say, span
 from jaxsph.io.slices import SUFFIXES
-from jaxsph.model import Camera, Image, Particles, Scene
+from jaxsph.model import Camera, Image, Particles, Scene, Settings
 from jaxsph.model.camera import Bounded
 from jaxsph.model.clip_shapes import Box, Plane, Sphere
 from jaxsph.model.clips import Clip
@@ -94,7 +93,7 @@ def _refuse_beside_slice(options: argparse.Namespace) -> None:
     """A slice looks straight at its plane, and casts no rays."""
     for name in NOT_OF_SLICES:
         given = getattr(options, name, None)
-        if given not in (None, False, []) and not (name == "samples" and given == SAMPLES):
+        if given not in (None, False, []) and not (name == "samples" and given == Settings().samples):
             raise UsageError(f"--{name.replace('_', '-')} and --slice exclude each other: a slice casts no rays; leave one out")
 
 
