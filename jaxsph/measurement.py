@@ -5,6 +5,7 @@ Flow: sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -12,8 +13,6 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
-
-import filelock
 
 from jaxsph.io.replace import written_whole
 
@@ -140,7 +139,8 @@ def append(path: str | Path, measurement: Measurement) -> None:
     What an interrupted write left at its end is cut off first.
     """
     line = json.dumps(dataclasses.asdict(measurement), allow_nan=False) + "\n"
-    with filelock.FileLock(Path(path).with_name(f".{Path(path).name}.lock")), open(path, "ab+") as file:
+    with open(path, "ab+") as file:
+        _lock(file)
         if measurement.key in {row.key for row in read_journal(path)}:  # another process was faster
             return
         file.seek(0)
@@ -148,6 +148,16 @@ def append(path: str | Path, measurement: Measurement) -> None:
         file.write(line.encode())
         file.flush()
         os.fsync(file.fileno())
+
+
+def _lock(file: Any) -> None:
+    """Wait until no other process adds to a file, until it is closed; where disks or systems have no locks, go on."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    with contextlib.suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def write_table(path: str | Path, measurements: Iterable[Measurement]) -> None:
