@@ -93,7 +93,8 @@ def _refuse_beside_slice(options: argparse.Namespace) -> None:
     """A slice looks straight at its plane, and casts no rays."""
     for name in NOT_OF_SLICES:
         given = getattr(options, name, None)
-        if given not in (None, False, []) and not (name == "samples" and given == Settings().samples):
+        left_out = given is None or given is False or (name == "samples" and given == Settings().samples)
+        if not left_out:
             raise UsageError(f"--{name.replace('_', '-')} and --slice exclude each other: a slice casts no rays; leave one out")
 
 
