@@ -20,7 +20,7 @@ import numpy as np
 from jaxsph import io
 from jaxsph.console import UsageError, say, span
 from jaxsph.io.slices import SUFFIXES
-from jaxsph.model import Camera, Image, Particles, Scene, Settings
+from jaxsph.model import Camera, Image, Particles, Scene
 from jaxsph.model.camera import Bounded
 from jaxsph.model.clip_shapes import Box, Plane, Sphere
 from jaxsph.model.clips import Clip
@@ -32,7 +32,7 @@ OF_FILES = ("where", "share", "box", "not_periodic", "center")
 OF_PARTICLES = (*OF_FILES, "slice")
 DENSEST = "densest"
 NOT_OF_SLICES = (
-    *("annotate", "eye", "target", "fov", "samples", "integrator", "tolerance", "estimator", "screen", "progressive", "relax"),
+    *("annotate", "eye", "target", "fov", "integrator", "tolerance", "estimator", "screen", "progressive", "relax"),
     *("opacity", "opacity_by", "memory", "devices", "from_disk", "volume", "points", "mix", "iso"),
 )
 """Options that do nothing to the picture of a plane."""
@@ -93,8 +93,7 @@ def _refuse_beside_slice(options: argparse.Namespace) -> None:
     """A slice looks straight at its plane, and casts no rays."""
     for name in NOT_OF_SLICES:
         given = getattr(options, name, None)
-        left_out = given is None or given is False or (name == "samples" and given == Settings().samples)
-        if not left_out:
+        if given is not None and given is not False:
             raise UsageError(f"--{name.replace('_', '-')} and --slice exclude each other: a slice casts no rays; leave one out")
 
 

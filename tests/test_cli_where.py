@@ -211,7 +211,7 @@ def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monk
     [
         ["--annotate"], ["--eye", 1, 2, 3], ["--target", 1, 2, 3], ["--fov", 30], ["--tolerance", 0.1], ["--progressive"],
         ["--opacity", 2], ["--opacity-by", "pressure"], ["--relax", 0], ["--screen", "quadtree"], ["--memory", 1],
-        ["--integrator", "samples"], ["--estimator", "pilot"], ["--samples", 16],
+        ["--integrator", "samples"], ["--estimator", "pilot"],
     ],
     ids=lambda beside: beside[0],
 )  # fmt: skip
