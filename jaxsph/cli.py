@@ -41,7 +41,19 @@ from jaxsph import (
     scenes,
 )
 from jaxsph.cli_progressive import render_in_stages
-from jaxsph.console import UsageError, camera_line, error_line, largest, largest_difference, progress, say, time_line
+from jaxsph.console import (
+    UsageError,
+    by_option,
+    camera_line,
+    error_line,
+    largest,
+    largest_difference,
+    progress,
+    say,
+    tell_if_unseen,
+    time_line,
+    warnings_in_lines,
+)
 from jaxsph.model import Camera, Settings
 
 IMAGE_SUFFIXES = (".exr", ".png")
@@ -64,14 +76,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             heard, as a caller may have set up JAX and signals otherwise.
     """
     try:
-        options = _parser().parse_args(arguments)
+        options, unknown = _parser().parse_known_args(arguments)
     except SystemExit as stop:  # --help, --version and what argparse refuses
         return int(stop.code or DONE)
     try:
+        if unknown:
+            raise UsageError(f"unrecognized arguments: {' '.join(unknown)}")
         with _ending_in_order(arguments is None):
             if arguments is None:
                 cli_cache.begin(keep=not options.no_cache)
-            options.run(options)
+            with warnings_in_lines(options.command, cli_cache.mended):
+                options.run(options)
     except _Terminated:
         return _failed(options, "terminated", TERMINATED)
     except KeyboardInterrupt:
@@ -80,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except UsageError as error:
-        return _failed(options, f"{error} (see `jaxsph {options.command} --help`)", WRONG_USAGE)
+        return _failed(options, f"{by_option(str(error))} (see `jaxsph {options.command} --help`)", WRONG_USAGE)
     except Exception as error:
         return _failed(options, _reason(error), FAILED)
     return DONE
@@ -129,7 +144,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return f"out of memory ({error}); try a smaller --size, fewer --samples or a lower --memory"
     if isinstance(error, ValueError | OSError | ImportError | RuntimeError):
-        return str(error) or type(error).__name__
+        return by_option(str(error)) or type(error).__name__
     return f"unexpected {type(error).__name__}: {error}; --debug shows where"
 
 
@@ -170,12 +185,12 @@ def _parser() -> argparse.ArgumentParser:
     cli_merge.add_options(command("merge", _merge, "make one image of its parts", cli_merge.MORE))
     transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
     cli_options.add_source(transfer)
-    cli_options.add_picture(transfer)
+    cli_options.add_picture(transfer, means=False)
     cli_transfer.add_looks(transfer)
     cli_transfer.add_command(transfer)
     info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
-    cli_options.add_source(info, optional=True)
-    _add_parts(info)
+    cli_options.add_source(info, optional=True, surface=False)
+    _add_parts(info, mixed=False)
     info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
     cli_disk.add_sort(command("sort", cli_disk.sort, "order a snapshot in space", "So that parts of it can be read alone."))
     cli_project.add_options(
@@ -202,10 +217,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_parts(parser: argparse.ArgumentParser) -> None:
+def _add_parts(parser: argparse.ArgumentParser, *, mixed: bool = True) -> None:
     cli_where.add_selection(parser)
     cli_volume.add_options(parser)
-    cli_points.add_options(parser)
+    cli_points.add_options(parser, mixed=mixed)
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -219,7 +234,7 @@ def _render_one(options: argparse.Namespace) -> None:
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0]
-    output = options.output or Path(Path(first.removeprefix(cli_scene.SCENE)).stem + cli_merge.suffix(options))
+    output = options.output or Path(cli_several.stem_of(first) + cli_merge.suffix(options))
     _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
     cli_annotate.check(options, output)
     cli_merge.check(options, settings, output)
@@ -232,7 +247,7 @@ def _render_one(options: argparse.Namespace) -> None:
     if options.slice is not None:
         cli_where.save_slice(scene, camera, options, output)
         return
-    say("camera", camera_line(camera))
+    say("camera", camera_line(camera, options))
     started = time.perf_counter()
     if options.progressive:
         image = render_in_stages(scene, camera, settings, output)
@@ -249,6 +264,8 @@ def _render_one(options: argparse.Namespace) -> None:
     if settings.tolerance is not None:
         say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
     say("time", time_line(image, elapsed))
+    if options.tile is None and (scene.particles is None or scene.particles.num_particles):
+        tell_if_unseen(options.command, output, [image.color])
 
 
 def _merge(options: argparse.Namespace) -> None:

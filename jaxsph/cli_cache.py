@@ -7,7 +7,9 @@ Where `JAX_COMPILATION_CACHE_DIR` names a folder, that is taken as it is, with a
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -58,6 +60,23 @@ def described() -> list[tuple[str, str]]:
     chosen = CHOSEN_BY_USER in os.environ
     bound = f"as {CHOSEN_BY_USER} names it, JAX's variables bound it" if chosen else f"at most {MAX_BYTES / 1e6:.0f} MB"
     return [("cache", str(place)), ("", f"{len(files)} compiled programs, {size / 1e6:.1f} MB; {bound}")]
+
+
+BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.-]+)'")
+
+
+def mended(warning: str) -> bool:
+    """Whether a warning of JAX is of an entry that cannot be read; such ones are removed, so that they are written anew.
+
+    JAX says of which program it is, not of which of its entries: all of them go.
+    """
+    found = BROKEN.match(warning)
+    if found is None:
+        return False
+    for path in folder().glob(f"{found[1]}-*-cache"):
+        with contextlib.suppress(OSError):  # another process may have removed it
+            path.rmdir() if path.is_dir() else path.unlink()
+    return True
 
 
 class _Notice:

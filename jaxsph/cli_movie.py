@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph import cli_cluster, cli_frames, cli_particles, cli_transfer, cli_where, io, scenes
 from jaxsph.cli_points import Together
-from jaxsph.console import UsageError, camera_line, progress, say, span
+from jaxsph.console import UsageError, camera_line, progress, say, span, tell_if_unseen
 from jaxsph.frame_task import FramesError, Source, Still
 from jaxsph.frames import render_frames
 from jaxsph.model import Camera, CameraPath, Scene, Settings
@@ -29,6 +29,8 @@ from jaxsph.survey import Reading, Survey, UnreadFile, surveyed
 MORE = "Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped."
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
+MAX_FRAMES = 1_000_000
+"""What a typing error goes beyond, and no movie: 11 hours at 24 frames a second."""
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
 
@@ -83,7 +85,7 @@ def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, o
     frames = _number_of_frames(options, path, number)
     cameras = _cameras(path, options, camera, shown, frames)
     sources: Still | Sequence[Source] = Still(scene) if snapshots is None else _moments(snapshots, frames)
-    say("camera", camera_line(cameras[0]))
+    say("camera", camera_line(cameras[0], options))
     folder = output.with_name(f"{output.stem}_frames")
     pattern = folder / f"{{:05d}}.{options.frame_format}"
     at_once = 1 if client is None else max(len(client.nthreads()), 1)
@@ -92,6 +94,8 @@ def _run(options: argparse.Namespace, settings: Settings, one_scene: OneScene, o
     if files:
         io.write_movie(output, files, options.fps)
         _say_movie(output, len(files), frames, options.fps, cameras[0])
+        some = {files[0], files[len(files) // 2], files[-1]}
+        tell_if_unseen(options.command, output, [io.read_image(path).color for path in some])
     _require_all(failed, () if snapshots is None else snapshots.survey.unread)
 
 
@@ -121,6 +125,8 @@ def _checked(options: argparse.Namespace) -> Path:
         raise UsageError(f"--fps must lie in (0, {io.movie.MAX_FPS:g}], got {options.fps:g}")
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames must be at least 1, got {options.frames}")
+    if (options.frames or 0) > MAX_FRAMES:
+        raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {_lasting(options)}")
     if options.orbit is not None and not (math.isfinite(options.orbit) and options.orbit):
         raise UsageError(f"--orbit must be degrees other than 0, got {options.orbit:g}")
     if options.progressive:
@@ -131,6 +137,11 @@ def _checked(options: argparse.Namespace) -> Path:
     if options.camera is not None and placed:
         raise UsageError(f"--{placed[0]} and --camera exclude each other; KEYS.json places the camera")
     return output
+
+
+def _lasting(options: argparse.Namespace) -> str:
+    hours = options.frames / options.fps / 3600
+    return f"that is {hours:,.4g} hours at --fps {options.fps:g}"
 
 
 def _choose_size(options: argparse.Namespace) -> None:
@@ -237,7 +248,12 @@ def _number_of_frames(options: argparse.Namespace, path: CameraPath | None, snap
     if options.frames is not None:
         return int(options.frames)
     if path is not None and path.end > path.start:
-        return round((path.end - path.start) * options.fps) + 1
+        seconds = path.end - path.start
+        if seconds * options.fps >= MAX_FRAMES:
+            long = f"lasts {seconds:g} s, from {path.start:g} to {path.end:g}, and times are seconds of the movie"
+            most = f"at --fps {options.fps:g} that is more than {MAX_FRAMES:,} frames"
+            raise ValueError(f"{options.camera}: {long}: {most}; correct the times, or give --frames")
+        return round(seconds * options.fps) + 1
     return max(snapshots, round(SECONDS * options.fps))
 
 
@@ -249,7 +265,22 @@ def _cameras(
         return [camera] * frames
     if path is None:
         path = _orbit(options, camera, shown, frames / options.fps)
-    return [path.at(path.start + frame / options.fps) for frame in range(frames)]
+    return _OnPath(path, options.fps, frames)
+
+
+class _OnPath(Sequence[Camera]):
+    """The cameras of a path, each made when it is asked for."""
+
+    def __init__(self, path: CameraPath, fps: float, frames: int) -> None:
+        self._path, self._fps, self._frames = path, fps, range(frames)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, frame: Any) -> Any:
+        if isinstance(frame, slice):
+            return [self[one] for one in self._frames[frame]]
+        return self._path.at(self._path.start + self._frames[frame] / self._fps)
 
 
 def _orbit(options: argparse.Namespace, camera: Camera, shown: Bounded, seconds: float) -> CameraPath:

@@ -11,10 +11,11 @@ from typing import Any
 from jaxsph import scenes
 from jaxsph.model import Settings, registry
 
+SAMPLES = Settings().samples
 INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registry.BOUNDING)
 
 
-def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
+def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False, surface: bool = True) -> None:
     """Options of the file or built-in scene, and what of it is shown."""
     number: dict[str, Any] = {"nargs": ("*" if optional else "+") if several else "?"} if optional or several else {}
     what = "file of particles or of a volume, or built-in scene" + ("; --points or --volume may stand for it" if optional else "")
@@ -27,21 +28,24 @@ def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, sever
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
     add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
-    add = parser.add_argument_group("volume of a file").add_argument
-    add("--iso", type=float, metavar="LEVEL", help="show the surface on which its values are LEVEL (--quantity: which values)")
+    if surface:
+        add = parser.add_argument_group("volume of a file").add_argument
+        more = "show the surface on which its values are LEVEL (--quantity: which values)"
+        add("--iso", type=float, metavar="LEVEL", help=more)
     add = parser.add_argument_group("particles of a built-in scene").add_argument
     add("--particles", type=int, metavar="N", help="how many")
     add("--frame", type=float, metavar="K", help="moment of the scene")
 
 
-def add_picture(parser: argparse.ArgumentParser) -> None:
-    """Options of size, colours and camera."""
+def add_picture(parser: argparse.ArgumentParser, *, means: bool = True) -> None:
+    """Options of size, colours and camera, and of the means by which rays are cast where they are."""
     maps, depth = ", ".join(scenes.appearance.COLORMAPS), scenes.appearance.OPTICAL_DEPTH
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
-    add("--samples", type=int, default=256, metavar="N", help="samples along a ray (default 256)")
-    integrator = Settings().integrator
-    add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
+    if means:
+        add("--samples", type=int, default=SAMPLES, metavar="N", help=f"samples along a ray (default {SAMPLES})")
+        integrator = Settings().integrator
+        add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
     add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
     add(
         "--range",
@@ -57,8 +61,9 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
     add("--target", **place, help="what it looks at (default: the middle of the particles)")
     add("--up", **place, help="upward direction (default 0 1 0)")
     add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
-    add = parser.add_argument_group("means").add_argument
-    add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
+    if means:
+        add = parser.add_argument_group("means").add_argument
+        add("--memory", type=float, metavar="GIB", help="working memory (default 4)")
 
 
 def add_control(parser: argparse.ArgumentParser) -> None:

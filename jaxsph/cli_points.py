@@ -55,7 +55,7 @@ class Together:
         return said
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser, *, mixed: bool = True) -> None:
     """Options of point sets."""
     group = parser.add_argument_group("points", "stars, galaxies, tracers: each of its own radius, colour and opacity")
     add = group.add_argument
@@ -66,8 +66,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--point-color", metavar="COLOR", help="R,G,B from 0 to 1, or a column (default: the file's, or white)")
     add("--point-colormap", metavar="NAME", help="shows a --point-color of one number a point (default heat)")
     add("--point-type", type=int, metavar="N", help="of a Gadget-like file, such as 4 for stars (default: gas, else the first)")
-    mix = "how parts mix their colours: by extinction, or as sums of colour times opacity (default extinction)"
-    add("--mix", choices=("extinction", "opacity"), help=mix)
+    if mixed:
+        mix = "how parts mix their colours: by extinction, or as sums of colour times opacity (default extinction)"
+        add("--mix", choices=("extinction", "opacity"), help=mix)
 
 
 def check_usage(options: argparse.Namespace) -> None:

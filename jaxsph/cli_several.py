@@ -44,7 +44,9 @@ def render_each(options: argparse.Namespace, render: Callable[[argparse.Namespac
 
 def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     """Where the picture of each goes: into a folder, or by a name with `{}` in it; here without."""
-    names = [Path(source.removeprefix(SCENE)).stem for source in sources]
+    names = [stem_of(source) for source in sources]
+    if len(set(names)) < len(names):  # equal names in two folders
+        names = [f"{Path(source).parent.name}_{name}".strip("_") for source, name in zip(sources, names, strict=True)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UsageError(f"two pictures would be called {twice}: render these files one by one, with -o")
@@ -55,6 +57,12 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     if output.suffix.lower() in (".png", ".exr"):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
+
+
+def stem_of(source: str) -> str:
+    """The name of a picture: that of its source, without a suffix; a number behind a point is none, as in `snap.00001`."""
+    path = Path(source.removeprefix(SCENE))
+    return path.name if path.suffix[1:].isdecimal() else path.stem
 
 
 def _alone(options: argparse.Namespace, source: str | None, output: Path | None) -> argparse.Namespace:

@@ -67,7 +67,7 @@ def look(shown: Particles | Volume, options: argparse.Namespace, quantity: str, 
     except ValueError as error:
         raise UsageError(str(error)) from error
     say("colours", f"{name} over {quantity} = {span(made.values)}, extinction {span(made.extinction)} per unit length")
-    _say_domain(made)
+    _say_domain(made, np.asarray(shown.quantity)[np.asarray(shown.valid)] if isinstance(shown, Particles) else shown.values)
     return made
 
 
@@ -106,10 +106,16 @@ def _made(
     return scenes.default_transfer(shown, name, options.range, depth, ramp=ramp), name
 
 
-def _say_domain(made: TransferFunction) -> None:
-    """How far colours are from the map's on an axis of logarithms."""
+def _say_domain(made: TransferFunction, shown: Any) -> None:
+    """Of an axis of logarithms: which values have none, and how far colours are from the map's."""
     values = np.asarray(made.values, np.float64)
     if len(values) > 2 and Scale.of(values).name == "log":
+        left_out, count = int((np.asarray(shown) <= 0).sum()), int(np.size(shown))
+        if left_out and values[0] > 0:
+            say(
+                "note",
+                f"{left_out:,} of {count:,} values are not positive and look as the lowest; see --domain symlog",
+            )
         off = log_departure(values, np.asarray(made.colors, np.float64))
         say(
             "",

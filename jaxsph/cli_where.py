@@ -31,6 +31,11 @@ from jaxsph.survey import Survey
 OF_FILES = ("where", "share", "box", "not_periodic", "center")
 OF_PARTICLES = (*OF_FILES, "slice")
 DENSEST = "densest"
+NOT_OF_SLICES = (
+    *("annotate", "eye", "target", "fov", "integrator", "tolerance", "estimator", "screen", "progressive", "relax"),
+    *("opacity", "opacity_by", "memory", "devices", "from_disk", "volume", "points", "mix", "iso"),
+)
+"""Options that do nothing to the picture of a plane."""
 CLIPS = ("clip_plane", "clip_box", "cut_box", "clip_sphere", "cut_sphere")
 
 
@@ -80,7 +85,16 @@ def settle(options: argparse.Namespace) -> None:
     if options.box is not None and not all(np.isfinite(side) and side > 0 for side in options.box):
         raise UsageError(f"--box must be three lengths > 0, got {' '.join(f'{side:g}' for side in options.box)}")
     clip_of(options)
-    plane_of_slice(options)
+    if plane_of_slice(options) is not None:
+        _refuse_beside_slice(options)
+
+
+def _refuse_beside_slice(options: argparse.Namespace) -> None:
+    """A slice looks straight at its plane, and casts no rays."""
+    for name in NOT_OF_SLICES:
+        given = getattr(options, name, None)
+        if given is not None and given is not False:
+            raise UsageError(f"--{name.replace('_', '-')} and --slice exclude each other: a slice casts no rays; leave one out")
 
 
 def _numbers(given: list[str]) -> list[float]:

@@ -5,9 +5,12 @@ Flow: particles, camera, image -> [console] -> cli.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import re
 import sys
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +19,87 @@ from jaxsph.io import ParticleTable
 from jaxsph.model import Camera, Image, Settings
 from jaxsph.model.registry import ESTIMATING
 
+DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.999
+OPTIONS = {
+    "values": "--range",
+    "low": "the low end of --range",
+    "optical_depth": "--opacity",
+    "fov_degrees": "--fov",
+    "name": "scene:NAME",
+    "num_particles": "--particles",
+}
+"""Options whose names in the library differ."""
+SAME = (
+    "samples",
+    "tolerance",
+    "relax",
+    "support",
+    "share",
+    "eye",
+    "target",
+    "up",
+    "frame",
+    "particles",
+    "domain",
+    "estimator",
+    "integrator",
+)
+
 
 class UsageError(Exception):
     """The command line asks for something that makes no sense."""
+
+
+def by_option(message: str) -> str:
+    """A message of the library whose first word is an argument, with the name of its option in place of that."""
+    found = re.match(r"`(\w+)`", message)
+    if found is None or found[1] not in (*OPTIONS, *SAME):
+        return message
+    return OPTIONS.get(found[1], f"--{found[1]}") + message[found.end() :]
+
+
+@contextlib.contextmanager
+def warnings_in_lines(command: str, hushed: Callable[[str], bool]) -> Iterator[None]:
+    """Warnings as lines of the command's own, but for those that are `hushed`.
+
+    NumPy's on arithmetic are left out: what comes of it is checked, and refused by name.
+    """
+
+    def told(message: Any, *_: Any, **__: Any) -> None:
+        if not hushed(str(message)):
+            tell(command, str(message))
+
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = told
+        yield
+
+
+def tell(command: str, text: str) -> None:
+    """Print a line on stderr that a command's user should see."""
+    print(f"jaxsph {command}: {' '.join(text.split())}", file=sys.stderr)
+
+
+def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
+    """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try."""
+    shown = [np.asarray(color, np.float64).reshape(-1, 3) for color in colors]
+    for beyond, what, remedy in (
+        (
+            lambda color: color.max(-1) < DARK,
+            f"darker than {DARK:.0%}",
+            "a larger --opacity, --opacity-by log10:NAME, or another camera",
+        ),
+        (
+            lambda color: color.min(-1) > BRIGHT,
+            f"brighter than {BRIGHT:.0%}",
+            "a smaller --opacity, or another --range or --colormap",
+        ),
+    ):
+        shares = [float(beyond(color).mean()) for color in shown if len(color)]
+        if shares and min(shares) >= NEARLY_ALL:
+            tell(
+                command, f"{output}: {min(shares):.4g} of the pixels are {what}; try {remedy}".replace(" 1 of the", " all of the")
+            )
 
 
 def largest(layer: Any) -> float:
@@ -87,13 +168,18 @@ def attributes(table: ParticleTable) -> None:
         print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
 
 
-def camera_line(camera: Camera) -> str:
-    """The options that give this camera again, and its depths."""
+def camera_line(camera: Camera, options: argparse.Namespace | None = None) -> str:
+    """The options that give this camera again, as they were given, and its depths."""
     eye, axes = camera.exact_eye(), np.asarray(camera.axes, np.float64)
     fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
     near, far = float(camera.near), float(camera.far)
-    target = eye + axes[2] * (near + far) / 2
-    place = " ".join(f"{v:.5g}" for v in eye) + " --target " + " ".join(f"{v:.5g}" for v in target)
+    given = [getattr(options, name, None) for name in ("eye", "target")]
+    computed = eye, eye + axes[2] * (near + far) / 2
+    texts = [
+        " ".join(f"{v:.5g}" for v in at) if said is None else " ".join(f"{v:.12g}" for v in said)
+        for at, said in zip(computed, given, strict=True)
+    ]
+    place = " --target ".join(texts)
     return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
 
 

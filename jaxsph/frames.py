@@ -86,9 +86,10 @@ def _require_client(client: Any) -> None:
 
 def _some(cameras: Any) -> Sequence[Camera]:
     """Cameras that are known ahead, evenly spread."""
-    if not isinstance(cameras, Sequence) or len({id(camera) for camera in cameras}) < 2:
+    if not isinstance(cameras, Sequence):
         return ()
-    return [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(AHEAD, len(cameras)))]
+    some = [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(AHEAD, len(cameras)))]
+    return some if len({id(camera) for camera in some}) > 1 else ()
 
 
 def _images(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[Image]:

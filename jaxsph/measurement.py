@@ -5,6 +5,7 @@ Flow: sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -134,14 +135,30 @@ def _parsed(line: str, where: str) -> Measurement:
 
 
 def append(path: str | Path, measurement: Measurement) -> None:
-    """Add a line to a journal, and see it written; what an interrupted write left at its end is cut off first."""
+    """Add a line to a journal that does not hold this measurement yet, and see it written; one process at a time.
+
+    What an interrupted write left at its end is cut off first.
+    """
     line = json.dumps(dataclasses.asdict(measurement), allow_nan=False) + "\n"
     with open(path, "ab+") as file:
+        _lock(file)
+        if measurement.key in {row.key for row in read_journal(path)}:  # another process was faster
+            return
         file.seek(0)
         file.truncate(file.read().rfind(b"\n") + 1)
         file.write(line.encode())
         file.flush()
         os.fsync(file.fileno())
+
+
+def _lock(file: Any) -> None:
+    """Wait until no other process adds to a file, until it is closed; where disks or systems have no locks, go on."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    with contextlib.suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def write_table(path: str | Path, measurements: Iterable[Measurement]) -> None:

@@ -1,7 +1,9 @@
 """The command line: what it writes, what it says, and how it refuses."""
 
+import argparse
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -142,10 +144,10 @@ WRONG_USAGE = [
     (["paint", "FILE"], "invalid choice"),
     (["render", "FILE", "--size", "0x4"], "at least 1 pixel"),
     (["render", "FILE", "--size", "big"], "640x480"),
-    (["render", "FILE", "--samples", "0"], "`samples` must be"),
+    (["render", "FILE", "--samples", "0"], "--samples must be"),
     (["render", "FILE", "--samples", "many"], "invalid int"),
     (["render", "FILE", "--integrator", "splat_bound"], "invalid choice"),
-    (["render", "FILE", "--tolerance", "-1"], "`tolerance`"),
+    (["render", "FILE", "--tolerance", "-1"], "--tolerance must be"),
     (["render", "FILE", "-o", "out.jpg"], ".exr or .png"),
     (["render", "FILE", "--target", "0", "0", "0"], "--target needs --eye"),
     (["render", "FILE", "--eye", "0", "0", "0", "--target", "0", "0", "0"], "must differ"),
@@ -243,3 +245,60 @@ def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(t
     assert len(stages) > 1
     assert all(said in stages[0] for said in ("estimated error", "rays cast", "left at most"))
     assert [file.name for file in tmp_path.iterdir() if file.suffix == ".png"] == ["stages.png"] and output.stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--range", 5, 1], 2, "--range must be two finite numbers"),
+        (["--opacity", -3], 2, "--opacity must be > 0"),
+        (["--fov", 200], 2, "--fov must lie in"),
+        (["--samples", 0], 2, "--samples must be"),
+        (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
+        (["--eye", 1e300, 0, 0], 2, "--eye"),
+        (["--box", 1e300, 1, 1], 1, ""),
+        (["--opacity", 1e300], None, "extinction"),
+        (["--qantity", "x"], 2, "(see `jaxsph render --help`)"),
+    ],
+    ids=str,
+)
+def test_messages_name_options_in_one_line(file, capsys, arguments, code, message):
+    got, _, err = run(capsys, "render", file, *TINY, *arguments)
+    assert len(err) == 1 and message in err[0], err
+    assert code is None or got == code
+
+
+def test_a_moment_beyond_all_numbers_is_refused_in_one_line(capsys):
+    code, _, err = run(capsys, "render", "scene:letters", "--frame", 1e300, *TINY)
+    assert code == 2 and len(err) == 1 and err[0].startswith("jaxsph render: --frame of scene 'letters'")
+
+
+def test_the_camera_line_gives_back_what_was_given(file, capsys):
+    from jaxsph.console import camera_line
+
+    camera = js.Camera.look_at((60, 50, 100), (0, 0, 0), near=90, far=1000)
+    given = argparse.Namespace(eye=[60.0, 50.0, 100.0], target=[0.0, 0.0, 0.0])
+    assert "--eye 60 50 100 --target 0 0 0 --fov 45" in camera_line(camera, given)
+    assert "--target 0 0 0" not in camera_line(camera)
+
+
+@pytest.mark.parametrize(("level", "said"), [(0.01, "darker than 5%"), (0.99, "brighter than 95%"), (0.5, "")])
+def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, said):
+    from jaxsph.console import tell_if_unseen
+
+    picture = np.full((40, 40, 3), level)
+    picture[0, 0] = 0.5
+    tell_if_unseen("render", "a.png", [picture])
+    err = capsys.readouterr().err
+    assert err.count("\n") == bool(said) and said in err and ("--opacity" in err) == bool(said)
+    tell_if_unseen("movie", "a.mp4", [picture, np.full((4, 4, 3), 0.5)])
+    assert capsys.readouterr().err == "", "one frame that is seen is enough"
+
+
+def test_a_missed_tolerance_is_a_line_of_the_command(capsys):
+    from jaxsph.console import warnings_in_lines
+
+    with warnings_in_lines("render", lambda _: False):
+        warnings.warn("3 of 9 pixels:\n the tolerance is not kept", stacklevel=1)
+        np.float32(1e38) * np.float32(1e38)
+    assert capsys.readouterr().err == "jaxsph render: 3 of 9 pixels: the tolerance is not kept\n"

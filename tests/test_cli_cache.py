@@ -3,10 +3,12 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 
 from jaxsph import cli_cache
+from jaxsph.console import warnings_in_lines
 
 RENDER = ["render", "scene:radial", "--particles", "200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
 COMPILING = "compiling for frames of this kind"
@@ -72,3 +74,40 @@ def test_a_folder_that_cannot_be_made_is_said_and_does_no_harm(command, tmp_path
 def test_the_folder_is_of_this_user_and_this_program(monkeypatch):
     monkeypatch.delenv(cli_cache.CHOSEN_BY_USER, raising=False)
     assert cli_cache.folder().name == "compiled" and "jaxsph" in str(cli_cache.folder())
+
+
+def test_entries_that_cannot_be_read_are_removed_and_no_warning_is_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(cli_cache.CHOSEN_BY_USER, str(tmp_path))
+    for name in ("jit_cast-ab-cache", "jit_cast-cd-cache", "jit_other-ab-cache"):
+        (tmp_path / name).write_bytes(b"garbage")
+    (tmp_path / "jit_cast-ef-cache").mkdir()
+    with warnings_in_lines("render", cli_cache.mended):
+        warnings.warn("Error reading persistent compilation cache entry for 'jit_cast': ValueError: no", stacklevel=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["jit_other-ab-cache"]
+    assert capsys.readouterr().err == ""
+
+
+def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypatch, capsys):
+    """In a process of its own, as JAX opens its cache once."""
+    script = """if True:
+        import sys, pathlib, jax, jax.numpy as jnp
+        from jaxsph import cli_cache
+        from jaxsph.console import warnings_in_lines
+        folder = pathlib.Path(sys.argv[1])
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+        with warnings_in_lines("render", cli_cache.mended):
+            jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
+            print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
+            for path in folder.glob("*-cache"):
+                path.write_bytes(b"garbage")
+            jax.clear_caches()
+            jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
+            print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
+    """
+    told = {**os.environ, cli_cache.CHOSEN_BY_USER: str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=told, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    kept, again = (int(count) for count in done.stdout.split())
+    assert kept == again > 0, "what was broken is written anew"

@@ -230,3 +230,12 @@ def test_key_frames_that_make_no_path_are_told_with_their_file(sequence, tmp_pat
     (tmp_path / "keys.json").write_text(json.dumps({"keys": keys}))
     code, _, err = run(capsys, *sequence, "--camera", "keys.json", *TINY)
     assert code == 1 and len(err) == 1 and said in err[0] and "keys.json" in err[0]
+
+
+def test_a_movie_without_end_is_refused_with_the_time_that_was_meant(sequence, tmp_path, capsys):
+    key = {"time": 0, "eye": [0, 0, 9], "target": [0, 0, 0]}
+    (tmp_path / "k.json").write_text(json.dumps({"keys": [key, key | {"time": 1e12, "eye": [0, 9, 1]}]}))
+    code, _, err = run(capsys, "s_0.npz", "--camera", "k.json", *TINY)
+    assert code == 1 and len(err) == 1 and "k.json" in err[0] and "lasts 1e+12 s" in err[0] and "--frames" in err[0]
+    code, _, err = run(capsys, "s_0.npz", "--orbit", 360, "--frames", 1_000_000_000, *TINY)
+    assert code == 2 and len(err) == 1 and "--frames must be at most 1,000,000" in err[0] and "hours" in err[0]

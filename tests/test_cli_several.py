@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsph.cli_several import outputs_of, render_each
+from jaxsph.cli_several import outputs_of, render_each, stem_of
 from jaxsph.console import UsageError
 
 
@@ -19,9 +19,18 @@ def test_pictures_are_named_after_their_files():
     assert outputs_of(["x.vtk", "y.vtk"], Path("out/{}_1.exr")) == [Path("out/x_1.exr"), Path("out/y_1.exr")]
 
 
+def test_numbers_behind_a_point_are_kept_in_names():
+    assert outputs_of(["run/snap.00001", "run/snap.00002"], None) == [Path("snap.00001.png"), Path("snap.00002.png")]
+    assert stem_of("snap.00001") == "snap.00001" and stem_of("scene:mixer") == "mixer" and stem_of("a/x.0.hdf5") == "x.0"
+
+
+def test_equal_names_in_two_folders_have_the_folders_before_them():
+    assert outputs_of(["a/s.npz", "b/s.npz"], Path("out/{}.exr")) == [Path("out/a_s.exr"), Path("out/b_s.exr")]
+
+
 @pytest.mark.parametrize(
     ("sources", "output", "message"),
-    [(["a/x.vtk", "b/x.vtk"], None, "called x"), (["x.vtk", "y.vtk"], Path("one.png"), r"one picture.*name with \{\}")],
+    [(["a/x.vtk", "a/x.npz"], None, "called a_x"), (["x.vtk", "y.vtk"], Path("one.png"), r"one picture.*name with \{\}")],
 )
 def test_names_that_clash_are_refused(sources, output, message):
     with pytest.raises(UsageError, match=message):

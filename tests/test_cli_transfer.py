@@ -127,3 +127,14 @@ def test_info_says_which_units_a_file_states(tmp_path, capsys):
         stored["particles/xyz"], stored["particles/h"] = np.eye(3), np.ones(3)
     code, out, _ = run(capsys, "info", tmp_path / "x.h5")
     assert code == 0 and "stated for positions, h, mass, density" in out and "t = " in out
+
+
+def test_values_that_a_logarithm_leaves_out_are_counted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
+    np.savez("drop.npz", position=position, heat=np.arange(60, dtype=np.float32) - 9, support=np.full(60, 0.8, np.float32))
+    more = ["--quantity", "heat", "--size", "24x16", "--rays", "9", "--opacity", "30"]
+    assert cli.main(["transfer", "drop.npz", "--domain", "log", *more]) == 0
+    assert "10 of 60 values are not positive" in capsys.readouterr().out
+    assert cli.main(["transfer", "drop.npz", "--domain", "symlog", *more]) == 0
+    assert "not positive" not in capsys.readouterr().out

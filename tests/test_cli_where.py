@@ -204,3 +204,17 @@ def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monk
     for source in ("scene:radial", "a.npy"):
         code, _, err = run(capsys, "render", source, *TINY, *option)
         assert code == 2 and len(err) == 1 and option[0] in err[0]
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        ["--annotate"], ["--eye", 1, 2, 3], ["--target", 1, 2, 3], ["--fov", 30], ["--tolerance", 0.1], ["--progressive"],
+        ["--opacity", 2], ["--opacity-by", "pressure"], ["--relax", 0], ["--screen", "quadtree"], ["--memory", 1],
+        ["--integrator", "samples"], ["--estimator", "pilot"],
+    ],
+    ids=lambda beside: beside[0],
+)  # fmt: skip
+def test_what_does_nothing_to_a_slice_is_refused_beside_it(file, capsys, beside):
+    code, _, err = run(capsys, "render", file, "--slice", 0.5, 0.5, 0.5, 0, 0, 1, *beside, "-o", "s.png")
+    assert code == 2 and len(err) == 1 and f"{beside[0]} and --slice exclude each other" in err[0]

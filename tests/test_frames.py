@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import pickle
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -196,3 +197,21 @@ def test_a_frame_of_which_a_bit_is_damaged_is_made_again(tmp_path):
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
         assert fingerprint_of(path) is None
+
+
+def test_cameras_that_are_made_when_asked_for_are_looked_at_ahead():
+    from jaxsph.frames import AHEAD, _some
+
+    path = js.CameraPath.orbit(center=(0, 0, 0), radius=1, seconds=1)
+
+    class Lazy(Sequence):
+        asked = 0
+
+        def __len__(self):
+            return 1_000_000
+
+        def __getitem__(self, frame):
+            Lazy.asked += 1
+            return path.at(frame / 1_000_000)
+
+    assert len(_some(Lazy())) == AHEAD == Lazy.asked

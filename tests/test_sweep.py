@@ -230,6 +230,13 @@ def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(row
         read_journal(path)
 
 
+def test_two_processes_that_measured_the_same_leave_one_line_of_it(rows, tmp_path):
+    path = tmp_path / JOURNAL
+    for row in (rows[0], rows[1], rows[0], rows[1]):
+        append(path, row)
+    assert read_journal(path) == rows[:2]
+
+
 def test_lines_from_before_there_was_an_integral_are_read(rows, tmp_path):
     new = {name: getattr(rows[1], name) for name in COLUMNS}
     old = {name: value for name, value in new.items() if not name.startswith("integral")}
@@ -386,7 +393,7 @@ def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
         (["-o", "out", "--repeats", "0"], "at least 1"),
         (["-o", "out", "--integral", "-1"], "at least 0"),
         (["-o", "out", "--integrator", "splat_bound"], "invalid choice"),
-        (["-o", "out", "--samples", "0"], "`samples` must be"),
+        (["-o", "out", "--samples", "0"], "--samples must be"),
         (["-o", "out", "--frames", "1", "1"], "different"),
         (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),
     ],

@@ -28,6 +28,7 @@ from jaxsph.model.camera import Bounded, Camera
 from jaxsph.model.camera_leg import Leg
 from jaxsph.model.camera_path import CameraPath
 
+from .json_text import read_json
 from .regular import regular_file
 from .replace import written_whole
 
@@ -76,10 +77,7 @@ def read_camera_path(
             `Camera.look_at` refuses.
     """
     file = regular_file(path)
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: is no JSON: {error}; repair it there") from error
+    found = read_json(file)
     try:
         return _path(found, width, height, None if shown is None else _corners(shown))
     except ValueError as error:
@@ -90,10 +88,13 @@ def _path(found: Any, width: int | None, height: int | None, corners: np.ndarray
     head = _known("a camera path", found, OF_PATH)
     if head.get("format", FORMAT) != FORMAT:
         raise ValueError(f'"format" must be "{FORMAT}", got {head["format"]!r}; `CameraPath.save` writes such files')
-    if head.get("version", VERSION) != VERSION:
+    if isinstance(head.get("version"), bool) or head.get("version", VERSION) != VERSION:
         raise ValueError(f'"version" is {head["version"]!r}, and this version of jaxsph reads {VERSION}')
     if ("legs" in head) == ("keys" in head):
         raise ValueError('must have "keys", or "legs" of which each has some')
+    for name in ("width", "height"):
+        if isinstance(head.get(name), bool) or not isinstance(head.get(name, SIZE), int):
+            raise ValueError(f'"{name}" must be a whole number of pixels, got {head[name]!r}')
     size = width or head.get("width", SIZE), height or head.get("height", SIZE)
     legs = head.get("legs", [{name: head[name] for name in OF_LEG if name in head}])
     if not isinstance(legs, list):
@@ -109,7 +110,9 @@ def _leg(leg: Mapping[str, Any], size: tuple[int, int], corners: np.ndarray | No
     times = tuple(_number(f"key {number}", "time", key) for number, key in enumerate(known, 1))
     cameras = tuple(_camera(f"key {number}", key, size, corners) for number, key in enumerate(known, 1))
     around = None if leg.get("around") is None else _vector("a leg", "around", leg)
-    return Leg(times, cameras, around, leg.get("ease", False) is True)
+    if not isinstance(leg.get("ease", False), bool):
+        raise ValueError(f'"ease" must be true or false, without quotes, got {leg["ease"]!r}')
+    return Leg(times, cameras, around, leg.get("ease", False))
 
 
 def _camera(what: str, key: Mapping[str, Any], size: tuple[int, int], corners: np.ndarray | None) -> Camera:

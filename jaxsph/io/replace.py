@@ -1,4 +1,4 @@
-"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target.
+"""Write a file whole or not at all: fill a temporary sibling, then rename it over the target (of a link, what it points to).
 
 A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
 that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
@@ -35,7 +35,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     Raises:
         ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if path.is_dir():
         raise ValueError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if not path.parent.is_dir():

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxsph.model.transfer import TransferFunction
 
+from .json_text import numbers_only, read_json
 from .regular import regular_file
 from .replace import written_whole
 
@@ -57,10 +58,7 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
             `TransferFunction.from_points` refuses.
     """
     file = regular_file(path)
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: is no JSON: {error}; repair it there, or save it again") from error
+    found = read_json(file)
     try:
         return TransferFunction.from_points(**_fields(found))
     except ValueError as error:
@@ -73,7 +71,7 @@ def _fields(found: Any) -> dict[str, Any]:
             f'is JSON, but no transfer function: "format" must be "{FORMAT}"; `TransferFunction.save` writes such files'
         )
     version = found.get("version")
-    if version != VERSION:
+    if isinstance(version, bool) or version != VERSION:
         newer = isinstance(version, int) and version > VERSION
         remedy = "update jaxsph" if newer else "save it again"
         raise ValueError(f'"version" is {version!r}, and this version of jaxsph reads {VERSION}; {remedy}')
@@ -91,8 +89,10 @@ def _fields(found: Any) -> dict[str, Any]:
 
 
 def _numbers(name: str, given: Any, dtype: str) -> np.ndarray:
+    numbers_only(name, given)
     try:
-        return np.asarray(given, np.float64).astype(dtype)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is refused as not finite
+            return np.asarray(given, np.float64).astype(dtype)
     except (TypeError, ValueError) as error:
         raise ValueError(f'"{name}" must hold numbers in rows of one length: {error}') from error
 

@@ -11,6 +11,7 @@ from typing import Any
 from .optional import require
 from .quantities import LOG_PREFIX, ROLES
 from .table import ParticleTable, plain
+from .unit_text import checked_unit
 from .units import BASE, LENGTH, TIME, VELOCITY, CodeUnit
 
 READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
@@ -64,11 +65,12 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None) -> tuple[
         ImportError: unyt is not installed.
         ValueError: `wanted` is no unit, or not one of the same dimension.
     """
+    known = None if wanted is None else checked_unit(wanted)
     unyt = require("unyt", "units by name", "units")
     amount = unyt.unyt_quantity(unit.cgs, _powers(unit, "*", "**", exact=True) or "dimensionless")
     left_in = _product([("a", unit.a), ("h", unit.h)], " ", "^")
-    if wanted is not None:
-        factor, name = _converted(unyt, amount, wanted, unit), wanted.replace("**", "^")
+    if wanted is not None and known is not None:
+        factor, name = _converted(unyt, amount, known, unit, wanted), wanted.replace("**", "^")
     else:
         factor, name = _chosen(amount, unit, abs(magnitude))
     return factor, f"{name} {left_in}".strip()
@@ -83,13 +85,14 @@ def _chosen(amount: Any, unit: CodeUnit, magnitude: float) -> tuple[float, str]:
     return next(((factor, name) for factor, name in reversed(factors) if factor * magnitude >= 1), factors[0])
 
 
-def _converted(unyt: Any, amount: Any, wanted: str, unit: CodeUnit) -> float:
+def _converted(unyt: Any, amount: Any, known: str, unit: CodeUnit, wanted: str) -> float:
+    """Numbers in the unit `known`, which was written as `wanted`, for one of `amount`."""
     try:
-        return float(amount.to_value(wanted))
+        return float(amount.to_value(known))
     except unyt.exceptions.UnitConversionError as error:
         own = _powers(unit, " ", "^") or "no dimension"
         raise ValueError(f"the unit {wanted!r} does not agree with the quantity, which is in {own} (CGS) in the file") from error
-    except unyt.exceptions.UnitParseError as error:
+    except Exception as error:  # of the library's parser, which raises many kinds
         raise ValueError(f"{wanted!r} is no unit that unyt knows: {error}; write it as 'Msun/kpc**3'") from error
 
 

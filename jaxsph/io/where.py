@@ -144,6 +144,7 @@ class Condition:
         if not text.strip():
             raise ConditionError("a condition is empty; give one such as 'Temperature > 1e4', or leave it out")
         self.text, self._table, self._density = re.sub(r"\s", " ", text), table, density
+        self._columns: dict[str, np.ndarray] = {}  # by name, as a density may take its time
         self._code = re.sub(r"`[^`]+`", lambda quoted: "_" * len(quoted[0]), self.text)  # a Python name that is as long
         try:
             with warnings.catch_warnings(action="ignore"):  # of Python's, on what looks odd to it
@@ -231,7 +232,9 @@ class Condition:
         if not isinstance(base, ast.Name):
             raise self._error("a point stands between the name of a vector and a component", self._start(node), node)
         try:
-            return quantity_named(self._table, name, density=self._density)
+            if name not in self._columns:
+                self._columns[name] = quantity_named(self._table, name, density=self._density)
+            return self._columns[name]
         except DataError as error:
             raise self._error(str(error), self._start(node), node) from error
 
@@ -246,18 +249,20 @@ class Condition:
         raise self._error(why, self._start(node), node)
 
     def _operated(self, node: ast.expr, operator: ast.AST, operands: list[ast.expr]) -> np.ndarray:
+        if isinstance(operator, ast.BitAnd | ast.BitOr):
+            return functools.reduce(LOGIC[type(operator)], map(self._tight, _chained(operator, operands)))
         for table, truth in ((LOGIC, True), (ARITHMETIC, False)):
             if type(operator) in table:
-                self._refuse_loose(operator, operands)
                 return np.asarray(table[type(operator)](*(self._of_kind(one, truth) for one in operands)))
         raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
 
-    def _refuse_loose(self, operator: ast.AST, operands: list[ast.expr]) -> None:
-        """`a > 1 & b < 2` is read as `a > (1 & b) < 2`."""
-        loose = [one for one in operands if isinstance(operator, ast.BitAnd | ast.BitOr) and self._value(one).dtype != bool]
-        if loose:
+    def _tight(self, node: ast.expr) -> np.ndarray:
+        """An operand of & or |, which must be a condition: `a > 1 & b < 2` is read as `a > (1 & b) < 2`."""
+        found = self._value(node)
+        if found.dtype != bool:
             why = "& and | come before comparisons: put those in brackets, or write and, or"
-            raise self._error(why, self._start(loose[0]), loose[0])
+            raise self._error(why, self._start(node), node)
+        return found
 
     def _compared(self, node: ast.Compare) -> np.ndarray:
         if not all(type(operator) in COMPARISONS for operator in node.ops):
@@ -274,3 +279,12 @@ class Condition:
         if len(node.args) != number or node.keywords:
             raise self._error(f"`{name}` is called with {number} number{'s' * (number > 1)}", self._start(node), node)
         return np.asarray(function(*(self._of_kind(one, False) for one in node.args)))
+
+
+def _chained(operator: ast.AST, operands: list[ast.expr]) -> list[ast.expr]:
+    """All that `a & b & c & ...` joins: it nests to the left, as deep as there are terms."""
+    first, *others = operands
+    while isinstance(first, ast.BinOp) and type(first.op) is type(operator):
+        others.insert(0, first.right)
+        first = first.left
+    return [first, *others]

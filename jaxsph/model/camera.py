@@ -148,6 +148,7 @@ class Camera:
             lower, upper = lower - 0.5, upper + 0.5
         middle = (lower + upper) / 2
         forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+        _check_up(forward, up)
         axes = np.asarray(_axes(forward, np.asarray(up, np.float64), np))
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower - middle
         local = corners @ axes.T
@@ -273,6 +274,13 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
     return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)
 
 
+def _check_up(forward: Any, up: Any) -> None:
+    """Raise where no picture has this direction upwards; `forward` is of length 1."""
+    up = np.asarray(up, np.float64)
+    if up.shape == (3,) and not np.linalg.norm(np.cross(forward, up)) > 1e-9 * np.linalg.norm(up):
+        raise ValueError(f"`up` = {up.tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)")
+
+
 def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:
     for name, vector in (("eye", eye), ("target", target), ("up", up)):
         vector = np.asarray(vector, np.float64)
@@ -283,11 +291,9 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
     length = np.linalg.norm(forward)
     if length == 0:
         raise ValueError(f"`target` must differ from `eye`, both are {np.asarray(eye).tolist()}; move one of them")
-    side = np.linalg.norm(np.cross(forward / length, np.asarray(up, np.float64)))
-    if not side > 1e-9 * np.linalg.norm(up):
-        raise ValueError(
-            f"`up` = {np.asarray(up).tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)"
-        )
+    if not np.isfinite(length):
+        raise ValueError(f"`eye` = {np.asarray(eye).tolist()} is too far from `target` for float64; move one of them")
+    _check_up(forward / length, up)
     near, far = float(near), float(far)
     if not (np.isfinite(near) and np.isfinite(far) and near < far):
         raise ValueError(

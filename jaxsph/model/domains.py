@@ -161,11 +161,21 @@ def _log(asked: _Asked) -> np.ndarray:
             raise ValueError(f"`{name}` = {end:g} must be > 0 for the domain 'log'{least}; {remedy}")
     if asked.values is not None and not positive.size and None in (asked.low, asked.high):
         raise ValueError("the domain 'log' needs positive values, and the quantity has none; use 'symlog' or 'linear'")
+    _refuse_single(asked, positive)
     low, high = (None if end is None else float(np.log(end)) for end in (asked.low, asked.high))
     values = None if asked.values is None else np.log(positive)
     first, last = asked._replace(values=values, low=low, high=high).ends()
     made = np.exp(first + (last - first) * asked.place)
     return _with_ends(made, asked.low, asked.high)
+
+
+def _refuse_single(asked: _Asked, positive: np.ndarray) -> None:
+    """One positive value beside others gives no range to choose."""
+    others = 0 if asked.values is None else asked.values.size - positive.size
+    if others and None in (asked.low, asked.high) and positive.min() == positive.max():
+        count = f"{others:,} of {others + positive.size:,} are not positive"
+        what = f"{positive.min():g} is the only positive value of the quantity, {count}"
+        raise ValueError(f"the domain 'log' finds no range: {what}; use 'symlog' or 'linear'")
 
 
 def _symlog(asked: _Asked) -> np.ndarray:

@@ -38,6 +38,8 @@ SINKING, SPREAD = 0.12, 0.12
 
 SWELL, SWELL_WIDTH, SWELL_SPEED = 0.35, 0.12, 1.4
 """Height over the water's depth, width in metres and speed in metres a second, of the ring that a letter raises."""
+LATEST = 10_000
+"""The last moment: all has long been at rest."""
 
 
 def letters(
@@ -50,8 +52,8 @@ def letters(
     frame 3.5.
     """
     moment = 3.5 if frame is None else float(frame)
-    if not (np.isfinite(moment) and moment >= 0):
-        raise ValueError(f"`frame` of scene 'letters' must be >= 0 and finite, got {frame!r}")
+    if not 0 <= moment <= LATEST:
+        raise ValueError(f"`frame` of scene 'letters' must be >= 0 and at most {LATEST:,}, got {frame!r}")
     count = PARTICLES if particles is None else particles
     lower, upper = np.asarray(BASIN)
     volumes = [float((upper - lower).prod()), *(area(name) * HEIGHT**2 * THICKNESS for name in GLYPHS)]

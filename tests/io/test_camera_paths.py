@@ -69,6 +69,11 @@ def test_what_is_left_out_is_of_the_box_that_is_shown_and_of_the_size_asked_for(
         ({"keys": [{name: KEY[name] for name in KEY if name != "far"}]}, "lacks `far`"),
         ({"keys": [KEY], "width": 0}, "width"),
         ({"keys": [KEY], "version": 9}, "version"),
+        ({"keys": [KEY], "version": True}, "version"),
+        ({"keys": [KEY], "ease": "yes"}, '"ease" must be true or false'),
+        ({"keys": [KEY], "width": "20"}, '"width" must be a whole number'),
+        ({"keys": [KEY], "height": True}, '"height" must be a whole number'),
+        ({"keys": [KEY | {"time": 10**400}]}, "401 digits"),
         ({"keys": [KEY], "format": "other"}, "format"),
     ],
 )

@@ -92,3 +92,20 @@ def test_temporary_files_of_any_name_are_told_from_those_of_users(name, tmp_path
         replace._sweep(tmp_path / name)  # it is at work
         assert temporary.exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_of_a_link_the_file_that_it_points_to_is_written(tmp_path):
+    (tmp_path / "there").mkdir()
+    link = tmp_path / "link.png"
+    link.symlink_to("there/target.png")
+    for text in ("first", "second"):
+        with written_whole(link) as temporary:
+            temporary.write_text(text)
+        assert link.is_symlink() and (tmp_path / "there" / "target.png").read_text() == text
+
+
+def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
+    path = tmp_path / ("n" * 251 + ".txt")
+    with written_whole(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"

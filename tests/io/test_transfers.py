@@ -74,6 +74,12 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path, monkeypatch):
         ({"extinction": [0, -1]}, "never a gain"),
         ({"colors": [[0, 0], [1]]}, "rows of one length"),
         ({"values": ["a", "b"]}, "numbers"),
+        ({"values": ["0", "1"]}, "without quotes"),
+        ({"values": [False, True]}, "numbers"),
+        ({"colors": [[0, 0, 0], [1, 1, True]]}, "numbers"),
+        ({"version": True}, "True"),
+        ({"values": [0, 10**400]}, "401 digits"),
+        ({"values": [0, 1e39]}, "finite"),
     ],
 )
 def test_what_is_no_transfer_function_is_refused_by_file_and_reason(tmp_path, changes, said):

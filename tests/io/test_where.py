@@ -61,6 +61,10 @@ MEANT = {
     "1 < 2": np.ones(COUNT, bool),
     "sqrt(x) >= 0": X >= 0,  # what is no number meets no comparison
     " and ".join(["`x` > 0"] * 150): X > 0,
+    "&".join(["(x>0)"] * 600): X > 0,
+    "|".join(["(x>0)"] * 600): X > 0,
+    "(" * 40 + "(x > 0) " + "& (y > 0)) " * 40: (X > 0) & (Y > 0),
+    "(x > 0) & " + "((y > 0) | " * 30 + "(y > 0)" + ")" * 30: (X > 0) & (Y > 0),
 }
 
 
@@ -241,3 +245,19 @@ def test_particles_are_chosen_after_all_have_made_volumes_and_supports(tmp_path)
         assert np.array_equal(column[T > 1e4], some[name]), name
     with pytest.raises(ConditionError, match=r"a\.npz: the condition"):
         io.read_particles(tmp_path / "a.npz", where="entropy > 1")
+
+
+def test_what_is_nested_too_deeply_is_refused_in_one_line():
+    with pytest.raises(ConditionError, match=r"too deeply|cannot be read"):
+        select(TABLE, "not " * 900 + "(x > 0)")
+
+
+def test_a_density_is_summed_once_however_often_it_is_named():
+    asked = []
+
+    def density():
+        asked.append(1)
+        return RHO
+
+    select(io.ParticleTable(TABLE.position), " & ".join(["(density > 0)"] * 5), density=density)
+    assert len(asked) == 1
