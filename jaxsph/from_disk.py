@@ -35,7 +35,7 @@ from jaxsph.numerics import free_memory
 from jaxsph.numerics.executors import Clock
 from jaxsph.on_disk import MOST_EXTREMES, Columns, OnDisk
 from jaxsph.panes import CROWDED, Crowd, Need, Pane, Sides, cut_to_fit
-from jaxsph.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands
+from jaxsph.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
 from jaxsph.render import Progress, image_of
 from jaxsph.tiles import joined, of_columns, of_rows
@@ -205,7 +205,7 @@ class _Renderer:
             crowd.count(position, support)
         need = crowd.fullest(self.whole_rows)
         need = need._replace(particles=need.particles + MOST_EXTREMES)
-        frame = self._frame_bytes(need)
+        frame = self._smallest(need).bytes
         given = {"memory": (self.memory, frame + self._read_bytes(need)), "settings.memory_limit": (self._limit, frame)}
         for name, (allowed, least) in given.items():
             if allowed < least:
@@ -221,19 +221,20 @@ class _Renderer:
         return self.settings.memory_limit or self.memory
 
     def _fits(self, need: Need) -> float:
-        """How many times what is needed there is, in bands of one row of tiles."""
-        frame = self._frame_bytes(need)
-        return min(self.memory / (frame + self._read_bytes(need)), self._limit / frame)
+        """How many times what is needed there is, in bands of one row of tiles and least batches."""
+        least = self._smallest(need)
+        return min(self.memory / (least.bytes + self._read_bytes(need)), self._limit / least.bytes)
 
     def _read_bytes(self, need: Need) -> int:
         return READ_BYTES * capacity_class(need.particles)
 
-    def _frame_bytes(self, need: Need) -> int:
+    def _smallest(self, need: Need) -> Plan:
+        """The plan that takes least of all."""
         tile_rows, tile_columns = -(-need.height // TILE), -(-self.camera.width // TILE)
         tiles, bundles = (np.full(tile_rows, count) for count in (need.tile_pairs, need.bundle_pairs))
         measures = Measures(tiles, bundles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
         shape = self._shape_of(self._shape, need.height, capacity_class(need.particles))
-        return in_bands(measures, shape, self._along, self._choices, tile_rows).bytes
+        return smallest(measures, shape, self._along, self._choices)
 
     def _shape_of(self, shape: FrameShape, height: int, capacity: int) -> FrameShape:
         return dataclasses.replace(shape, height=height, num_particles=capacity, num_classes=self._classes, headroom=1.0)
@@ -272,9 +273,10 @@ class _Renderer:
         given, roomy = (along, self._choices), dataclasses.replace(shape, headroom=CROWDED)
         kept = self.plans.get((shape.height, shape.num_particles))
         if kept is not None:
-            if kept.serves(in_bands(needed, shape, *given, kept.bands)):
+            sizes = kept.bands, kept.cast.batch_slabs
+            if kept.serves(in_bands(needed, shape, *given, *sizes)):
                 return kept
-            grown = kept.grown(in_bands(needed, roomy, *given, kept.bands))
+            grown = kept.grown(in_bands(needed, roomy, *given, *sizes))
             kept = dataclasses.replace(grown, bytes=bytes_of(grown, shape.number))
         if kept is not None and kept.bytes <= limit:
             made: Plan | None = kept

@@ -10,20 +10,19 @@ is room.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.access.lists import BUNDLE, TILE
 from jaxsph.model.camera import Camera
-from jaxsph.model.frusta import SLACK, seen_by
+from jaxsph.model.frusta import SLACK
 
 CROWDED = 1.25
 """Times as many particles as the sample has it there is room for in a pane."""
-MIN_SHRINKING, MAX_SHRINKING = 0.5, 0.9
+MIN_SHRINKING, MAX_SHRINKING = 0.5, 0.8
 """What is left, at least and at most, of the room for particles where panes need more than there is memory for."""
-AT_ONCE = 1 << 14
-"""Particles that are tried against all tiles at once."""
 
 
 class Pane(NamedTuple):
@@ -144,15 +143,30 @@ class _PairsOfTiles:
 def _touching(sides: Sides, side: int, size: tuple[int, int]) -> np.ndarray:
     """How many particles touch each square of so many pixels on a side, of all the tiles of an image: rows and columns."""
     rows, columns = (-(-pixels // TILE) * TILE // side for pixels in size)
-    left, right, top, bottom = (pixels // side for pixels in sides)
-    found = np.zeros((rows + 1, columns + 1), np.int64)
+    return _boxes(Sides(*(pixels // side for pixels in sides)), (rows, columns))
+
+
+def _boxes(sides: Sides, size: tuple[int, int]) -> np.ndarray:
+    """How many boxes of squares cover each square."""
+    left, right, top, bottom = sides
+    found = np.zeros((size[0] + 1, size[1] + 1), np.int64)
     for row, column, sign in ((top, left, 1), (top, right + 1, -1), (bottom + 1, left, -1), (bottom + 1, right + 1, 1)):
         np.add.at(found, (row, column), sign)
     return found.cumsum(0).cumsum(1)[:-1, :-1]
 
 
+def _edges(place: Callable[[Any], Any], pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of each row or column of tiles, and a pixel around, as `frusta.seen_by` has them."""
+    begins = np.arange(0, pixels, TILE)
+    ends = np.minimum(begins + TILE, pixels)
+    both = [np.array([float(place(jnp.asarray(pixel))) for pixel in side]) for side in (begins - 1, ends + 1)]
+    return np.minimum(*both), np.maximum(*both)
+
+
 class Crowd:
-    """How many of all particles are read for each least pane, a tile or a row of tiles: counted a few at a time.
+    """How many of all particles are read for each least pane, a tile or a row of tiles: counted some at a time.
+
+    Counted are all that `frusta.Planes` takes for seen by these pixels, and a few more: none that are read is missed.
 
     Args:
         camera: whose tiles they are.
@@ -160,24 +174,40 @@ class Crowd:
     """
 
     def __init__(self, camera: Camera, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+        self._camera, self._size = camera, (camera.height, camera.width)
         farthest = max(float(np.abs(corner - origin).max()) for corner in bounds for origin in (0.0, camera.exact_eye()))
-        self._slack = 2 * SLACK * farthest  # as much as any others that these are read with may cause
-        rows, columns = (range(0, pixels, TILE) for pixels in (camera.height, camera.width))
-        self._rows = [seen_by(camera, row, min(row + TILE, camera.height), 0, camera.width) for row in rows]
-        self._columns = [seen_by(camera, 0, camera.height, column, min(column + TILE, camera.width)) for column in columns]
-        self.of_tiles = np.zeros((len(self._rows), len(self._columns)), np.int64)
-        self.of_rows = np.zeros(len(self._rows), np.int64)
+        self._slack = 2 * SLACK * farthest
+        self._edges = _edges(camera.row, camera.height), _edges(camera.column, camera.width)
+        self.of_tiles = np.zeros([len(low) for low, _ in self._edges], np.int64)
+        self.of_rows = np.zeros(len(self.of_tiles), np.int64)
 
     def count(self, position: np.ndarray, support: np.ndarray) -> None:
         """Add some particles."""
-        for begin in range(0, len(position), AT_ONCE):
-            some = slice(begin, begin + AT_ONCE)
-            given = position[some].astype(np.float64), support[some].astype(np.float64) + self._slack
-            rows, columns = (
-                np.stack([planes.meet(*given) for planes in side], 1).astype(np.float32) for side in (self._rows, self._columns)
-            )
-            self.of_tiles += (rows.T @ columns).astype(np.int64)
-            self.of_rows += rows.sum(0).astype(np.int64)
+        reach = support.astype(np.float64) * (1 + SLACK) + self._slack
+        across, up, depth = ((position - self._camera.exact_eye()) @ np.asarray(self._camera.axes, np.float64).T).T
+        kept = (depth + reach >= float(self._camera.near)) & (depth - reach <= float(self._camera.far))
+        tiles = []
+        for place, (low, high) in zip((up, across), self._edges, strict=True):
+            least, most = self._between(place, depth, reach)
+            first, last = np.searchsorted(np.sort(high), least, "left"), np.searchsorted(np.sort(low), most, "right") - 1
+            descending = high[0] > high[-1]
+            tiles.append((len(high) - 1 - last, len(high) - 1 - first) if descending else (first, last))
+            kept &= first <= last
+        (top, bottom), (left, right) = ([side[kept] for side in ends] for ends in tiles)
+        self.of_tiles += _boxes(Sides(left, right, top, bottom), self.of_tiles.shape)
+        nothing = np.zeros_like(top)
+        self.of_rows += _boxes(Sides(nothing, nothing, top, bottom), (len(self.of_rows), 1))[:, 0]
+
+    def _between(self, place: np.ndarray, depth: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Between which coordinates on the image plane spheres are seen: tangents from the eye, all where these are behind it."""
+        if not self._camera.is_perspective:
+            return place - reach, place + reach
+        beyond = depth**2 - reach**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wide = reach * np.sqrt(place**2 + beyond)
+            least, most = (place * depth - wide) / beyond, (place * depth + wide) / beyond
+        outside = (beyond > 0) & (depth > 0)
+        return np.where(outside, least, -np.inf), np.where(outside, most, np.inf)
 
     def fullest(self, whole_rows: bool) -> Need:
         """What suffices for each of the least panes; a particle has up to four bundles in a tile."""
