@@ -51,11 +51,17 @@ FRAME_SHARE = 0.2
 
 
 class TooLittleMemoryError(ValueError):
-    """No cut into panes fits the memory; with `least` bytes the finest does."""
+    """No cut into panes fits the memory.
 
-    def __init__(self, message: str, least: int) -> None:
-        super().__init__(message)
-        self.least = least
+    Attributes:
+        name: `"memory"` or `"settings.memory_limit"`, whichever is too little.
+        least: bytes of it with which the finest cut fits.
+        why: what needs so many.
+    """
+
+    def __init__(self, name: str, given: int, least: int, why: str) -> None:
+        super().__init__(f"`{name}` = {given} bytes is too little: {why}, which need {least:,}; give more, or look closer")
+        self.name, self.least, self.why = name, least, why
 
 
 def render_from_disk(
@@ -85,8 +91,8 @@ def render_from_disk(
         `stats["most_particles"]` say how many panes there were, and how many particles the fullest had.
 
     Raises:
-        ValueError: memory that does not suffice for a single tile (how much does), a screen or an integrator that
-            needs all particles; as `jaxsph.render`.
+        TooLittleMemoryError: a `ValueError`: memory that does not suffice for a single tile, and how much does.
+        ValueError: a screen or an integrator that needs all particles; as `jaxsph.render`.
     """
     settings = settings or Settings()
     if settings.screen == "quadtree":
@@ -209,11 +215,8 @@ class _Renderer:
         given = {"memory": (self.memory, frame + self._read_bytes(need)), "settings.memory_limit": (self._limit, frame)}
         for name, (allowed, least) in given.items():
             if allowed < least:
-                raise TooLittleMemoryError(
-                    f"`{name}` = {allowed} bytes is too little: {LEAST[self.whole_rows]} see up to {need.particles:,} particles, "
-                    f"which need {least:,}; give more, or look closer",
-                    least,
-                )
+                why = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles"
+                raise TooLittleMemoryError(name, allowed, least, why)
 
     @property
     def _limit(self) -> int:

@@ -24,6 +24,10 @@ RUN = 1 << 14
 """Rows of a run: the least that is read."""
 READ = 1 << 17
 """Rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run."""
+OTHER_FORMAT = (
+    "is not a Gadget-like HDF5 snapshot, all that `--from-disk`, `OnDisk.open` and `sort` can read, as they read "
+    "some rows at a time; render it as a whole, without `--from-disk`"
+)
 
 
 class Snapshot:
@@ -42,9 +46,11 @@ class Snapshot:
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such file")
         h5py = require("h5py", "reading HDF5 files")
+        if not path.is_file() or not h5py.is_hdf5(path):
+            raise DataError(f"{path}: {OTHER_FORMAT}")
         with explained(path, "HDF5"), h5py.File(path, "r") as file:
             if not any(name.startswith("PartType") for name in file):
-                raise DataError("is not a Gadget-like HDF5 snapshot; particles of other formats are read as a whole")
+                raise DataError(OTHER_FORMAT)
             first = gadget_hdf5.from_hdf5(file, part_type, slice(0, 1))
         assert first.part_type is not None
         self.part_type: int = first.part_type
