@@ -206,7 +206,7 @@ class _Renderer:
 
     def _require_least(self) -> None:
         """Raise where the least panes do not fit: all particles are read once, to count them."""
-        crowd = Crowd(self.camera, self.on_disk.bounds())
+        crowd = Crowd(self.camera, self.on_disk.index.bounds())
         for position, support, *_ in self.on_disk.all_seen_by(seen_by(self.camera, 0, self.camera.height, 0, self.camera.width)):
             crowd.count(position, support)
         need = crowd.fullest(self.whole_rows)

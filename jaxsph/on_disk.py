@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.io.assemble import opacity_of
+from jaxsph.io.assemble import in_box, opacity_of
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
 from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
@@ -97,8 +97,12 @@ class OnDisk:
         return len(self.index)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """See `Camera.framing`."""
-        return self.index.bounds()
+        """See `Camera.framing`: those of the particles in memory, of a periodic box its own."""
+        if not len(self):
+            return self.index.bounds()
+        corners = np.stack([self.index.lower.min(0), self.index.upper.max(0)])
+        boxed, _ = in_box(dataclasses.replace(self.snapshot.first, position=corners, columns={}, support=None), "file")
+        return self.index.bounds() if boxed.box_size is None else (np.zeros(3), np.asarray(boxed.box_size, np.float64))
 
     def transfer(self, colormap: str = "viridis", values: tuple[float, float] | None = None, **more: Any) -> TransferFunction:
         """What its particles look like by default, see `scenes.default_transfer`; chosen by the sample."""

@@ -46,7 +46,7 @@ def test_what_needs_all_particles_is_refused(file, capsys, arguments, message):
 
 
 def test_too_little_memory_names_the_file_the_option_and_the_least_of_it_that_works(file, capsys):
-    code, out, err = run(capsys, "render", file, "--from-disk", "0.00001", *TINY)
+    code, _, err = run(capsys, "render", file, "--from-disk", "0.00001", *TINY)
     assert (code, len(err)) == (1, 1) and f"{file}: --from-disk 1e-05 is too little" in err[0]
     least = float(err[0].split("give --from-disk ")[1].split()[0])
     assert run(capsys, "render", file, "--from-disk", least, "-o", "a.png", *TINY)[0] == 0
