@@ -5,7 +5,11 @@ the peak of resident memory is taken, less that of the same with a thousandth of
 programs take. Times are from opening the files to the image, the second frame in the process (programs compiled, files in the
 system's cache); the index is made before, and its time told apart. Writes `results/larger_than_memory.json`; ends in an assert.
 
+With `--shares` it shows instead that any share of the size gives the same picture, or a refusal that names the least memory, and
+that this works: a table, with another assert.
+
     python benchmarks/larger_than_memory.py [--particles 20000000] [--size 1024] [--share 0.25] [--folder DIR]
+    python benchmarks/larger_than_memory.py --shares 0.25 0.35 0.5 [--particles 8000000] [--frames 1]
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import h5py
 import numpy as np
 
 import jaxsph as js
+from jaxsph.from_disk import TooLittleMemoryError
 from jaxsph.io.replace import written_whole
 from jaxsph.io.snapshot_sort import CELLS, Grid
 from jaxsph.provenance import of_this_run
@@ -74,11 +79,15 @@ def one_way(options: argparse.Namespace) -> None:
     transfer = js.TransferFunction.from_colormap("viridis", (0.5, 2.5), 3.0)
     camera = js.Camera.framing(on_disk, width=options.size, height=options.size)
     seconds: list[float] = []
-    for _ in range(2):
+    for _ in range(options.frames):
         begun = time.perf_counter()
         if options.way == "disk":
             on_disk = js.OnDisk.open(options.path, "InternalEnergy", kernel="cubic_spline")
-            image = js.render_from_disk(on_disk, transfer, camera, js.Settings(samples=SAMPLES), memory=options.memory)
+            try:
+                image = js.render_from_disk(on_disk, transfer, camera, js.Settings(samples=SAMPLES), memory=options.memory)
+            except TooLittleMemoryError as error:
+                print(json.dumps({"refused": str(error), "least": error.least}))
+                return
         else:
             particles = js.io.read_particles(options.path, "InternalEnergy", kernel="cubic_spline", box=None)
             image = js.render(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=SAMPLES))
@@ -87,15 +96,17 @@ def one_way(options: argparse.Namespace) -> None:
     np.save(options.image, color)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     stats = {name: image.stats.get(name) for name in ("panes", "most_particles")}
-    print(json.dumps({"opened": opened, "first": seconds[0], "seconds": seconds[1], "peak": peak, **stats}))
+    print(json.dumps({"opened": opened, "first": seconds[0], "seconds": seconds[-1], "peak": peak, **stats}))
 
 
-def apart(way: str, path: pathlib.Path, memory: int, size: int) -> tuple[dict[str, Any], np.ndarray]:
+def apart(way: str, path: pathlib.Path, memory: int, size: int, frames: int = 2) -> tuple[dict[str, Any], Any]:
     """What a way takes in a process of its own, and its image."""
     image = path.with_name(f"{way}.npy")
     command = [sys.executable, __file__, "--way", way, "--path", str(path), "--memory", str(memory), "--image", str(image)]
-    done = subprocess.run([*command, "--size", str(size)], check=True, capture_output=True, text=True)
-    return json.loads(done.stdout.splitlines()[-1]), np.load(image)
+    command += ["--size", str(size), "--frames", str(frames)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    told = json.loads(done.stdout.splitlines()[-1])
+    return told, None if "least" in told else np.load(image)
 
 
 def compared(options: argparse.Namespace, folder: pathlib.Path) -> dict[str, Any]:
@@ -118,11 +129,33 @@ def compared(options: argparse.Namespace, folder: pathlib.Path) -> dict[str, Any
     return found
 
 
+def of_shares(options: argparse.Namespace, folder: pathlib.Path) -> None:
+    """A table of what each share of the size gives, beside the picture in memory."""
+    path = write(folder, options.particles)
+    size = sum(file.stat().st_size for file in folder.glob("*.hdf5"))
+    whole, image = apart("memory", path, size, options.size, options.frames)
+    print(f"{options.particles:,} particles, {size / 1e6:.0f} MB; in memory {whole['seconds']:.1f} s", flush=True)
+    for share in options.shares:
+        memory = int(share * size)
+        told, picture = apart("disk", path, memory, options.size, options.frames)
+        if picture is None:
+            print(f"{share:g} | {memory / 1e6:.1f} MB | refused: {told['refused']}", flush=True)
+            memory = told["least"]
+            told, picture = apart("disk", path, memory, options.size, options.frames)
+        assert picture is not None, f"{memory} bytes were named as enough: {told['refused']}"
+        off = float(np.abs(picture - image).max())
+        took = f"{told['seconds']:.1f} s, {told['seconds'] / whole['seconds']:.2f} of the time"
+        print(f"{share:g} | {memory / 1e6:.1f} MB | {told['panes']} panes | {took} | apart {off:.1e}", flush=True)
+        assert off <= SAME
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=20_000_000)
     parser.add_argument("--size", type=int, default=1024, help="pixels on a side")
     parser.add_argument("--share", type=float, default=0.25, help="of the size of the snapshot, that memory may be")
+    parser.add_argument("--shares", type=float, nargs="+", help="several shares: a table of them, and no measurement is kept")
+    parser.add_argument("--frames", type=int, default=2, help="in each process, the last of which is timed")
     parser.add_argument("--folder", type=pathlib.Path, help="where to write the snapshot")
     parser.add_argument("--way", choices=("disk", "memory"), help=argparse.SUPPRESS)
     for name, kind in (("path", pathlib.Path), ("memory", int), ("image", pathlib.Path)):
@@ -133,6 +166,9 @@ def main() -> None:
         return
     folder = pathlib.Path(tempfile.mkdtemp(dir=options.folder))
     try:
+        if options.shares:
+            of_shares(options, folder)
+            return
         found = compared(options, folder)
     finally:
         shutil.rmtree(folder)

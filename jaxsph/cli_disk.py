@@ -6,6 +6,7 @@ Flow: options -> [cli_disk] -> OnDisk, Image -> cli.
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 
@@ -13,13 +14,17 @@ import numpy as np
 
 from jaxsph import cli_scene, cli_transfer, cli_where
 from jaxsph.console import UsageError, camera_line, progress, say, span, time_line
-from jaxsph.from_disk import render_from_disk
+from jaxsph.from_disk import TooLittleMemoryError, render_from_disk
 from jaxsph.io.snapshot_index import index_path
 from jaxsph.io.snapshot_rows import Snapshot
 from jaxsph.io.snapshot_sort import sort_snapshot
 from jaxsph.model import Image, Settings
 from jaxsph.on_disk import OnDisk
 
+GIB = 2**30
+DIGITS = 4
+FRACTIONS = 10**DIGITS
+"""Of a GiB, to which memory is named."""
 OTHERS = ("volume", "points", "iso", "support", "particles", "frame", *cli_where.CLIPS)
 """Options of what cannot be rendered part by part."""
 
@@ -64,11 +69,21 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     camera = cli_scene.camera_of(on_disk, options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
-    with progress("render", " panes") as show:
-        image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * 2**30), progress=show)
+    try:
+        with progress("render", " panes") as show:
+            image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * GIB), progress=show)
+    except TooLittleMemoryError as error:
+        raise ValueError(_too_little(options, error)) from error
     say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
     say("time", time_line(image, time.perf_counter() - started))
     return image
+
+
+def _too_little(options: argparse.Namespace, error: TooLittleMemoryError) -> str:
+    """In words of the command line: the least memory that works, rounded up to what is written of it."""
+    option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
+    least = math.ceil(error.least / GIB * FRACTIONS) / FRACTIONS
+    return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
 
 
 def add_sort(parser: argparse.ArgumentParser) -> None:

@@ -25,15 +25,26 @@ def add_tile(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tile", type=tile, metavar="I/N", help=f"{more}; `jaxsph merge` puts parts together")
 
 
-def tile(text: str) -> tuple[int, int]:
-    """Which part, from 0 on, and of how many; arrays of jobs count from 0 or from 1, and either way all parts are there."""
+class Part(tuple[int, int]):
+    """Which part, from 0 on, and of how many; written as it was asked for."""
+
+    text = ""
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def tile(text: str) -> Part:
+    """Which part of how many; arrays of jobs count from 0 or from 1, and either way all parts are there."""
     try:
         index, count = (int(part) for part in text.split("/"))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a part; write the second of four as 1/4") from None
     if count < 1 or not 0 <= index <= count:
         raise argparse.ArgumentTypeError(f"{text!r} is not a part; I must lie in [0, N], and N be at least 1")
-    return index % count, count
+    part = Part((index % count, count))
+    part.text = f"{index}/{count}"
+    return part
 
 
 def suffix(options: argparse.Namespace) -> str:
@@ -62,7 +73,7 @@ def render(
         return jaxsph.render(scene, camera, settings, progress=show, devices=devices)
     image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
     first = dict(image.metadata)[tiles.FIRST_ROW]
-    say("part", f"{'/'.join(map(str, options.tile))}, rows {first} to {first + image.shape[0] - 1} of {camera.height}")
+    say("part", f"{options.tile}, rows {first} to {first + image.shape[0] - 1} of {camera.height}")
     return image
 
 

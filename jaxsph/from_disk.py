@@ -13,6 +13,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax.numpy as jnp
@@ -31,9 +33,9 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer import TransferFunction
 from jaxsph.numerics import free_memory
 from jaxsph.numerics.executors import Clock
-from jaxsph.on_disk import Columns, OnDisk
-from jaxsph.panes import CROWDED, Pane, Sides, cut
-from jaxsph.plan import Choices, FrameShape, Plan, choose, fitted, in_bands
+from jaxsph.on_disk import MOST_EXTREMES, Columns, OnDisk
+from jaxsph.panes import CROWDED, Crowd, Need, Pane, Sides, cut_to_fit
+from jaxsph.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
 from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
 from jaxsph.render import Progress, image_of
 from jaxsph.tiles import joined, of_columns, of_rows
@@ -41,11 +43,25 @@ from jaxsph.viewing import Seen
 
 MEMORY = 1 << 30
 READ_BYTES, BYTES_A_PARTICLE = 96, 430
-"""Of a particle of a pane: of columns that are read, with those of the next pane; and in all, with its place in lists."""
+"""Of a particle of a pane: of columns that are read, with those of the next pane; and in all, as a first guess."""
 LEAST = f"{TILE} x {TILE} pixels", f"{TILE} rows of pixels"
 """The least pane, and the least from one side of the image to the other."""
 FRAME_SHARE = 0.2
-"""Of the memory, that a frame takes whatever its particles."""
+"""Of the memory, that a frame is guessed to take whatever its particles."""
+
+
+class TooLittleMemoryError(ValueError):
+    """No cut into panes fits the memory.
+
+    Attributes:
+        name: `"memory"` or `"settings.memory_limit"`, whichever is too little.
+        least: bytes of it with which the finest cut fits.
+        why: what needs so many.
+    """
+
+    def __init__(self, name: str, given: int, least: int, why: str) -> None:
+        super().__init__(f"`{name}` = {given} bytes is too little: {why}, which need {least:,}; give more, or look closer")
+        self.name, self.least, self.why = name, least, why
 
 
 def render_from_disk(
@@ -75,37 +91,72 @@ def render_from_disk(
         `stats["most_particles"]` say how many panes there were, and how many particles the fullest had.
 
     Raises:
-        ValueError: memory that does not suffice for a single tile (how much does), a screen or an integrator that
-            needs all particles; as `jaxsph.render`.
+        TooLittleMemoryError: a `ValueError`: memory that does not suffice for a single tile, and how much does.
+        ValueError: a screen or an integrator that needs all particles; as `jaxsph.render`.
     """
     settings = settings or Settings()
     if settings.screen == "quadtree":
         raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
-    renderer = _Renderer(on_disk, transfer, camera, settings)
-    panes = list(renderer.panes(memory))  # the fullest first: where the plan has room for it, it has for most
-    always = on_disk.extremes(camera)
-    planes = [seen_by(camera, *pane) for pane in panes]
-    images: dict[Pane, Image] = {}
-    most = 0
-    with free_memory.given_back_at_once(), ThreadPoolExecutor(1, "jaxsph-read") as reader:
-        ahead: Future[Columns] = reader.submit(on_disk.seen_by, planes[0], always)
-        for number, pane in enumerate(panes, 1):
-            columns = ahead.result()
-            if number < len(panes):
-                ahead = reader.submit(on_disk.seen_by, planes[number], always)
-            images[pane] = renderer.pane(columns, pane)
+    renderer = _Renderer(on_disk, transfer, camera, settings, memory)
+    panes = renderer.panes()  # the fullest first: where the plan has room for it, it has for most
+    todo, images, most = deque(panes), dict[Pane, Image](), 0
+    with free_memory.given_back_at_once(), _Reader(on_disk, camera, memory // READ_BYTES) as reader:
+        while todo:
+            pane = todo.popleft()
+            columns = reader.columns(pane, todo[0] if todo else None)
+            image = None if columns is None else renderer.pane(columns, pane)
+            if image is None:
+                todo.extendleft(reversed(renderer.halves(pane)))
+                continue
+            assert columns is not None
+            images[pane], most = image, max(most, len(columns[0]))
+            del columns
             free_memory.give_back()
-            most = max(most, len(columns[0]))
             if progress is not None:
-                progress(number, len(panes))
-    image = _whole(images)
-    return dataclasses.replace(image, stats=image.stats | {"panes": len(panes), "most_particles": most})
+                progress(len(images), len(images) + len(todo))
+    image = _rows_of([_cut_image(pane, images, renderer.whole_rows) for pane in sorted(panes)], sorted(panes))
+    return dataclasses.replace(image, stats=image.stats | {"panes": len(images), "most_particles": most})
 
 
-def _whole(images: dict[Pane, Image]) -> Image:
-    """The image that panes make."""
-    rows = (list(row) for _, row in itertools.groupby(sorted(images), lambda pane: pane.top))
-    return joined([joined([images[pane] for pane in row], axis=1) for row in rows])
+def _cut_image(pane: Pane, images: dict[Pane, Image], whole_rows: bool) -> Image:
+    """The image of a pane, of its halves where it was cut."""
+    if pane in images:
+        return images[pane]
+    axis, halves = pane.halves(whole_rows)
+    return joined([_cut_image(half, images, whole_rows) for half in halves], axis=axis)
+
+
+def _rows_of(images: list[Image], panes: list[Pane]) -> Image:
+    """The image that panes make, in the order of their rows and columns."""
+    rows = itertools.groupby(zip(panes, images, strict=True), lambda one: one[0].top)
+    return joined([joined([image for _, image in row], axis=1) for _, row in rows])
+
+
+class _Reader:
+    """Reads the particles of a pane while another is rendered; None of panes with more than `most`."""
+
+    def __init__(self, on_disk: OnDisk, camera: Camera, most: int) -> None:
+        self._on_disk, self._camera, self._most = on_disk, camera, most
+        self._always = on_disk.extremes(camera)
+        self._ahead: dict[Pane, Future[Columns | None]] = {}
+        self._thread = ThreadPoolExecutor(1, "jaxsph-read")
+
+    def __enter__(self) -> _Reader:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._thread.shutdown()
+
+    def columns(self, pane: Pane, then: Pane | None) -> Columns | None:
+        """The particles of a pane; those of the next are begun to be read, unless others are read ahead already."""
+        columns = self._begun(pane).result()
+        if then is not None and not self._ahead:
+            self._ahead[then] = self._begun(then)
+        return columns
+
+    def _begun(self, pane: Pane) -> Future[Columns | None]:
+        begun = self._ahead.pop(pane, None)
+        return begun or self._thread.submit(self._on_disk.seen_by, seen_by(self._camera, *pane), self._always, self._most)
 
 
 @dataclasses.dataclass
@@ -116,61 +167,127 @@ class _Renderer:
     transfer: TransferFunction
     camera: Camera
     settings: Settings
+    memory: int
     capacity: int = 1
-    plan: Plan | None = None
+    plans: dict[tuple[int, int], Plan] = dataclasses.field(default_factory=dict)
+    """By rows of pixels and entries of particle arrays."""
 
-    def panes(self, memory: int) -> dict[Pane, int]:
-        """As few as memory allows; the frame may take what particles leave.
+    @property
+    def whole_rows(self) -> bool:
+        """Whether panes reach from side to side: the pilot's lattice reaches from bundle to bundle."""
+        return self._along.estimator == "pilot"
+
+    def panes(self) -> list[Pane]:
+        """As few as memory allows, as far as the sample tells.
 
         Raises:
-            ValueError: the least pane needs more.
+            TooLittleMemoryError: the least pane needs more.
         """
-        seen, along = self._sample.viewed, self._along
-        there = np.asarray(self.on_disk.sample.valid)
+        seen, there = self._sample.viewed, np.asarray(self.on_disk.sample.valid)
         sides = Sides(*(np.asarray(side)[: len(there)][there] for side in (seen.left, seen.right, seen.top, seen.bottom)))
-        room = int((1 - FRAME_SHARE) * memory) // BYTES_A_PARTICLE
-        whole_rows = along.estimator == "pilot"  # its lattice reaches from bundle to bundle
-        found = cut((self.camera.height, self.camera.width), sides, len(self.on_disk), room, whole_rows=whole_rows)
-        most = max(found.values())
-        if most > room:
-            least = int(BYTES_A_PARTICLE * most / (1 - FRAME_SHARE)) + 1
-            raise ValueError(
-                f"`memory` = {memory} bytes is too little: {LEAST[whole_rows]} see about {most:,} particles, "
-                f"which need {least:,}; give more, or look closer"
-            )
-        self.capacity = capacity_class(max(most, 1))
-        left = max(memory - READ_BYTES * self.capacity, 1)
-        self.settings = dataclasses.replace(self.settings, memory_limit=self.settings.memory_limit or left)
-        return found
+        room = int((1 - FRAME_SHARE) * self.memory) // BYTES_A_PARTICLE
+        size = self.camera.height, self.camera.width
+        found, fit = cut_to_fit(size, sides, len(self.on_disk), room, self._fits, whole_rows=self.whole_rows)
+        if not fit:
+            self._require_least()
+        return list(found)
 
-    def pane(self, columns: Columns, pane: Pane) -> Image:
-        """The image of some pixels."""
-        self.capacity = max(self.capacity, capacity_class(len(columns[0])))
-        particles = self.on_disk.particles(columns, self.capacity)
+    def halves(self, pane: Pane) -> list[Pane]:
+        """Of a pane that needs more than there is.
+
+        Raises:
+            TooLittleMemoryError: it cannot be cut.
+        """
+        halves = pane.halves(self.whole_rows)[1]
+        if not halves:
+            self._require_least()
+            raise AssertionError(f"{pane} fits by counting, but not by its plan")
+        return halves
+
+    def _require_least(self) -> None:
+        """Raise where the least panes do not fit: all particles are read once, to count them."""
+        crowd = Crowd(self.camera, self.on_disk.index.bounds())
+        for position, support, *_ in self.on_disk.all_seen_by(seen_by(self.camera, 0, self.camera.height, 0, self.camera.width)):
+            crowd.count(position, support)
+        need = crowd.fullest(self.whole_rows)
+        need = need._replace(particles=need.particles + MOST_EXTREMES)
+        frame = self._smallest(need).bytes
+        given = {"memory": (self.memory, frame + self._read_bytes(need)), "settings.memory_limit": (self._limit, frame)}
+        for name, (allowed, least) in given.items():
+            if allowed < least:
+                why = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles"
+                raise TooLittleMemoryError(name, allowed, least, why)
+
+    @property
+    def _limit(self) -> int:
+        """Of a frame, whatever is read."""
+        return self.settings.memory_limit or self.memory
+
+    def _fits(self, need: Need) -> float:
+        """How many times what is needed there is, in bands of one row of tiles and least batches."""
+        least = self._smallest(need)
+        return min(self.memory / (least.bytes + self._read_bytes(need)), self._limit / least.bytes)
+
+    def _read_bytes(self, need: Need) -> int:
+        return READ_BYTES * capacity_class(need.particles)
+
+    def _smallest(self, need: Need) -> Plan:
+        """The plan that takes least of all."""
+        tile_rows, tile_columns = -(-need.height // TILE), -(-self.camera.width // TILE)
+        tiles, bundles = (np.full(tile_rows, count) for count in (need.tile_pairs, need.bundle_pairs))
+        measures = Measures(tiles, bundles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
+        shape = self._shape_of(self._shape, need.height, capacity_class(need.particles))
+        return smallest(measures, shape, self._along, self._choices)
+
+    def _shape_of(self, shape: FrameShape, height: int, capacity: int) -> FrameShape:
+        return dataclasses.replace(shape, height=height, num_particles=capacity, num_classes=self._classes, headroom=1.0)
+
+    def pane(self, columns: Columns, pane: Pane) -> Image | None:
+        """The image of some pixels; None where it needs more memory than there is."""
+        needed = capacity_class(len(columns[0]))
+        for capacity in dict.fromkeys((max(self.capacity, needed), needed)):
+            if self._fits(Need(capacity, 1, 1, pane.bottom - pane.top)) < 1:
+                continue
+            image = self._image(columns, pane, capacity)
+            if image is not None:
+                self.capacity = max(self.capacity, capacity)
+                return image
+        return None
+
+    def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image | None:
+        particles = self.on_disk.particles(columns, capacity)
         scene = reachable(Scene(particles=particles, transfer=self.transfer), self.settings)
         along, clock = along_rays(scene, self.settings), Clock()
-        shape = dataclasses.replace(shape_of_scene(scene, self.camera, along), headroom=1.0, num_classes=self._classes)
+        shape = self._shape_of(shape_of_scene(scene, self.camera, along), self.camera.height, capacity)
         seen = _within(see(scene, self.camera, shape, clock), pane)
         seen, measures = measured(seen, self.camera, shape.samples, shape.tuning, stride_of(along))
         rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
-        needed = of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE))
-        self.plan = self._plan_for(needed, rows, along)
+        plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows, along)
         clock.mark("plan")
-        given = seen, self.camera, self.settings, self.plan, scene.formulas
+        if plan is None:
+            return None
+        given = seen, self.camera, self.settings, plan, scene.formulas
         image = image_of(*given, clock, None, planned=True, first_row=pane.top)
         return of_columns(image, pane.left, pane.right)
 
-    def _plan_for(self, needed: Measures, shape: FrameShape, along: Settings) -> Plan:
-        """The plan there is, if it serves; else with room for more like this, in as many bands if memory allows."""
-        roomy = dataclasses.replace(shape, headroom=CROWDED)
-        if self.plan is None or self.plan.height != shape.height:
-            return fitted(needed, roomy, along, self._choices)
-        made = in_bands(needed, shape, along, self._choices, self.plan.bands)
-        if self.plan.serves(made):
-            return self.plan
-        if made.bytes > (along.memory_limit or shape.memory):
-            return fitted(needed, shape, along, self._choices)
-        return self.plan.grown(in_bands(needed, roomy, along, self._choices, self.plan.bands))
+    def _plan_for(self, needed: Measures, shape: FrameShape, along: Settings) -> Plan | None:
+        """The plan there is, if it serves; else with room for more like this if memory allows; None where it allows none."""
+        limit = min(self._limit, self.memory - READ_BYTES * shape.num_particles)
+        given, roomy = (along, self._choices), dataclasses.replace(shape, headroom=CROWDED)
+        kept = self.plans.get((shape.height, shape.num_particles))
+        if kept is not None:
+            sizes = kept.bands, kept.cast.batch_slabs
+            if kept.serves(in_bands(needed, shape, *given, *sizes)):
+                return kept
+            grown = kept.grown(in_bands(needed, roomy, *given, *sizes))
+            kept = dataclasses.replace(grown, bytes=bytes_of(grown, shape.number))
+        if kept is not None and kept.bytes <= limit:
+            made: Plan | None = kept
+        else:
+            made = fitting(needed, roomy, *given, limit) or fitting(needed, shape, *given, limit)
+        if made is not None:
+            self.plans[shape.height, shape.num_particles] = made
+        return made
 
     @functools.cached_property
     def _classes(self) -> int:

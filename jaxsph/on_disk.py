@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.io.assemble import opacity_of
+from jaxsph.io.assemble import in_box, opacity_of
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
 from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
@@ -24,15 +24,10 @@ from jaxsph.model.frusta import Planes, between_depths
 from jaxsph.model.particles import Particles
 from jaxsph.model.transfer import TransferFunction
 
-MEMORY = 1 << 30
 SAMPLED = 1 << 16
 """Particles, about, by which colours, plans and parts are chosen."""
-READ_BYTES, BYTES_A_PARTICLE = 96, 430
-"""Of a particle of a part: of columns that are read, with those of the next part; and in all, with its place in lists."""
-FRAME_SHARE = 0.2
-"""Of the memory, that a frame takes whatever its particles."""
-CROWDED = 1.25
-"""Times as many particles as the sample has it there is room for in a part."""
+MOST_EXTREMES = 2
+"""Particles that come along wherever they are: the widest and the strongest."""
 Columns = tuple[np.ndarray, ...]
 
 
@@ -102,8 +97,12 @@ class OnDisk:
         return len(self.index)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """See `Camera.framing`."""
-        return self.index.bounds()
+        """See `Camera.framing`: those of the particles in memory, of a periodic box its own."""
+        if not len(self):
+            return self.index.bounds()
+        corners = np.stack([self.index.lower.min(0), self.index.upper.max(0)])
+        boxed, _ = in_box(dataclasses.replace(self.snapshot.first, position=corners, columns={}, support=None), "file")
+        return self.index.bounds() if boxed.box_size is None else (np.zeros(3), np.asarray(boxed.box_size, np.float64))
 
     def transfer(self, colormap: str = "viridis", values: tuple[float, float] | None = None, **more: Any) -> TransferFunction:
         """What its particles look like by default, see `scenes.default_transfer`; chosen by the sample."""
@@ -136,20 +135,38 @@ class OnDisk:
         quantity: Any = values[0] if len(values) == 1 else tuple(values)
         return Particles.from_arrays(position, support, quantity, volume, self.kernel, capacity=capacity)
 
-    def seen_by(self, planes: Planes, always: frozenset[tuple[int, int]] = frozenset()) -> Columns:
-        """The particles whose supports reach into a region, and some others, in the order of the files."""
-        index, parts = self.index, [self.columns_of(self._nothing)]
+    def seen_by(
+        self, planes: Planes, always: frozenset[tuple[int, int]] = frozenset(), most: int | None = None
+    ) -> Columns | None:
+        """The particles whose supports reach into a region, and some others, in the order of the files.
+
+        None where there are more than `most`: so many are never held.
+        """
+        index, parts, found = self.index, [self.columns_of(self._nothing)], 0
         held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
         for file, row in always:
             held |= (index.file == file) & (index.begin <= row) & (row < index.end)
+        for file, begin, columns in self._read(held):
+            kept = planes.meet(columns[0].astype(np.float64), columns[1].astype(np.float64))
+            kept[[row - begin for which, row in always if which == file and begin <= row < begin + len(kept)]] = True
+            parts.append(tuple(column[kept] for column in columns))
+            found += len(parts[-1][0])
+            if most is not None and found > most:
+                return None
+        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+
+    def all_seen_by(self, planes: Planes) -> Iterator[Columns]:
+        """The particles of all runs that reach into a region, some at a time."""
+        held = planes.meet_boxes(self.index.lower, self.index.upper, self.index.support) if len(self) else np.zeros(0, bool)
+        return (columns for _, _, columns in self._read(held))
+
+    def _read(self, held: np.ndarray) -> Iterator[tuple[int, int, Columns]]:
+        """File, first row and columns of some runs."""
+        index = self.index
         runs = zip(index.file[held].tolist(), index.begin[held].tolist(), index.end[held].tolist(), strict=True)
         for file, rows in together(runs):
             begin, end = rows[0][0], rows[-1][1]
-            columns = self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
-            kept = planes.meet(columns[0].astype(np.float64), columns[1].astype(np.float64))
-            kept[[row - begin for which, row in always if which == file and begin <= row < end]] = True
-            parts.append(tuple(column[kept] for column in columns))
-        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+            yield file, begin, self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
 
     @functools.cached_property
     def _nothing(self) -> ParticleTable:

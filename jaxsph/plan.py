@@ -227,27 +227,63 @@ def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: C
     """The plan of a frame, in as few bands as the memory limit allows.
 
     Raises:
-        ValueError: when even a band of one row of tiles exceeds `settings.memory_limit`.
+        ValueError: when even a band of one row of tiles exceeds `settings.memory_limit`; with the bytes named it does not.
     """
-    tile_rows, bands = -(-shape.height // TILE), 1
     limit = settings.memory_limit or shape.memory
-    while True:
-        made = in_bands(measures, shape, settings, choices, bands)
-        slabs = made.lists.num_bundles * -(-shape.samples // choices.slab_samples)
-        fits = made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and slabs < MAX_SLABS
-        if fits:
-            return made
-        if made.lists.tile_rows == 1:
-            break
-        bands = min(2 * bands, tile_rows)
+    if (made := fitting(measures, shape, settings, choices, limit)) is not None:
+        return made
+    least = smallest(measures, shape, settings, choices)
+    one_row = f"one band of {TILE} pixel rows"
+    if least.bytes <= limit:  # then what is too little is not memory
+        raise ValueError(
+            f"{one_row} has room for {MAX_CAPACITY:,} pairs of particles and bundles of rays and {MAX_SLABS:,} slabs, got "
+            f"{least.lists.list_capacity:,} and {_slabs(least):,}; lower the image width, the samples or the number of particles"
+        )
     raise ValueError(
-        f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs "
-        f"about {made.bytes} bytes; raise the limit, or lower the image width, the samples or the number of particles"
+        f"`memory_limit` = {limit} bytes is too little: {one_row} needs about {least.bytes} bytes; raise the limit, or lower "
+        "the image width, the samples or the number of particles"
     )
 
 
-def in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, bands: int) -> Plan:
-    """The plan of a frame in so many bands, whatever they take; fewer if so many are not there."""
+def fitting(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, limit: int) -> Plan | None:
+    """The plan of a frame, in as few bands as so many bytes allow; None where even the smallest needs more.
+
+    Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
+    """
+    tile_rows, bands, batch = -(-shape.height // TILE), 1, None
+    while True:
+        made = in_bands(measures, shape, settings, choices, bands, batch)
+        if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:
+            return made
+        if made.lists.tile_rows > 1:
+            bands = min(2 * bands, tile_rows)
+        elif made.cast.batch_slabs > made.cast.chunk:
+            batch = made.cast.batch_slabs // 2
+        else:
+            return None
+
+
+def smallest(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices) -> Plan:
+    """The plan that takes least: one row of tiles a band, and least batches."""
+    return in_bands(measures, shape, settings, choices, -(-shape.height // TILE), 1)
+
+
+def _slabs(plan: Plan) -> int:
+    """Of a band."""
+    return plan.lists.num_bundles * -(-plan.samples // plan.cast.slab_samples)
+
+
+def bytes_of(plan: Plan, number: int) -> int:
+    """About what a frame takes with all the room of a plan, of numbers so many bytes wide."""
+    size = plan.width, plan.height, plan.samples, plan.num_particles
+    needed = frame_bytes(size, plan.num_classes, plan.lists, plan.cast, plan.control, number)
+    return needed + (0 if plan.quadtree is None else quadtree_bytes(size, plan.quadtree.lists, number))
+
+
+def in_bands(
+    measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, bands: int, batch: int | None = None
+) -> Plan:
+    """The plan of a frame in so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
     tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
     rows = -(-tile_rows // bands)
     bands = -(-tile_rows // rows)
@@ -255,15 +291,15 @@ def in_bands(measures: Measures, shape: FrameShape, settings: Settings, choices:
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
     lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
-    cast = dataclasses.replace(cast, doublings=DOUBLINGS if settings.is_refined else 0)
+    held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
+    cast = dataclasses.replace(cast, batch_slabs=held, doublings=DOUBLINGS if settings.is_refined else 0)
     room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
-    needed = frame_bytes(size, shape.num_classes, lists, cast, control, shape.number)
     quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
-    needed += 0 if quadtree is None else quadtree_bytes(size, quadtree.lists, shape.number)
     method = control, settings.integrator, settings.screen, quadtree
-    return Plan(*size, shape.num_classes, bands, lists, cast, needed, *method, step_tolerance=_step_tolerance(settings))
+    made = Plan(*size, shape.num_classes, bands, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
+    return dataclasses.replace(made, bytes=bytes_of(made, shape.number))
 
 
 def _step_tolerance(settings: Settings) -> float | None:

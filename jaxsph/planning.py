@@ -34,7 +34,7 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.plan import FrameShape, Plan, choose, fitted, next_class
+from jaxsph.plan import FrameShape, Plan, choose, fitted, fitting, next_class
 from jaxsph.viewing import Seen, longest_interval, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -61,7 +61,7 @@ def plan(
             support is in samples.
         tuning: of another kind of machine than holds the particles (`jaxsph.numerics.tuning`), to compile for it or to compare.
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
-            There is room for more particles where `like` has too little.
+            There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
 
     Raises:
         ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
@@ -87,7 +87,8 @@ def plan(
     made = fitted(measures, shape, settings, choices)
     if headroom > 1 and (like is None or not like.serves(made)):
         outgrown = like is not None and shape.num_particles > like.num_particles
-        made = fitted(measures, _with_headroom(shape, headroom, outgrown), settings, choices)
+        roomy = _with_headroom(shape, headroom, outgrown)
+        made = fitting(measures, roomy, settings, choices, settings.memory_limit or shape.memory) or made
     return made if like is None else like.grown(made)
 
 
@@ -141,13 +142,18 @@ class Plans:
     def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings = along_rays(scene, settings)
-        shape = self._similar(shape_of_scene(scene, camera, settings))
-        run.mark("plan")
-        seen = see(scene, camera, shape, run)
-        seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
-        choices = choose(measures, settings)
-        needed = fitted(measures, dataclasses.replace(shape, headroom=1.0), settings, choices)
-        made = self._recalled(needed, shape, settings) or fitted(measures, shape, settings, choices)
+        own = shape_of_scene(scene, camera, settings)
+        limit = settings.memory_limit or own.memory
+        for shape in dict.fromkeys((self._similar(own), own)):  # the room of a kept plan may be more than there is memory for
+            run.mark("plan")
+            seen = see(scene, camera, shape, run)
+            seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
+            choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0)
+            needed = fitting(measures, tight, settings, choices, limit)
+            if needed is not None:
+                break
+        needed = needed or fitted(measures, tight, settings, choices)  # which says how much memory would do
+        made = self._recalled(needed, shape, settings) or fitting(measures, shape, settings, choices, limit) or needed
         self._keep(made)
         run.mark("plan")
         return made, seen

@@ -28,7 +28,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.numerics.executors import Clock
-from jaxsph.plan import Plan, choose, fitted
+from jaxsph.plan import choose, fitted, fitting
 from jaxsph.planning import measured, see, shape_of_scene, stride_of
 from jaxsph.render import Progress, image_of
 from jaxsph.version import __version__
@@ -72,7 +72,10 @@ def render_tile(
     rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
-    plan: Plan = fitted(of_rows(measures, *rows), of_part, along, choose(measures, along))
+    given = of_rows(measures, *rows), of_part, along, choose(measures, along)
+    plan = fitting(*given, along.memory_limit or shape.memory)
+    if plan is None:  # no room for more than this part needs
+        plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
     clock.mark("plan")
     image = image_of(seen, camera, settings, plan, scene.formulas, clock, progress, planned=True, first_row=first)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))

@@ -21,12 +21,18 @@ def run(capsys, *arguments):
     return code, out, err.splitlines()
 
 
+@pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])
+def test_a_part_is_called_as_it_was_asked_for(text, index):
+    part = cli_merge.tile(text)
+    assert (part, str(part)) == ((index, 2), text)
+
+
 @pytest.mark.slow
 def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
     assert run(capsys, "render", *SCENE, "-o", "whole.exr")[0] == 0
     assert run(capsys, "render", *SCENE, "--tile", "1/2", "-o", "b.exr")[0] == 0
     code, out, err = run(capsys, "render", *SCENE, "--tile", "2/2")
-    assert (code, err) == (0, []) and "radial_0_of_2.exr" in out and "0/2, rows 0 to" in out and "of 40" in out
+    assert (code, err) == (0, []) and "radial_0_of_2.exr" in out and "2/2, rows 0 to" in out and "of 40" in out
     code, out, err = run(capsys, "merge", "b.exr", "radial_0_of_2.exr", "-o", "merged.exr")
     assert (code, err) == (0, []) and "merged.exr, 24 x 40, of 2 parts" in out
     whole, merged = (js.io.read_image(name) for name in ("whole.exr", "merged.exr"))

@@ -1,5 +1,6 @@
 """A snapshot that stays on disk: what is read of it, and how it is shown by default."""
 
+import h5py
 import numpy as np
 import pytest
 from snapshots_made import particles, write
@@ -37,3 +38,14 @@ def test_log_density_gives_opacity_where_densities_spread(tmp_path):
     on_disk = js.OnDisk.open(write(tmp_path, columns), QUANTITY, opacity_by="auto")
     assert on_disk.quantities == (QUANTITY, "log10:Density") and on_disk.sample.extinction_quantity is not None
     assert np.asarray(on_disk.transfer().extinction)[0] == 0
+
+
+@pytest.mark.parametrize("side", [1.0, 0.5], ids=["all inside", "some outside"])
+def test_a_periodic_snapshot_is_framed_as_in_memory(tmp_path, side):
+    path = write(tmp_path, particles(400))
+    for name in ("snap.0.hdf5", "snap.1.hdf5"):
+        with h5py.File(tmp_path / name, "r+") as file:
+            file["Header"].attrs["BoxSize"] = side
+    on_disk, in_memory = js.OnDisk.open(path, QUANTITY), js.io.read_particles(path, QUANTITY)
+    assert (in_memory.box is None) == (side < 1)
+    np.testing.assert_allclose(on_disk.bounds(), in_memory.bounds(), rtol=1e-6)

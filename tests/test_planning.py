@@ -11,6 +11,7 @@ import jaxsph as js
 from jaxsph.model import registry
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import capacity_class
+from jaxsph.numerics.executors import Clock
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.plan import next_class
 from jaxsph.planning import PLANS, Plans, shape_of
@@ -179,6 +180,35 @@ def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypat
         ):
             with pytest.raises(ValueError, match=f"`tolerance` does not cover {name} yet; give `tolerance=None`"):
                 attempt(changed, camera, asked)
+
+
+def least_of(attempt):
+    """The least memory that a refusal names."""
+    with pytest.raises(ValueError, match=r"`memory_limit` = 1000 bytes .* needs about (\d+) bytes") as refused:
+        attempt(dataclasses.replace(SETTINGS, memory_limit=1000))
+    return int(str(refused.value).split("needs about ")[1].split()[0])
+
+
+def test_the_least_memory_that_is_named_works_and_a_byte_less_does_not():
+    scene, camera = snapshot(700)
+    least = least_of(functools.partial(js.plan, scene, camera))
+    assert js.plan(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least)).bytes == least
+    with pytest.raises(ValueError, match=f"needs about {least} bytes"):
+        js.plan(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least - 1))
+
+
+def test_room_for_more_than_a_frame_needs_is_no_reason_to_refuse_it():
+    scene, camera = snapshot(700)
+    tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, scene, camera)))
+    assert js.plan(scene, camera, tight, headroom=1.5) == js.plan(scene, camera, tight)
+    assert Plans().for_frame(scene, camera, tight, Clock())[0].bytes <= tight.memory_limit
+
+
+def test_the_room_of_an_earlier_frame_is_no_reason_to_refuse_the_next():
+    plans, frames = Plans(), [snapshot(count) for count in (880, 700)]
+    tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, *frames[1])))
+    plans.for_frame(*frames[0], SETTINGS, Clock())
+    assert plans.for_frame(*frames[1], tight, Clock())[0].bytes <= tight.memory_limit
 
 
 @pytest.mark.slow

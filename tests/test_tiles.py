@@ -8,6 +8,7 @@ import OpenEXR
 import pytest
 
 import jaxsph as js
+from jaxsph import tiles
 from jaxsph.measures import Measures
 from jaxsph.tiles import cuts
 
@@ -153,3 +154,21 @@ def test_what_the_memory_limit_is_does_not_make_another_picture(three):
     scene, camera = view()
     tight = js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=1 << 30), 1, 3)
     np.testing.assert_array_equal(js.merge([three[0], tight, three[2]]).color, js.merge(three).color)
+
+
+def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
+    scene, camera = view(count=260)
+    planned = []
+
+    def stop(seen, camera, settings, plan, *more, **how):
+        planned.append(plan)
+        raise InterruptedError
+
+    monkeypatch.setattr(tiles, "image_of", stop)
+    for limit in (None, 1000):
+        with pytest.raises((InterruptedError, ValueError)) as ended:
+            js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)
+    least = int(str(ended.value).split("needs about ")[1].split()[0])
+    with pytest.raises(InterruptedError):
+        js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least), 1, 3)
+    assert planned[-1].bytes <= least

@@ -16,7 +16,8 @@ import numpy as np
 from . import gadget_hdf5
 from .damage import DataError
 from .datasets import position_shape, read_dataset
-from .hdf5_links import holds, member, opened
+from .hdf5_links import PURPOSE, holds, member, opened
+from .optional import require
 from .quantities import ROLES, available_quantities, choose_quantity
 from .snapshot_files import files_of
 from .table import ParticleTable, plain
@@ -25,6 +26,10 @@ RUN = 1 << 14
 """Rows of a run: the least that is read."""
 READ = 1 << 17
 """Rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run."""
+OTHER_FORMAT = (
+    "is not a Gadget-like HDF5 snapshot, all that `--from-disk`, `OnDisk.open` and `sort` can read, as they read "
+    "some rows at a time; render it as a whole, without `--from-disk`"
+)
 
 
 class Snapshot:
@@ -42,9 +47,12 @@ class Snapshot:
         path = Path(path)
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such file")
+        h5py = require("h5py", PURPOSE)
+        if path.is_dir() or (path.is_file() and not h5py.is_hdf5(path)):
+            raise DataError(f"{path}: {OTHER_FORMAT}")
         with opened(path) as file:
             if not any(name.startswith("PartType") for name in file):
-                raise DataError("is not a Gadget-like HDF5 snapshot; particles of other formats are read as a whole")
+                raise DataError(OTHER_FORMAT)
             first = gadget_hdf5.from_hdf5(file, part_type, slice(0, 1))
         assert first.part_type is not None
         self.part_type: int = first.part_type
