@@ -22,6 +22,7 @@ from jaxsph.io.selection import chosen
 from jaxsph.model import Camera, Particles
 from jaxsph.model.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
+from jaxsph.model.kernels import KERNELS
 from jaxsph.model.projection import NORMS
 from jaxsph.project import project
 from jaxsph.projection_plan import PIXELS
@@ -59,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="means of pixels, which keep all mass, or values of rays (default mean)",
     )
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), default="cubic_spline", help="(default cubic_spline)")
+    add("--kernel", choices=tuple(KERNELS), default="cubic_spline", help="(default cubic_spline)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
     cli_where.add_selection(parser)
     add = parser.add_argument_group("camera", "default: parallel rays along z, all of the particles").add_argument

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsph as js
+from jaxsph.model.kernels import KERNELS
 from jaxsph.numerics import faults
 
-ALL = list(itertools.product(["poly6", "cubic_spline", "wendland_c2"], ["perspective", "orthographic"]))
-IN_FLOAT32 = [("poly6", "perspective"), ("wendland_c2", "orthographic")]
-IN_FLOAT64 = [("poly6", "orthographic"), ("cubic_spline", "perspective")]
+ALL = list(itertools.product(KERNELS, ["perspective", "orthographic"]))
+IN_FLOAT32 = [("poly6", "perspective"), ("wendland_c2", "orthographic"), ("wendland_c6", "perspective")]
+IN_FLOAT64 = [("poly6", "orthographic"), ("cubic_spline", "perspective"), ("quintic_spline", "orthographic")]
 
 
 def with_kernels_and_projections(chosen):
