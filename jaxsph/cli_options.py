@@ -26,7 +26,7 @@ def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, sever
     more = "the same for opacity alone (default: log density where it spreads over a decade, else as colour)"
     add("--opacity-by", metavar="NAME", help=more)
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=tuple(KERNELS), help="smoothing kernel (default poly6)")
+    add("--kernel", choices=tuple(KERNELS), help="smoothing kernel (default: that of the file or its code, else poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
     add = parser.add_argument_group("volume of a file").add_argument
     add("--iso", type=float, metavar="LEVEL", help="show the surface on which its values are LEVEL (--quantity: which values)")

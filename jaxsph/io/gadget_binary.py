@@ -63,7 +63,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
         edge = float(header["box"])
         box_size = (edge, edge, edge) if edge > 0 else None
+        said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
         more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
+        more["kernel"] = "cubic_spline"
         more |= {"part_type": chosen, "num_files": max(int(header["files"]), 1)}
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
