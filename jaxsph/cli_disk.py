@@ -52,7 +52,7 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
         on_disk = OnDisk.open(
             options.source,
             options.quantity,
-            kernel=options.kernel or "poly6",
+            kernel=options.kernel,
             part_type=options.part_type,
             opacity_by=options.opacity_by or "auto",
             progress=show,

@@ -161,7 +161,7 @@ def _sequence(options: argparse.Namespace) -> Snapshots:
     if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
         raise UsageError(f"--support must be > 0, got {options.support:g}")
     more = {**cli_where.selected(options), "opacity_by": cli_particles.opacity_by(options)}
-    reading = Reading(options.quantity, options.support, options.kernel or "poly6", options.part_type, **more)
+    reading = Reading(options.quantity, options.support, options.kernel, options.part_type, **more)
     with progress("read", " files") as show, cli_where.conditions():
         survey = _surveyed(options, reading, show)
     _say_survey(survey)
@@ -195,6 +195,7 @@ def _say_survey(survey: Survey) -> None:
         say("between", sentence)
     say("support", survey.report.support)
     say("volume", survey.report.volume)
+    say("kernel", survey.report.kernel)
     for note in survey.report.notes:
         say("note", note)
 

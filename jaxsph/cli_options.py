@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxsph import scenes
 from jaxsph.model import Settings, registry
+from jaxsph.model.kernels import KERNELS
 
 SAMPLES = Settings().samples
 INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registry.BOUNDING)
@@ -26,7 +27,7 @@ def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, sever
     more = "the same for opacity alone (default: log density where it spreads over a decade, else as colour)"
     add("--opacity-by", metavar="NAME", help=more)
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), help="smoothing kernel (default poly6)")
+    add("--kernel", choices=tuple(KERNELS), help="smoothing kernel (default: that of the file or its code, else poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
     if surface:
         add = parser.add_argument_group("volume of a file").add_argument

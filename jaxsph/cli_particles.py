@@ -27,6 +27,7 @@ def scene_of(options: argparse.Namespace) -> tuple[Scene, Particles]:
     columns = particles.to_numpy()
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
+    say("kernel", report.kernel)
     _say_quantities(report, columns)
     for note in report.notes:
         say("note", note)
@@ -52,6 +53,7 @@ def describe(options: argparse.Namespace) -> Particles:
     _say_quantities(report, columns)
     say("support", f"{span(columns['support'])}: {report.support}")
     say("volume", report.volume)
+    say("kernel", report.kernel)
     for note in report.notes:
         if note not in table.conventions:
             say("note", note)
@@ -60,10 +62,14 @@ def describe(options: argparse.Namespace) -> Particles:
 
 def _particles(table: io.ParticleTable, options: argparse.Namespace) -> tuple[Particles, io.Report]:
     """Those that are asked for."""
-    kernel = options.kernel or "poly6"
     with cli_where.conditions():
         return io.particles_from_table(
-            table, options.quantity, options.support, kernel, opacity_by=opacity_by(options), **cli_where.selected(options)
+            table,
+            options.quantity,
+            options.support,
+            options.kernel,
+            opacity_by=opacity_by(options),
+            **cli_where.selected(options),
         )
 
 

@@ -22,6 +22,7 @@ from jaxsph.io.selection import chosen
 from jaxsph.model import Camera, Particles
 from jaxsph.model.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
+from jaxsph.model.kernels import KERNELS
 from jaxsph.model.projection import NORMS
 from jaxsph.project import project
 from jaxsph.projection_plan import PIXELS
@@ -59,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="means of pixels, which keep all mass, or values of rays (default mean)",
     )
     add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=("poly6", "cubic_spline", "wendland_c2"), default="cubic_spline", help="(default cubic_spline)")
+    add("--kernel", choices=tuple(KERNELS), help="(default: that of the file or its code, else poly6)")
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
     cli_where.add_selection(parser)
     add = parser.add_argument_group("camera", "default: parallel rays along z, all of the particles").add_argument
@@ -88,9 +89,10 @@ def run(options: argparse.Namespace) -> None:
         table = chosen(table, "density", options.support, options.kernel, **cli_where.selected(options))
     particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
     say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
+    say("kernel", report.kernel)
     for note in report.notes:
         say("note", note)
-    columns = _Columns(table, particles, options.kernel)
+    columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
     camera = _camera(particles, options)
@@ -130,8 +132,8 @@ def _check(options: argparse.Namespace) -> None:
 class _Columns:
     """What a file's particles hold, in float64."""
 
-    def __init__(self, table: io.ParticleTable, particles: Particles, kernel: str) -> None:
-        self.table, self._particles, self._kernel = table, particles, kernel
+    def __init__(self, table: io.ParticleTable, particles: Particles) -> None:
+        self.table, self._particles = table, particles
         self.mass_name = table.named(*ROLES[MASS])
 
     @functools.cached_property
@@ -168,7 +170,7 @@ class _Columns:
     def _summed(self) -> np.ndarray:
         support = self._particles.to_numpy()["support"].astype(np.float64)
         mass = None if self.mass_name is None else self.mass
-        return io.kernel_sum(self.table.position, support, mass, kernel=self._kernel, box=self.table.box_size)
+        return io.kernel_sum(self.table.position, support, mass, kernel=self._particles.kernel, box=self.table.box_size)
 
 
 def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray | None, str, str]:

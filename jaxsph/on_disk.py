@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.io.assemble import in_box, opacity_of
+from jaxsph.io.assemble import in_box, kernel_of, opacity_of
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.snapshot_index import SnapshotIndex, index_of
 from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
@@ -56,7 +56,7 @@ class OnDisk:
         path: str | Path,
         quantity: str | None = None,
         *,
-        kernel: str = "poly6",
+        kernel: str | None = None,
         part_type: int | None = None,
         opacity_by: str | None = None,
         progress: Callable[[int, int], None] | None = None,
@@ -87,7 +87,7 @@ class OnDisk:
         names = tuple(dict.fromkeys((name, *([] if second is None else [second]))))
         ramp = "even" if name in ("x", "y", "z") else None
         nothing = Particles.from_arrays(np.zeros((0, 3)), 1.0, 0.0)
-        opened = cls(snapshot, index, names, kernel, nothing, ramp if second is None else "steep")
+        opened = cls(snapshot, index, names, kernel_of(table, kernel)[0], nothing, ramp if second is None else "steep")
         position, support, volume, *values = opened.columns_of(table)
         thinned = np.cbrt(max(len(index), 1) / max(len(table), 1))
         sample = opened.particles((position, (support * thinned).astype(support.dtype), volume, *values))

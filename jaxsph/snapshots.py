@@ -68,7 +68,7 @@ class Snapshots:
         quantity: str | None = None,
         *,
         support: float | None = None,
-        kernel: str = "poly6",
+        kernel: str | None = None,
         part_type: int | None = None,
         box: Any = "file",
         where: str | None = None,

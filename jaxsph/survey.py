@@ -33,7 +33,7 @@ class Reading:
 
     quantity: str | None = None
     support: float | None = None
-    kernel: str = "poly6"
+    kernel: str | None = None
     part_type: int | None = None
     box: Any = "file"
     where: str | None = None
@@ -41,7 +41,7 @@ class Reading:
     opacity_by: str | None = None
 
     @property
-    def how(self) -> tuple[float | None, str]:
+    def how(self) -> tuple[float | None, str | None]:
         """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
         return self.support, self.kernel
 

@@ -90,7 +90,7 @@ def test_gradients_are_those_of_differences_wherever_borders_are(frames, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@pytest.mark.parametrize("kernel", ["poly6", "cubic_spline", "wendland_c2"])
+@pytest.mark.parametrize("kernel", kernels.KERNELS)
 def test_gradients_are_those_of_differences_for(frames, kernel, projection, x64):
     """By one after the other of all that there is."""
     rng = np.random.default_rng(len(kernel))

@@ -28,7 +28,7 @@ def brute_force(particles, lower, spacing, shape, fill):
     return np.where(total > 0, (weight * columns["quantity"]).sum(-1) / np.where(total > 0, total, 1), fill)
 
 
-@pytest.mark.parametrize("kernel", ["poly6", "cubic_spline", "wendland_c2"])
+@pytest.mark.parametrize("kernel", kernels.KERNELS)
 def test_values_are_those_of_all_pairs(kernel, monkeypatch):
     monkeypatch.setattr(sys.modules["jaxsph.resample"], "PAIRS", 300)  # many chunks, and boxes that are cut
     particles, lower, spacing, shape = drawn(kernel), np.array([-0.9, -1.1, -0.5]), np.array([0.1, 0.15, 0.2]), (17, 12, 9)

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera import Camera
+from jaxsph.model.kernels import Kernel
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
-LIFT = 30  # binary digits by which strengths are lifted, so that weak ones do not underflow; kernels' degrees divide it
+LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow
 OFF = 2  # eps of its distance from the eye that a view coordinate may be off
 SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
 MIN_STEP = 16  # eps of its depth that a sample must be away from the next
@@ -30,14 +31,19 @@ def longest(dtype: Any) -> float:
     return float(jnp.finfo(dtype).max) ** RANGE
 
 
-def weakest(degree: int, dtype: Any) -> float:
+def lift_of_sizes(kernel: Kernel) -> int:
+    """Binary digits that sizes are lifted by, the root of what strengths are lifted by."""
+    return -(-LIFT // kernel.degree)
+
+
+def weakest(kernel: Kernel, dtype: Any) -> float:
     r"""Least strength, as a share of the largest, of a particle that is seen right up to its edge.
 
-    Where $1 - q = \delta$ a weight is about $\delta^k$ times the strength, with k = 3 or 4 by the kernel. It must be a normal
+    Where $1 - q = \delta$ a weight is about $\delta^k$ times the strength, with k the kernel's order there. It must be a normal
     number at $\delta$ = 2^-MAX_SHELL_BITS.
     """
-    power = 4 if degree == 5 else 3
-    return 2.0 ** (int(jnp.finfo(dtype).minexp) + power * MAX_SHELL_BITS - LIFT)
+    lift = kernel.degree * lift_of_sizes(kernel)
+    return 2.0 ** (int(jnp.finfo(dtype).minexp) + kernel.edge * MAX_SHELL_BITS - lift)
 
 
 def too_fine(camera: Camera, samples: int) -> Bool[Array, ""]:

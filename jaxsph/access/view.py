@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.footprint import pixel_ranges
-from jaxsph.access.resolution import LIFT, ROUNDING, unresolved, weakest
+from jaxsph.access.resolution import ROUNDING, lift_of_sizes, unresolved, weakest
 from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
@@ -156,9 +156,9 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     peak = greatest_of_all(lax.stop_gradient(strength.max(initial=0)))
     strength = strength / jnp.where(peak > 0, peak, 1)
     kernel = kernels.by_name(particles.kernel)
-    lift = 2.0 ** (LIFT // kernel.degree)
+    lift = 2.0 ** lift_of_sizes(kernel)
     size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
-    weak = (counts & (strength < weakest(kernel.degree, strength.dtype))) | (live & exponents.is_subnormal(volume))
+    weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & exponents.is_subnormal(volume))
     return size / support, size, weak
 
 

@@ -103,7 +103,7 @@ def read_particles(
     quantity: str | None = None,
     support: float | Float[np.ndarray, " particles"] | None = None,
     *,
-    kernel: str = "poly6",
+    kernel: str | None = None,
     part_type: int | None = None,
     progress: bool = False,
     box: Any = "file",
@@ -119,7 +119,7 @@ def read_particles(
             these; `None` picks the first telling one of a concentration, temperature, internal energy, density, speed.
         support: support radius in the file's length unit; `None` means the file's own, else the distance to the 32nd
             neighbour.
-        kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+        kernel: its name, one of `jaxsph.model.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.

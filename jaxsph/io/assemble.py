@@ -31,6 +31,9 @@ OUTSIDE = 1e-3
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
 AUTO = "auto"
+SETTLED = "support =", "kernel ="
+"""How conventions begin that are told where supports and kernels are."""
+DEFAULT_KERNEL = "poly6"
 DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
 """Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
 
@@ -49,6 +52,7 @@ class Report:
         support: one sentence on where the supports come from.
         support_range: smallest and largest support radius, length units; NaN for an empty set.
         volume: one sentence on where the volumes come from.
+        kernel: the smoothing kernel, and why it is that one.
         notes: further sentences: what was left out, periodic boxes, rounding.
     """
 
@@ -62,6 +66,7 @@ class Report:
     volume: str
     notes: tuple[str, ...]
     opacity_by: str | None = None
+    kernel: str = ""
 
     def __str__(self) -> str:
         lines = [
@@ -70,6 +75,7 @@ class Report:
             *([] if self.opacity_by is None else [f"opacity   by {self.opacity_by}"]),
             f"support   {self.support_range[0]:.6g} .. {self.support_range[1]:.6g}: {self.support}",
             f"volume    {self.volume}",
+            f"kernel    {self.kernel}",
         ]
         return "\n".join([*lines, *(f"note      {note}" for note in self.notes)])
 
@@ -78,7 +84,7 @@ def particles_from_table(
     table: ParticleTable,
     quantity: str | None = None,
     support: float | Float[np.ndarray, " particles"] | None = None,
-    kernel: str = "poly6",
+    kernel: str | None = None,
     *,
     progress: bool = False,
     box: Any = FROM_FILE,
@@ -96,7 +102,7 @@ def particles_from_table(
         table: what was read.
         quantity: name of a quantity (`jaxsph.io.quantities`), or `None` for the most telling one.
         support: one support radius, or one a particle, in the table's length unit; overrides the table's.
-        kernel: name of a kernel, for the particles and for kernel sums.
+        kernel: name of a kernel, for the particles and for kernel sums; `None` for the table's own, else poly6.
         progress: show progress bars; on a terminal large sets show them anyway.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the table, `None` for none.
         where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"` (`jaxsph.io.where`);
@@ -141,12 +147,13 @@ def _assemble(
     notes: list[str],
     quantity: str | None,
     support: float | np.ndarray | None,
-    kernel: str,
+    kernel: str | None,
     progress: bool,
     wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
     supports, support_origin = _supports(table, support, progress)
-    notes = [*(sentence for sentence in table.conventions if not sentence.startswith("support =")), *notes]
+    kernel, kernel_origin = kernel_of(table, kernel)
+    notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     mass_name = table.named(*ROLES["mass"])
     mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
     summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
@@ -187,8 +194,19 @@ def _assemble(
         volume=volume_origin,
         notes=tuple(notes),
         opacity_by=opacity_by,
+        kernel=kernel_origin,
     )
     return particles, report
+
+
+def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
+    """The smoothing kernel of a table's particles, and one sentence on why it is that one."""
+    if asked is not None:
+        return asked, f"{asked}, given by the caller"
+    if table.kernel is None:
+        return DEFAULT_KERNEL, f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
+    sentence = next((c for c in table.conventions if c.startswith("kernel =")), f"kernel = {table.kernel}")
+    return table.kernel, sentence.removeprefix("kernel = ")
 
 
 def _volumes(

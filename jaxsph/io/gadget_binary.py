@@ -64,7 +64,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
         box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
         said += notes
+        said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
         more: dict[str, Any] = {"box_size": box_size, "conventions": tuple(said), "time": time_of(header["time"])}
+        more["kernel"] = "cubic_spline"
         more |= {"part_type": chosen, "num_files": max(int(header["files"]), 1)}
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 

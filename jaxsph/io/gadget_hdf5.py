@@ -10,6 +10,8 @@ What `SmoothingLength` means depends on the code:
 Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
 `Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
 SWIFT in `Parameters`.
+The kernel is that which SWIFT (`HydroScheme`), GADGET-4 (`Config`) or GIZMO (`Kernel_Function_ID`) state; a cubic spline where
+nothing is said.
 Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
 """
 
@@ -29,15 +31,33 @@ from .units import of_gadget
 
 SOURCE = "Gadget HDF5"
 SWIFT_SOURCE = "SWIFT HDF5"
-SWIFT_GAMMA = {
-    "Cubic spline (M4)": 1.825742,
-    "Quartic spline (M5)": 2.018932,
-    "Quintic spline (M6)": 2.195775,
-    "Wendland C2": 1.936492,
-    "Wendland C4": 2.207940,
-    "Wendland C6": 2.449490,
+SWIFT_KERNELS = {
+    "Cubic spline (M4)": ("cubic_spline", 1.825742),
+    "Quartic spline (M5)": ("quartic_spline", 2.018932),
+    "Quintic spline (M6)": ("quintic_spline", 2.195775),
+    "Wendland C2": ("wendland_c2", 1.936492),
+    "Wendland C4": ("wendland_c4", 2.207940),
+    "Wendland C6": ("wendland_c6", 2.449490),
 }
-"""Support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
+"""Kernels, and support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
+GADGET4_KERNELS = {
+    "CUBIC_SPLINE_KERNEL": "cubic_spline",
+    "WENDLAND_C2_KERNEL": "wendland_c2",
+    "WENDLAND_C4_KERNEL": "wendland_c4",
+    "WENDLAND_C6_KERNEL": "wendland_c6",
+}
+"""What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
+GIZMO_KERNELS = {
+    3: "cubic_spline",
+    4: "quartic_spline",
+    5: "quintic_spline",
+    6: "wendland_c2",
+    7: "wendland_c4",
+    9: "wendland_c6",
+}
+"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION."""
+MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
+CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
 
 
@@ -79,11 +99,13 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     if smoothing is not None:
         support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
         said.append(sentence)
+    kernel, sentence = _kernel(file, header, swift)
+    said.append(sentence)
     box_size, notes = _box(header) if _is_periodic(file) else (None, [])
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
-    more |= {"part_type": chosen, "num_files": max(_num_files(header), 1)}
+    more |= {"part_type": chosen, "num_files": max(_num_files(header), 1), "kernel": kernel}
     return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 
@@ -108,15 +130,39 @@ def _is_swift(file: Any) -> bool:
 def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
     if not swift:
         return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
-    attributes = file["HydroScheme"].attrs if "HydroScheme" in file else {}
-    kernel = text(attributes.get("Kernel function", ""))
-    if kernel not in SWIFT_GAMMA:
+    kernel = _swift_kernel(file)
+    if kernel not in SWIFT_KERNELS:
         raise DataError(
             f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`); the support radius is known "
-            f"for {', '.join(SWIFT_GAMMA)}"
+            f"for {', '.join(SWIFT_KERNELS)}"
         )
-    gamma = SWIFT_GAMMA[kernel]
+    gamma = SWIFT_KERNELS[kernel][1]
     return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {kernel} kernel)"
+
+
+def _swift_kernel(file: Any) -> str:
+    return text(file["HydroScheme"].attrs.get("Kernel function", "")) if "HydroScheme" in file else ""
+
+
+def _kernel(file: Any, header: Any, swift: bool) -> tuple[str, str]:
+    """The smoothing kernel, and one sentence on where that is said."""
+    if swift:
+        stated = _swift_kernel(file)
+        if stated in SWIFT_KERNELS:
+            return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
+    config = set(file["Config"].attrs) if "Config" in file else set()
+    if config & MOVING_MESH:
+        return CUBIC, f"kernel = {CUBIC}: the cells of a moving mesh (AREPO) have none, and are drawn as particles"
+    compiled = [name for name in GADGET4_KERNELS if name in config]
+    if compiled:
+        return GADGET4_KERNELS[compiled[0]], f"kernel = {GADGET4_KERNELS[compiled[0]]} ({compiled[0]}, Config)"
+    number = np.ravel(np.asarray(header.get("Kernel_Function_ID", ())))
+    if len(number) and number.dtype.kind in "iuf":
+        found = GIZMO_KERNELS.get(int(number[0]))
+        if found is not None:
+            return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number[0])})"
+        return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number[0]} is none that is known here"
+    return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
 
 
 def _num_files(header: Any) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
                     stated = f"{len(columns[file.name])} values, but there are {len(position)} positions"
                     raise DataError(f"{where.parent.name}/{file.name} has {stated}; it is damaged or of another snapshot")
         said = [f"particles of type {chosen} ({where.parent.name})"]
-        return ParticleTable(position, columns, source=SOURCE, conventions=tuple(said), time=time, part_type=chosen)
+        said.append("kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)")
+        more: dict[str, Any] = {"conventions": tuple(said), "time": time, "part_type": chosen, "kernel": "cubic_spline"}
+        return ParticleTable(position, columns, source=SOURCE, **more)
 
 
 def _positions(folder: Path, number: int) -> Path | None:

@@ -64,12 +64,18 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     columns |= {"mass": np.full(len(h), mass), "density": mass * (hfact / h) ** 3}
     said += [
         "support = 2 x smoothing length h (Phantom convention)",
+        "kernel = cubic_spline (Phantom's unless it is compiled with another, which a dump does not say)",
         f"density = mass (hfact / h)^3 and volume = (h / hfact)^3, hfact = {hfact:g} (Phantom convention)",
     ]
     if "sinks" in file and len(file["sinks"]):
         said.append("sink particles are left out")
     volume, time = (h / hfact) ** 3, time_of(read_dataset(header["time"])) if "time" in header else None
-    more: dict[str, Any] = {"conventions": tuple(said), "units": of_phantom(header, columns), "time": time}
+    more: dict[str, Any] = {
+        "conventions": tuple(said),
+        "units": of_phantom(header, columns),
+        "time": time,
+        "kernel": "cubic_spline",
+    }
     return ParticleTable(position[keep], columns, SUPPORT_OVER_H * h, volume, source=SOURCE, **more)
 
 

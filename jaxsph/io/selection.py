@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .assemble import in_box, particles_from_table
+from .assemble import in_box, kernel_of, particles_from_table
 from .quantities import ROLES, choose_quantity
 from .table import ParticleTable, plain
 from .where import select
@@ -23,7 +23,7 @@ def chosen(
     table: ParticleTable,
     quantity: str | None = None,
     support: float | None = None,
-    kernel: str = "poly6",
+    kernel: str | None = None,
     *,
     box: Any = "file",
     where: str | None = None,
@@ -48,6 +48,7 @@ def chosen(
     if _is_density(boxed, choose_quantity(boxed, quantity, density=density)[1]):
         columns["density"] = density()
     said = [sentence for sentence in boxed.conventions if not sentence.startswith(ORIGIN)]
+    name, why = kernel_of(boxed, kernel)
     own = particles.to_numpy()
     return dataclasses.replace(
         boxed,
@@ -55,11 +56,17 @@ def chosen(
         columns={name: column[kept] for name, column in columns.items()},
         support=own["support"][kept],
         volume=own["volume"][kept],
-        conventions=(*said, report.support if report.support.startswith(ORIGIN) else ORIGIN + report.support, *told),
+        kernel=name,
+        conventions=(
+            *(sentence for sentence in said if not sentence.startswith("kernel =")),
+            f"kernel = {why}",
+            report.support if report.support.startswith(ORIGIN) else ORIGIN + report.support,
+            *told,
+        ),
     )
 
 
-def _density(table: ParticleTable, support: float | None, kernel: str) -> np.ndarray:
+def _density(table: ParticleTable, support: float | None, kernel: str | None) -> np.ndarray:
     return particles_from_table(table, "density", support, kernel)[0].to_numpy()["quantity"].astype(np.float64)
 
 

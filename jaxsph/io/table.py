@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxsph.model.kernels import by_name
+
 from .damage import DataError
 from .units import NO_UNITS, FileUnits
 
@@ -46,6 +48,8 @@ class ParticleTable:
         units: of positions and columns, and the moment, as far as the file states them.
         part_type: number of the type of particles that was read, where the format has types.
         num_files: how many files the snapshot has, of which this may be one.
+        kernel: name of the smoothing kernel that the file states, or that its code has unless told otherwise; `None` where the
+            format says nothing of kernels.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -64,8 +68,11 @@ class ParticleTable:
     units: FileUnits = NO_UNITS
     part_type: int | None = dataclasses.field(default=None, kw_only=True)
     num_files: int = dataclasses.field(default=1, kw_only=True)
+    kernel: str | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.kernel is not None:
+            by_name(self.kernel)
         position = native(np.asarray(self.position))
         if position.ndim != 2 or position.shape[1] != 3:
             raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -75,7 +75,9 @@ def _table(values: np.ndarray, chosen: int, kind: str, fields: tuple[str, ...], 
     said = [f"particles of type {chosen} ({kind})"]
     if "hsmooth" in columns:
         said.append("column `hsmooth` is not used: it is a softening in some codes; pass `support=` to set supports yourself")
-    return ParticleTable(values[:, 1:4], columns, source=SOURCE, conventions=tuple(said), time=time, part_type=chosen)
+    said.append("kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)")
+    more: dict[str, Any] = {"conventions": tuple(said), "time": time, "part_type": chosen, "kernel": "cubic_spline"}
+    return ParticleTable(values[:, 1:4], columns, source=SOURCE, **more)
 
 
 def _header(start: bytes) -> tuple[Order, np.void]:

@@ -7,7 +7,8 @@ kernels are sums of polynomials in r, each inside a radius c of its own, and $r 
 
 $$I_n(t) = \int_0^t r^n dt = \frac{t r^n + n b^2 I_{n-2}(t)}{n + 1}, \quad I_0 = t, \quad I_{-1} = \mathrm{asinh}(t / b),$$
 
-which is exact for whole chords and for any part of one. All functions take `xp`, which is `numpy` or `jax.numpy`.
+which is exact for whole chords and for any part of one. Kernels of high order are summed shell by shell instead
+(`shell_integrals`). All functions take `xp`, which is `numpy` or `jax.numpy`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxsph.model import kernels
+from jaxsph.model import kernels, shell_integrals
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
 
@@ -40,7 +41,7 @@ PIECES = {
     "cubic_spline": (Piece(1.0, (2, -6, 6, -2)), Piece(0.5, (-1, 6, -12, 8))),
     "wendland_c2": (Piece(1.0, (1, 0, -10, 20, -15, 4)),),
 }
-"""Of the kernels of `model.kernels`, without their norms."""
+"""Of some kernels of `model.kernels`, without their norms. Of others rounding would be too much; see `shell_integrals`."""
 
 
 def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
@@ -59,8 +60,10 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
     Differentiation:
         Finite everywhere.
     """
+    if kernels.by_name(name).name not in PIECES:
+        return 2 * shell_integrals.from_foot(name, square, xp.ones_like(square), xp)
     total = 0.0
-    for piece in PIECES[kernels.by_name(name).name]:
+    for piece in PIECES[name]:
         half, inside = _half_chord(piece, square, xp)
         total = total + 2 * xp.where(inside, _from_foot(piece, square, half, xp), 0)
     return kernels.by_name(name).norm * xp.maximum(total, 0)
@@ -68,8 +71,11 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
 
 def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) -> Any:
     """The same integral from t = `start` to t = `end`, with start <= end; all three broadcast."""
+    if kernels.by_name(name).name not in PIECES:
+        first, last = (shell_integrals.from_foot(name, square, t, xp) for t in (start, end))
+        return xp.maximum(last - first, 0)
     total = 0.0
-    for piece in PIECES[kernels.by_name(name).name]:
+    for piece in PIECES[name]:
         half, inside = _half_chord(piece, square, xp)
         ends = (_from_foot(piece, square, xp.clip(t, -half, half), xp) for t in (end, start))
         total = total + xp.where(inside, next(ends) - next(ends), 0)
@@ -78,8 +84,10 @@ def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) 
 
 def depth_share(name: str, start: Any, end: Any, xp: Any = jnp) -> Any:
     """How much of a kernel of support 1 lies between two planes at distances `start` <= `end` from its centre, in [0, 1]."""
+    if kernels.by_name(name).name not in PIECES:
+        return xp.clip(shell_integrals.below(name, end, xp) - shell_integrals.below(name, start, xp), 0, 1)
     total = 0.0
-    for radius, coefficients in PIECES[kernels.by_name(name).name]:
+    for radius, coefficients in PIECES[name]:
         low, high = xp.clip(start, -radius, radius), xp.clip(end, -radius, radius)
         for power, factor in enumerate(coefficients):
             n = power + 2

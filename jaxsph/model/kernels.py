@@ -29,6 +29,7 @@ class Kernel:
         name: what users call it.
         norm: $\sigma$, so that $\int W dx = 1$.
         degree: n, with $w(c q, c) = c^n w(q, 1)$.
+        edge: k, with $w(q, 1)$ about $(1 - q)^k$ near the edge of the support.
         prepare: `prepare(part, size)`: what the inner loop needs of the first part of $(c q)^2$ and of c.
         weigh: `weigh(prepared, rest, size, xp)`: $w(c q, c)$ for $(c q)^2$ = part + rest, and 0 outside the support; `xp` is
             `numpy` or `jax.numpy`.
@@ -39,6 +40,7 @@ class Kernel:
     name: str
     norm: float
     degree: int
+    edge: int
     prepare: Callable[[Any, Any], Any]
     weigh: Callable[[Any, Any, Any, Any], Any]
     slope: Callable[[Any, Any, Any, Any], Any]
@@ -83,6 +85,66 @@ def _wendland_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     return -10 * (outer * outer * outer)
 
 
+def _quartic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    outer, middle, inner = (_power(xp.maximum(end * size - r, 0), 4) for end in (1.0, 0.6, 0.2))
+    return outer - 5 * middle + 10 * inner
+
+
+def _quartic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    """Of the innermost piece as a polynomial of the square: its parts cancel at the centre."""
+    square = part + rest
+    r = xp.sqrt(square)
+    outer, middle = (_power(xp.maximum(end * size - r, 0), 3) for end in (1.0, 0.6))
+    return xp.where(r < 0.2 * size, 12 * square - 2.4 * (size * size), xp.minimum(10 * middle - 2 * outer, 0) / r)
+
+
+def _quintic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    outer, middle, inner = (_power(xp.maximum(end * size - r, 0), 5) for end in (1.0, 2 / 3, 1 / 3))
+    return outer - 6 * middle + 15 * inner
+
+
+def _quintic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    """As `_quartic_slope`."""
+    square = part + rest
+    r = xp.sqrt(square)
+    outer, middle = (_power(xp.maximum(end * size - r, 0), 4) for end in (1.0, 2 / 3))
+    inside = 20 * size * square - 25 * square * r - 20 / 9 * _power(size, 3)
+    return xp.where(r < 1 / 3 * size, inside, xp.minimum(15 * middle - 2.5 * outer, 0) / r)
+
+
+def _wendland_c4(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    square = part + rest
+    r = xp.sqrt(square)
+    return _power(xp.maximum(size - r, 0), 6) * (size * size + 6 * size * r + 35 / 3 * square)
+
+
+def _wendland_c4_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    r = xp.sqrt(part + rest)
+    return -28 / 3 * _power(xp.maximum(size - r, 0), 5) * (size + 5 * r)
+
+
+def _wendland_c6(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    square = part + rest
+    r = xp.sqrt(square)
+    return _power(xp.maximum(size - r, 0), 8) * (size * size * (size + 8 * r) + square * (25 * size + 32 * r))
+
+
+def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
+    square = part + rest
+    r = xp.sqrt(square)
+    return -11 * _power(xp.maximum(size - r, 0), 7) * (size * size + 7 * size * r + 16 * square)
+
+
+def _power(value: Any, exponent: int) -> Any:
+    """A whole power by multiplications alone."""
+    half = value * value if exponent < 4 else _power(value, exponent // 2)
+    if exponent < 4:
+        return half * value if exponent == 3 else half
+    return half * half * value if exponent % 2 else half * half
+
+
 def _margin(part: Any, size: Any) -> Any:
     return size * size - part
 
@@ -91,12 +153,17 @@ def _under_root(part: Any, size: Any) -> Any:
     return part + (MIN_SQUARE * (size * size) + NOTHING)
 
 
+_TABLE = "Dehnen & Aly 2012, table 1"
 KERNELS = {
     kernel.name: kernel
     for kernel in (
-        Kernel("poly6", 315 / (64 * math.pi), 6, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
-        Kernel("cubic_spline", 8 / math.pi, 3, _under_root, _cubic, _cubic_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
-        Kernel("wendland_c2", 21 / (2 * math.pi), 5, _under_root, _wendland, _wendland_slope, "Dehnen & Aly 2012, table 1"),
+        Kernel("poly6", 315 / (64 * math.pi), 6, 3, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
+        Kernel("cubic_spline", 8 / math.pi, 3, 3, _under_root, _cubic, _cubic_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
+        Kernel("wendland_c2", 21 / (2 * math.pi), 5, 4, _under_root, _wendland, _wendland_slope, _TABLE),
+        Kernel("quartic_spline", 5**6 / (512 * math.pi), 4, 4, _under_root, _quartic, _quartic_slope, _TABLE + ", M5"),
+        Kernel("quintic_spline", 3**7 / (40 * math.pi), 5, 5, _under_root, _quintic, _quintic_slope, _TABLE + ", M6"),
+        Kernel("wendland_c4", 495 / (32 * math.pi), 8, 6, _under_root, _wendland_c4, _wendland_c4_slope, _TABLE),
+        Kernel("wendland_c6", 1365 / (64 * math.pi), 11, 8, _under_root, _wendland_c6, _wendland_c6_slope, _TABLE),
     )
 }
 
@@ -112,10 +179,13 @@ def evaluate(name: str, r: Float[Array, "..."], support: Float[Array, "..."]) ->
     r"""Kernel value $W(r, H)$.
 
     Poly6: $\frac{315}{64\pi H^3} (1 - q^2)^3$; cubic spline: $\frac{8}{\pi H^3} (2 (1-q)^3 - 8 (1/2 - q)_+^3)$;
-    Wendland C2: $\frac{21}{2\pi H^3} (1 - q)^4 (1 + 4q)$; with $q = r/H$, and 0 for $q \ge 1$.
+    Wendland C2: $\frac{21}{2\pi H^3} (1 - q)^4 (1 + 4q)$, C4: $\frac{495}{32\pi H^3} (1 - q)^6 (1 + 6q + 35 q^2 / 3)$, C6:
+    $\frac{1365}{64\pi H^3} (1 - q)^8 (1 + 8q + 25q^2 + 32q^3)$; quartic spline (M5):
+    $\frac{5^6}{512\pi H^3} ((1-q)^4 - 5 (3/5 - q)_+^4 + 10 (1/5 - q)_+^4)$, quintic spline (M6):
+    $\frac{3^7}{40\pi H^3} ((1-q)^5 - 6 (2/3 - q)_+^5 + 15 (1/3 - q)_+^5)$; with $q = r/H$, and 0 for $q \ge 1$.
 
     Args:
-        name: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+        name: one of `KERNELS`.
         r: distance to the particle, `>= 0`, in length units.
         support: support radius $H > 0$ (**not** the smoothing length), same units as `r`.
 

@@ -45,7 +45,7 @@ class Particles:
         quantity: the carried quantity q, the input of the transfer function; of two, that of colours.
         volume: V >= 0, any unit: only ratios between particles matter.
         valid: which entries are particles; the rest is padding and contributes nothing.
-        kernel: `"poly6"`, `"cubic_spline"` or `"wendland_c2"`.
+        kernel: its name, one of `jaxsph.model.kernels.KERNELS`.
         position_rest: what rounding float64 positions to `position` has left, length units; None where that is a negligible
             part of every support.
         extinction_quantity: the second carried quantity, by which extinction is looked up; None where there is one alone.

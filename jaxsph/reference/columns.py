@@ -17,7 +17,7 @@ from jaxsph.model.particles import Particles
 from jaxsph.model.projection import Projection
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
-KINKS = 0.0, 0.5, 1.0  # distances in supports between which all kernels are smooth
+KINKS = 0.0, 0.2, 1 / 3, 0.5, 0.6, 2 / 3, 1.0  # distances in supports between which all kernels are smooth
 
 
 def project(

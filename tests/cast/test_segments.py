@@ -104,7 +104,7 @@ def two_pieces_at_most(rays, position, support, view):
     return not (apart & (inner[0] == inner[1])).any()
 
 
-@pytest.mark.parametrize("kernel", ["poly6", "cubic_spline", "wendland_c2"])
+@pytest.mark.parametrize("kernel", kernels.KERNELS)
 def test_an_image_is_the_integral_of_its_light(kernel):
     """Supports of all sizes, and colours that change from one to the next: but for where that is within a segment or two."""
     particles, view = several(np.random.default_rng(0), kernel), camera()

@@ -3,8 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+import jaxsph as js
 import jaxsph.io as io
-from jaxsph.io.gadget_hdf5 import SWIFT_GAMMA
+from jaxsph.io.gadget_hdf5 import GADGET4_KERNELS, GIZMO_KERNELS, SWIFT_KERNELS
+from jaxsph.model import kernels
 
 h5py = pytest.importorskip("h5py")
 
@@ -16,24 +18,72 @@ def test_the_smoothing_length_of_gadget_is_the_support(samples, tmp_path):
     assert any("support = SmoothingLength (Gadget convention" in sentence for sentence in table.conventions)
 
 
-@pytest.mark.parametrize("kernel", list(SWIFT_GAMMA))
+@pytest.mark.parametrize("kernel", list(SWIFT_KERNELS))
 def test_the_support_of_swift_is_gamma_smoothing_lengths_of_its_kernel(kernel, samples, tmp_path):
     samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel=kernel)
     table = io.read_table(tmp_path / "a.hdf5")
-    np.testing.assert_allclose(table.support, SWIFT_GAMMA[kernel] * 0.5)
+    np.testing.assert_allclose(table.support, SWIFT_KERNELS[kernel][1] * 0.5)
     assert table.source == "SWIFT HDF5"
-    assert any(str(SWIFT_GAMMA[kernel]) in sentence and kernel in sentence for sentence in table.conventions)
+    assert any(str(SWIFT_KERNELS[kernel][1]) in sentence and kernel in sentence for sentence in table.conventions)
 
 
-@pytest.mark.parametrize("kernel", ["cubic_spline", "wendland_c2"])
-def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel):
-    from jaxsph.model import kernels
-
+@pytest.mark.parametrize(("kernel", "gamma"), SWIFT_KERNELS.values())
+def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel, gamma):
     q = np.linspace(0, 1, 100_001)
     weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].of_square(q**2, np)
     deviation = np.sqrt(np.trapezoid(weight * q**4, q) / 3)
-    swift = {"cubic_spline": "Cubic spline (M4)", "wendland_c2": "Wendland C2"}[kernel]
-    assert SWIFT_GAMMA[swift] == pytest.approx(1 / (2 * deviation), rel=1e-6)
+    assert gamma == pytest.approx(1 / (2 * deviation), rel=1e-6)
+
+
+STATED = [
+    *((name, "swift", stated) for stated, (name, _) in SWIFT_KERNELS.items()),
+    *((name, "Config", stated) for stated, name in GADGET4_KERNELS.items()),
+    *((name, "Kernel_Function_ID", stated) for stated, name in GIZMO_KERNELS.items()),
+    ("cubic_spline", "Kernel_Function_ID", 2),
+    ("cubic_spline", "Config", "PERIODIC"),
+    ("cubic_spline", "Config", "VORONOI"),
+    ("cubic_spline", None, None),
+]
+
+
+def write(path, samples, place, stated):
+    """A snapshot whose code says its kernel somewhere."""
+    samples.write_gadget_hdf5(path, samples.particles(), **({"swift_kernel": stated} if place == "swift" else {}))
+    with h5py.File(path, "a") as file:
+        if place == "Config":
+            file.require_group("Config").attrs[stated] = ""
+        if place == "Kernel_Function_ID":
+            file["Header"].attrs[place] = stated
+    return path
+
+
+@pytest.mark.parametrize(("name", "place", "stated"), STATED)
+def test_the_kernel_is_the_one_that_the_file_states_and_that_is_said(name, place, stated, samples, tmp_path):
+    table = io.read_table(write(tmp_path / "a.hdf5", samples, place, stated))
+    assert table.kernel == name
+    particles, report = io.particles_from_table(table, "x", 0.5, box=None)
+    assert particles.kernel == name and report.kernel.startswith(name) and f"kernel    {report.kernel}" in str(report)
+    particles, report = io.particles_from_table(table, "x", 0.5, "poly6", box=None)
+    assert particles.kernel == "poly6" and report.kernel == "poly6, given by the caller"
+    assert not any(note.startswith("kernel") for note in report.notes)
+
+
+@pytest.mark.parametrize("name", sorted(kernels.KERNELS))
+def test_files_are_drawn_with_the_kernel_that_they_state(name, samples, tmp_path, frames, compare):
+    """Against float64 brute force, each kernel once: as SWIFT, GADGET-4, GIZMO or a code that says nothing state it."""
+    place, stated = next(((place, stated) for kernel, place, stated in STATED if kernel == name), (None, None))
+    path = write(tmp_path / "a.hdf5", samples, place, stated)
+    given = io.read_particles(path, "x", 0.6, box=None, **({"kernel": name} if place is None else {}))
+    columns = given.to_numpy()
+    middle = columns["position"].mean(0)
+    columns["position"] = ((columns["position"] - middle) / np.ptp(columns["position"])).astype(np.float32)
+    particles = js.Particles.from_arrays(**columns, kernel=given.kernel, capacity=frames.capacity)
+    values = np.linspace(columns["quantity"].min(), columns["quantity"].max(), 5)
+    transfer = js.TransferFunction.from_points(values, np.eye(5, 3), np.full(5, 3.0))
+    scene, camera = js.Scene(particles=particles, transfer=transfer), frames.camera(np.random.default_rng(3))
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    compare(image, js.reference.render(scene, camera, frames.settings), 1e-4, 0.999)
+    assert particles.kernel == name and float(image.alpha.max()) > 0.1
 
 
 def test_an_unknown_swift_kernel_is_refused(samples, tmp_path):

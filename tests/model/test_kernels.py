@@ -15,7 +15,16 @@ formulas = {
     "poly6": lambda q: 315 / (64 * np.pi) * (1 - q * q) ** 3,
     "cubic_spline": lambda q: 8 / np.pi * (1 - 6 * q**2 + 6 * q**3 if q <= 0.5 else 2 * (1 - q) ** 3),
     "wendland_c2": lambda q: 21 / (2 * np.pi) * (1 - q) ** 4 * (1 + 4 * q),
+    "quartic_spline": lambda q: spline(q, 2.5, (1, -5, 10), 4) / (20 * np.pi) * 2.5**3,
+    "quintic_spline": lambda q: spline(q, 3, (1, -6, 15), 5) / (120 * np.pi) * 27,
+    "wendland_c4": lambda q: 495 / (32 * np.pi) * (1 - q) ** 6 * (1 + 6 * q + 35 / 3 * q**2),
+    "wendland_c6": lambda q: 1365 / (64 * np.pi) * (1 - q) ** 8 * (1 + 8 * q + 25 * q**2 + 32 * q**3),
 }
+
+
+def spline(q, reach, factors, power):
+    """M5 and M6 as Price 2012 has them, JCP 231, equations 7 and 8: by r / h, of which the support is `reach`."""
+    return sum(factor * max(reach - k - q * reach, 0) ** power for k, factor in enumerate(factors))
 
 
 @names
@@ -24,7 +33,9 @@ def test_integral_over_space_is_one(name, support, x64):
     def shell(r):
         return 4 * np.pi * r * r * float(kernels.evaluate(name, r, support))
 
-    value = integrate.quad(shell, 0, support, points=[support / 2], epsabs=0, epsrel=1e-10)[0]
+    value = integrate.quad(
+        shell, 0, support, points=[part * support for part in (0.2, 1 / 3, 0.5, 0.6, 2 / 3)], epsabs=0, epsrel=1e-10
+    )[0]
     assert abs(value - 1) < 1e-9
 
 
