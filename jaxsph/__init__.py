@@ -17,13 +17,14 @@ from jaxsph.model.domains import control_values
 from jaxsph.model.framing import along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
+from jaxsph.numerics.faults import CapacityError
 from jaxsph.on_disk import OnDisk
 from jaxsph.plan import Plan
 from jaxsph.planning import plan
 from jaxsph.progressive import Progressive, progressive
 from jaxsph.project import project
 from jaxsph.projection_plan import ProjectionPlan, plan_projection
-from jaxsph.render import CapacityError, render
+from jaxsph.render import render
 from jaxsph.resample import resample
 from jaxsph.slices import Slice, slice_of
 from jaxsph.snapshots import Snapshots

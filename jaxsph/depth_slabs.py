@@ -36,10 +36,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.along_rays import first_samples
+from jaxsph.claims import certified, disclaimed, faults_of_settings, missed, tell
 from jaxsph.depth_dealing import Parts, dealt_particles
 from jaxsph.field.schedule import SlabRange
 from jaxsph.frame import Drawn, Frame, over_bands
-from jaxsph.layers import OfShards, assemble, blank_if, crop, of_band
+from jaxsph.layers import OfShards, assemble, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles import Particles
@@ -54,7 +55,7 @@ from jaxsph.numerics.executors import Executor, Traced
 from jaxsph.over_mesh import apart, on_each, over
 from jaxsph.plan import Plan
 from jaxsph.planning import see
-from jaxsph.render import certifies, metadata_of, missed, raise_for, tell, with_ended_rays
+from jaxsph.render import metadata_of
 from jaxsph.viewing import Seen, half_steps
 
 TIES = 16  # eps that a transmittance may be off one half, where rounding decides which depth slab it crosses in
@@ -144,13 +145,11 @@ def _eager(slabs: DepthSlabs, camera: Camera, settings: Settings) -> Image:
     image = jax.block_until_ready(_program(settings)(slabs, camera))
     seconds = {"cast": time.perf_counter() - begun}
     word = int(image.faults)
-    raise_for(word & ~faults.TOLD, False)
+    faults.raise_for(word & ~faults.TOLD)
     tell(word, image, settings)
     stats = {name: int(value) for name, value in image.stats.items()} | {"seconds": seconds}
-    certified = bool(image.certified)
-    return dataclasses.replace(
-        image, certified=certified, faults=word, stats=stats, metadata=metadata_of(camera, settings, certified)
-    )
+    proven = bool(image.certified)
+    return dataclasses.replace(image, certified=proven, faults=word, stats=stats, metadata=metadata_of(camera, settings, proven))
 
 
 @functools.lru_cache(maxsize=16)
@@ -171,12 +170,11 @@ def _traced(slabs: DepthSlabs, camera: Camera, settings: Settings) -> Image:
     parts = slabs.scene.particles, slabs.parts
     images, full, found = over(mesh, of_device, (rest, slabs.scene.transfer, camera, share), parts)
     word = functools.reduce(lambda a, b: a | b, [found.faults[nth] for nth in range(mesh.size)])
-    image = blank_if(word & faults.UNUSABLE != 0, composited(apart(images, mesh.size)))
-    word = word | missed(image, settings)
+    image = composited(apart(images, mesh.size))
+    word = word | missed(image, settings) | faults_of_settings(settings)
     counts = {"cells": found.filled.sum(), "pairs": found.pairs.sum()}
     stats = {"evaluations": image.evaluations.sum(), "evaluations_full": full.sum(), **counts}
-    certified = certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
-    return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
+    return disclaimed(dataclasses.replace(image, certified=jnp.asarray(certified(plan, settings)), stats=stats), word)
 
 
 def _part(scene: Scene, own: Parts, camera: Camera, share: Settings, plan: Plan, mesh: Mesh) -> tuple[Image, Any, Drawn]:
@@ -190,8 +188,7 @@ def _part(scene: Scene, own: Parts, camera: Camera, share: Settings, plan: Plan,
     found = over_bands(plan, functools.partial(_band, frame, run, axes))
     layers = crop(found.layers, plan)
     word = found.faults | seen.viewed.faults | _beyond(seen, own, camera, plan, axes)
-    image = with_ended_rays(assemble(layers, word), share)
-    image = dataclasses.replace(image, certified=jnp.asarray(True))
+    image = dataclasses.replace(assemble(layers, word), certified=jnp.asarray(True))
     return image, layers.full, Drawn((), word, found.filled, found.pairs)
 
 
@@ -245,7 +242,7 @@ def composited(parts: tuple[Image, ...]) -> Image:
             color=color,
             transmittance=front * part.transmittance,
             depth=jnp.minimum(whole.depth, part.depth),
-            error_bound=bound,
+            error_bound=jnp.minimum(bound, 1),
             evaluations=whole.evaluations + part.evaluations,
             levels=levels,
         )

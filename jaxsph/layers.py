@@ -5,13 +5,13 @@ Flow: cast -> [layers] -> Image.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax import lax
+from jaxtyping import Array, Float, Int
 
 from jaxsph.access.lists import BUNDLE
 from jaxsph.access.shards import unshard
@@ -21,6 +21,9 @@ from jaxsph.model.image import Image
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.plan import Plan
 from jaxsph.stages import Cast, Verdict
+
+REFERENCE = "samples"
+"""The integrator whose image at full rate is what errors are bounded against: of others none is known without an estimate."""
 
 
 class OfShards(NamedTuple):
@@ -75,14 +78,22 @@ def of_band(band: OfShards, *, plan: Plan) -> Layers:
         error = unshard(tuple(shard.rays.error for shard in band.cast), 0)
         bound = registry.screen(plan.screen).resolve(RayResult(color, error, depth), lists)[1]
     color, transmittance, depth = pixels
+    if band.cast[0].cut is not None:  # what may be left out by rays that ended is what they let through
+        cut = unshard(tuple(shard.cut for shard in band.cast))
+        bound = bound + jnp.where(over_pixels(cut), lax.stop_gradient(transmittance), 0)
     return Layers(color, transmittance, depth, over_pixels(spent), bound, over_pixels(verdict.full), levels)
 
 
 def crop(bands: Layers, plan: Plan) -> Layers:
-    """Join the layers of all bands, stacked, and cut off what lies beyond the image; levels of cells come first."""
+    """Join the layers of all bands, stacked, and cut off what lies beyond the image; levels of cells come first.
+
+    No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: NaN.
+    """
     joined = jax.tree.map(lambda layer: layer.reshape(-1, *layer.shape[2:]), bands)
     levels, joined = joined.levels, joined._replace(levels=None)
     image: Layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], joined)
+    known = plan.integrator == REFERENCE or plan.cast.doublings
+    image = image._replace(bound=jnp.minimum(image.bound, 1) if known else jnp.full_like(image.bound, jnp.nan))
     if levels is None:
         return image
     rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
@@ -92,11 +103,3 @@ def crop(bands: Layers, plan: Plan) -> Layers:
 def assemble(layers: Layers, word: Array | int) -> Image:
     """The image of those layers."""
     return Image(*layers[:3], layers.bound, layers.evaluations, True, word, {}, levels=layers.levels)
-
-
-def blank_if(unusable: Bool[Array, ""], image: Image) -> Image:
-    """Nothing at all instead of the NaN that unusable numbers would make."""
-    color = jnp.where(unusable, 0, image.color)
-    transmittance = jnp.where(unusable, 1, image.transmittance)
-    depth, bound = jnp.where(unusable, jnp.inf, image.depth), jnp.where(unusable, 0, image.error_bound)
-    return dataclasses.replace(image, color=color, transmittance=transmittance, depth=depth, error_bound=bound)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxsph.access.lists import TILE, ListPlan
@@ -39,9 +40,10 @@ MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wid
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Everything that fixes a shape: hashable, and shared by similar frames.
+    """Everything that fixes a shape: hashable, and shared by similar frames. A pytree without leaves: any argument of `jit`.
 
     Attributes:
         width, height: of the image, pixels.

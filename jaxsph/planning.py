@@ -24,6 +24,7 @@ from jaxsph.along_rays import along_rays, first_samples
 from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures, measure
 from jaxsph.model import registry
+from jaxsph.model.asked import require_asked
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.periodic import num_ghosts
@@ -67,7 +68,8 @@ def plan(
         ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
             `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
-    settings = settings or Settings()
+    settings = Settings() if settings is None else settings
+    require_asked(scene, camera, settings)
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     if not headroom >= 1:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsph.claims import with_ended_rays
 from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Frame
 from jaxsph.layers import assemble
@@ -20,12 +21,13 @@ from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor, Forecast
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.planning import PLANS
 from jaxsph.refinement import Decisions, Refinement
-from jaxsph.render import metadata_of, raise_for, with_ended_rays
+from jaxsph.render import metadata_of
 from jaxsph.screen.canvas import Canvas
 from jaxsph.screen.marking import Quality
 from jaxsph.screen.packets import Queue
@@ -137,7 +139,7 @@ class _State:
         """With all bands known, and what their leaves want."""
         made = [self.filling.decided(row) for row in self._rows]
         word = functools.reduce(operator.or_, (int(grid.lists.faults) for _, grid in made), self.word)
-        raise_for(word, True)
+        faults.raise_for(word, True)
         return dataclasses.replace(self, word=word)._marked(self.canvas, [one for one, _ in made], worst, share)
 
     def _marked(self, canvas: Canvas, decisions: list[Decisions], worst: int | None, share: float) -> _State:
@@ -189,7 +191,7 @@ def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) 
     begun = filling(clock)
     canvas, made = begun.begun()
     word = int(seen.viewed.faults) | int(made.lists.faults)
-    raise_for(word, True)
+    faults.raise_for(word, True)
     return _State(begun, clock, word, canvas, begun.judged(canvas), (), 0)
 
 

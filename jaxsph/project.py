@@ -34,10 +34,10 @@ from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock
+from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.given import in_unit
 from jaxsph.projection_plan import SHARES, WANTED, ProjectionPlan, beside, plan_projection
-from jaxsph.render import CapacityError
 from jaxsph.version import __version__
 
 

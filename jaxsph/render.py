@@ -8,19 +8,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-import warnings
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Int
 
-from jaxsph.control.pilot import PilotPlan
+from jaxsph.claims import certified, disclaimed, faults_of_settings, missed, tell, with_ended_rays
 from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Band, Drawn, Frame
-from jaxsph.layers import Layers, assemble, blank_if, crop, develop, of_band
+from jaxsph.layers import Layers, assemble, crop, develop, of_band
+from jaxsph.model.asked import require_asked
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.registry import ESTIMATING
@@ -31,22 +30,18 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.device_executors import OnDevices
 from jaxsph.numerics.devices import chosen_devices, mesh_of
 from jaxsph.numerics.executors import Clock, Executor, Forecast, Traced
-from jaxsph.numerics.programs import PROGRAMS
+from jaxsph.numerics.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.over_devices import draw_over_devices
 from jaxsph.over_mesh import drawn_over_mesh
 from jaxsph.plan import Plan
 from jaxsph.planning import PLANS, see
 from jaxsph.refinement import refined
-from jaxsph.stages import ends, least_transmittance
 from jaxsph.version import __version__
 from jaxsph.viewing import Seen
 
 Progress = Callable[[int, int], None]
-
-
-class CapacityError(ValueError):
-    """A given plan has no room for this frame: make a new one with `jaxsph.plan`."""
+MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
 
 def render(
@@ -96,7 +91,10 @@ def render(
     References:
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
     """
-    settings = settings or Settings()
+    settings = Settings() if settings is None else settings
+    require_asked(scene, camera, settings)
+    if plan is not None and not isinstance(plan, Plan):
+        raise ValueError(f"`plan` must be a `jaxsph.Plan`, got {type(plan).__name__}; make one with `jaxsph.plan`")
     if is_traced(scene, camera, settings):
         if plan is None:
             raise ValueError(
@@ -145,8 +143,10 @@ def image_of(
         clock.foresee(lambda known: draw(Forecast(known), None))
         bands, layers = draw(clock, progress)
     word = functools.reduce(operator.or_, [int(seen.viewed.faults), *(int(band.faults) for band in bands)])
-    raise_for(word, planned)
-    image = with_ended_rays(assemble(layers, word), settings)
+    faults.raise_for(word, planned)
+    image = assemble(layers, word)
+    if plan.quadtree is not None:
+        image = with_ended_rays(image, settings)
     word |= int(missed(image, settings))
     tell(word, image, settings)
     stats = {
@@ -159,9 +159,9 @@ def image_of(
     if layers.rays is not None:
         stats["rays"] = int(layers.rays)
     clock.mark("image")
-    certified = certifies(plan) and (plan.control is None or float(settings.relax) == 0)
-    metadata = metadata_of(camera, settings, certified)
-    return dataclasses.replace(image, certified=certified, faults=word, stats=stats, metadata=metadata)
+    proven = bool(certified(plan, settings))
+    metadata = metadata_of(camera, settings, proven)
+    return dataclasses.replace(image, certified=proven, faults=word, stats=stats, metadata=metadata)
 
 
 def _draw(
@@ -189,21 +189,43 @@ def _draw(
 
 
 def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan, devices: Any) -> Image:
-    if plan.quadtree is not None:
-        if devices is not None:
-            raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
-        return _refined_traced(scene, camera, settings, plan)
-    if devices is None:
+    """As one program of all that is traced: numbers of settings that are known stay so."""
+    if plan.quadtree is not None and devices is not None:
+        raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
+    numbers, structure = jax.tree.flatten(settings)
+    known = tuple(None if is_traced(number) else number for number in numbers)
+    program = _program(plan, structure, known, None if devices is None else mesh_of(devices))
+    image: Image = program(scene, camera, [number for number in numbers if is_traced(number)])
+    return image
+
+
+@kept_while_there_is_room
+@functools.lru_cache(maxsize=MAX_TRACED)
+def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> Any:
+    """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
+
+    Within one, it is no call of its own.
+    """
+
+    def drawn(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
+        given = iter(numbers)
+        settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
+        if plan.quadtree is not None:
+            return _refined_traced(scene, camera, settings, plan)
+        return _image_traced(scene, camera, settings, plan, mesh)
+
+    return jax.jit(drawn, inline=True)
+
+
+def _image_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan, mesh: Any) -> Image:
+    if mesh is None:
         found = _drawn(scene, camera, settings, plan)
     else:
-        found = drawn_over_mesh(scene, camera, settings, plan, mesh_of(devices))
-    layers, word = found.layers, found.faults
-    image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
-    word = word | missed(image, settings)
-    spent = image.evaluations.sum()
-    stats = {"evaluations": spent, "evaluations_full": layers.full.sum(), "cells": found.filled, "pairs": found.pairs}
-    certified = certifies(plan) & (jnp.asarray(plan.control is None) | (jnp.asarray(settings.relax) == 0))
-    return dataclasses.replace(image, certified=certified, faults=word, stats=stats)
+        found = drawn_over_mesh(scene, camera, settings, plan, mesh)
+    image, full = assemble(found.layers, found.faults), found.layers.full
+    stats = {"evaluations": image.evaluations.sum(), "evaluations_full": full.sum(), "cells": found.filled, "pairs": found.pairs}
+    image = dataclasses.replace(image, certified=jnp.asarray(certified(plan, settings)), stats=stats)
+    return disclaimed(image, found.faults | faults_of_settings(settings) | missed(image, settings))
 
 
 def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
@@ -219,48 +241,11 @@ def _refined_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan
     seen = see(scene, camera, plan, run)
     bands, layers = refined(Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run), run, None)
     word = functools.reduce(operator.or_, [band.faults for band in bands]) | seen.viewed.faults
-    image = with_ended_rays(blank_if(word & faults.UNUSABLE != 0, assemble(layers, word)), settings)
+    image = with_ended_rays(assemble(layers, word), settings)
     counts = {"cells": sum(band.filled for band in bands), "pairs": sum(band.pairs for band in bands)}
     stats = {"evaluations": image.evaluations.sum(), "evaluations_full": layers.full.sum(), **counts, "rays": layers.rays}
-    return dataclasses.replace(image, certified=jnp.asarray(False), stats=stats)
-
-
-def with_ended_rays(image: Image, settings: Settings) -> Image:
-    """With what rays that may have ended can have left out: colour and alpha change by at most what is let through."""
-    if not ends(settings):
-        return image
-    let_through = lax.stop_gradient(image.transmittance)
-    left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
-    return dataclasses.replace(image, error_bound=image.error_bound + left_out)
-
-
-def missed(image: Image, settings: Settings) -> Int[Array, ""]:
-    """Fault bit of a tolerance that segments were refined for, and that the estimate is above somewhere."""
-    if not settings.is_refined:
-        return jnp.int32(faults.NONE)
-    above = lax.stop_gradient(image.error_bound) > settings.tolerance
-    return faults.raised(faults.TOLERANCE_MISSED, above.any())
-
-
-def tell(word: int, image: Image, settings: Settings) -> None:
-    """Warn the caller of who calls this of what is no reason to raise."""
-    if word & faults.TOLD:
-        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
-        pixels = f"{number} of {image.error_bound.size} pixels"
-        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
-
-
-def certifies(plan: Plan) -> bool:
-    """Whether the error can be bounded at all."""
-    return not isinstance(plan.control, PilotPlan) and plan.quadtree is None and not plan.cast.doublings
-
-
-def raise_for(word: int, planned: bool) -> None:
-    """Raise what faults say; `planned`: whether capacities were made for the frame."""
-    if word & faults.OVERFLOWS and not planned:
-        raise CapacityError(f"`plan` is too small for this frame: {faults.describe(word)}")
-    if word:
-        raise ValueError(f"this frame cannot be rendered: {faults.describe(word)}")
+    image = dataclasses.replace(image, certified=jnp.asarray(False), stats=stats)
+    return disclaimed(image, word | faults_of_settings(settings))
 
 
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:

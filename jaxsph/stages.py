@@ -349,10 +349,11 @@ def _among(transfer: TransferFunction | None, references: list[Array], dtype: An
 
 
 class Cast(NamedTuple):
-    """What the rays of a shard meet, and the kernel evaluations of each bundle, a pixel."""
+    """What the rays of a shard meet, the kernel evaluations of each bundle, a pixel, and whose rays ended before their ends."""
 
     rays: RayResult
     evaluations: Float[Array, " bundles"]
+    cut: Bool[Array, " bundles"] | None
 
 
 @stage("shards", "cast_plan", "integrator", "screen", "formulas")
@@ -391,4 +392,5 @@ def cast_shard(
         spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)
     if rays.left_out is not None:
         spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
-    return Cast(rays, spent if of_nodes is None else spent + of_nodes)
+    cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, spent.shape[0], BUNDLE * BUNDLE) > 0
+    return Cast(rays, spent if of_nodes is None else spent + of_nodes, cut)

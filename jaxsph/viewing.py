@@ -22,6 +22,7 @@ from jaxsph.field.volume import VolumeMedium
 from jaxsph.field.within import Within
 from jaxsph.model.camera import Camera
 from jaxsph.model.clips import Clip
+from jaxsph.model.in_range import scene_in_range
 from jaxsph.model.medium import Medium
 from jaxsph.model.periodic import unfolded
 from jaxsph.model.scene import Scene
@@ -58,6 +59,7 @@ def view_scene(
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
     dtype, within = jnp.promote_types(scene.dtype, camera.dtype), scene.particles_within
     margin = longest_interval(camera, samples) if between_samples else 0.0
+    scene, clipped = scene_in_range(scene)
     scene, folded = _unfolded(scene, capacity, margin)
     particles = spheres_of(scene).padded(capacity)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
@@ -68,7 +70,7 @@ def view_scene(
     media = _media(scene, camera, dtype)
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
-    viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded)
+    viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
     return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
 
 
@@ -129,9 +131,8 @@ def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
 
 
 def _shows(transfer: TransferFunction) -> Bool[Array, ""]:
-    """Whether a transfer function is usable."""
-    shown = ((transfer.colors >= 0) & (transfer.colors <= 1)).all()
-    shown &= ((transfer.extinction >= 0) & jnp.isfinite(transfer.extinction)).all()
+    """Whether a transfer function is usable, once it is in range."""
+    shown = jnp.isfinite(transfer.colors).all() & jnp.isfinite(transfer.extinction).all()
     for part in transfer.parts():
-        shown &= (part.values[1:] >= part.values[:-1]).all() & jnp.isfinite(part.values).all() & ~too_small(part.values)
+        shown &= jnp.isfinite(part.values).all() & ~too_small(part.values)
     return shown

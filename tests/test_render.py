@@ -206,8 +206,8 @@ def jitted(frames):
         ("particles", "support", -1.0, "a particle has a position"),
         ("particles", "quantity", np.inf, "a particle has a position"),
         ("particles", "volume", -1.0, "a particle has a position"),
-        ("transfer", "extinction", -1.0, "transfer function is not usable"),
-        ("transfer", "colors", 2.0, "transfer function is not usable"),
+        ("transfer", "extinction", -1.0, "transfer function or points were clipped"),
+        ("transfer", "colors", 2.0, "transfer function or points were clipped"),
         ("transfer", "values", np.nan, "transfer function is not usable"),
         ("camera", "eye", np.nan, "camera is not usable"),
         ("camera", "near", -1.0, "camera is not usable"),
@@ -227,7 +227,9 @@ def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, jitted, part
     else:
         scene = dataclasses.replace(scene, **{part: spoil(getattr(scene, part))})
     image = jitted(scene, camera)
-    assert int(image.faults) != 0
+    assert int(image.faults) != 0 and not image.certified and (np.asarray(image.error_bound) == 1).all()
+    with pytest.raises(ValueError, match=message):
+        image.check()
     if part == "particles":
         assert np.isfinite(image.color).all()
     with pytest.raises(ValueError, match=message):

@@ -99,12 +99,15 @@ def touches(
 
     With unit normals $n_1, n_2$ of the two violated planes, $c = n_1 \cdot n_2$, distances $a \ge b$: the nearest point of plane
     one is $a$ away, and from there plane two is still $b - c a$ away along a direction of length $\sqrt{1 - c^2}$ a unit, so
-    the distance is $\sqrt{a^2 + \max(b - c a, 0)^2 / (1 - c^2)}$. `size` bounds the coordinates, for the rounding.
+    the distance is $\sqrt{a^2 + \max(b - c a, 0)^2 / (1 - c^2)}$. `size` bounds the coordinates, for the rounding: $b - c a$ is
+    taken less and $1 - c^2$ more by what it can make of them. So no sphere that touches is left out, however wide the view:
+    towards 180 degrees c tends to 1, both roundings to all there is, and the wedge that the sphere is farther from decides.
     """
     (dx, nx), (dy, ny) = x_side, y_side
-    cosine = nx * ny
+    cosine, eps = nx * ny, jnp.finfo(reach.dtype).eps
     far, near = jnp.maximum(dx, dy), jnp.minimum(dx, dy)
-    beyond = jnp.maximum(near - cosine * far, 0)
+    slack = eps * ROUNDING * size
+    beyond = jnp.maximum(near - cosine * far - slack, 0)
     far = jnp.maximum(far, 0)
-    limit = reach + jnp.finfo(reach.dtype).eps * ROUNDING * size
-    return far * far + beyond * beyond / (1 - cosine * cosine) * (far > 0) <= limit * limit
+    limit = reach + slack
+    return far * far + beyond * beyond / (1 - cosine * cosine + eps * ROUNDING) * (far > 0) <= limit * limit

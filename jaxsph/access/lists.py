@@ -30,6 +30,7 @@ from jaxsph.numerics.checks import require_sizes
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.sums import running_sum
 
+MAX_EXACT = 1 << 22  # tiles of a band that float32 divides by columns without a mistake; whole numbers take longer
 MAX_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
 WORD = 32  # flags in a word
 BUNDLE = 8  # pixels on each side of a ray bundle (D_xy in Hochstetter et al. 2016)
@@ -199,9 +200,11 @@ def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: Li
     nth = _set_before(last, before, lane).ravel()
     slot = (slot + lane).ravel()
     rank, begin, corner, columns = (column[nth] for column in seen)
-    # exact for fewer than 2^22 tiles a particle, which the image's largest size keeps
-    row = ((slot - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)
-    tile = corner + row.astype(jnp.int32) * (plan.tile_columns - columns) + slot - begin
+    if plan.num_tiles < MAX_EXACT:
+        row = (((slot - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)).astype(jnp.int32)
+    else:
+        row = (slot - begin) // columns
+    tile = corner + row * (plan.tile_columns - columns) + slot - begin
     return jnp.where(slot < used, tile, plan.num_tiles), rank
 
 

@@ -32,6 +32,7 @@ class RayResult:
 
     `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
     ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
+    `cut` is how many slabs they left out, whatever those would have taken.
     """
 
     color: Float[Array, "3 packets rows columns"]
@@ -40,6 +41,7 @@ class RayResult:
     left_out: Float[Array, " packets"] | None = None
     error: Float[Array, "packets rows columns"] | None = None
     refined: Float[Array, " packets"] | None = None
+    cut: Float[Array, " packets"] | None = None
 
 
 class Marched(NamedTuple):
@@ -48,13 +50,13 @@ class Marched(NamedTuple):
     Attributes:
         rays: what they have met.
         light: of the slabs of the last batch, by slot.
-        left_out: what rays that ended would have taken; None where none can end.
+        left_out: what rays that ended would have taken, and how many slabs that is; None where none can end.
         refined: what marching slabs again took; None where none are.
     """
 
     rays: RayState
     light: Segment
-    left_out: Array | None
+    left_out: tuple[Array, Array] | None
     refined: Array | None
 
 
@@ -91,7 +93,7 @@ def march(
         rays, light, left_out, refined = state
         batch = batches.batch(nth, batches.ended(rays.transmittance))
         if spent is not None and left_out is not None:
-            left_out = left_out + batches.left_out(batch, spent)
+            left_out = left_out[0] + batches.left_out(batch, spent), left_out[1] + batches.left_out(batch, jnp.ones_like(spent))
 
         def march_chunk(chunk: Array, light: Segment) -> Segment:
             items, begin = batches.chunk(batch, chunk)
@@ -114,9 +116,10 @@ def march(
         seen_through = rays.transmittance.at[batches.compacted.bundle_rank].set(front.reshape(batches.num_packets, -1))
         rays = dataclasses.replace(rays, transmittance=seen_through)
     light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining)
-    start = Marched(rays, light, nothing if ending else None, nothing if refining else None)
+    start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
     found = lax.fori_loop(0, batches.number, march_batch, start)
-    return dataclasses.replace(result_of(found.rays, batches), left_out=found.left_out, refined=found.refined)
+    left_out, cut = (None, None) if found.left_out is None else found.left_out
+    return dataclasses.replace(result_of(found.rays, batches), left_out=left_out, refined=found.refined, cut=cut)
 
 
 def segments_of(
@@ -142,5 +145,5 @@ def result_of(rays: RayState, batches: Batches) -> RayResult:
 
 
 jax.tree_util.register_dataclass(
-    RayResult, data_fields=["color", "transmittance", "depth", "left_out", "error", "refined"], meta_fields=[]
+    RayResult, data_fields=["color", "transmittance", "depth", "left_out", "error", "refined", "cut"], meta_fields=[]
 )

@@ -44,7 +44,7 @@ from jaxsph.numerics.fusion import fusion_barrier
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
 MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
-SUBSAMPLED_SHARE = 0.1  # of the variance across, what is left between rays of `SUBSAMPLE`; at free surfaces, 0.2
+SUBSAMPLED_SHARE = 0.2  # of the variance across, what is left between rays of `SUBSAMPLE`, where it is most: at free surfaces
 DEVIATIONS_AROUND = 10.0  # of Q, by which quantities between nodes are taken to lie beyond those at the nodes
 MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
 Combine = Callable[[Array, Array], Array]

@@ -29,6 +29,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
+POLISHED = 2  # steps of Newton's after those: the last has the derivatives, and they are as good as the root before it
 OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
 Coordinates = list[Float[Array, "tasks samples rays"]]
 
@@ -126,21 +127,20 @@ class IsoSurface(Medium):
         """Whether the surface is met in what each sample stands for; and how brightly it shines where that is first so in a slab.
 
         Differentiation:
-            Shading has derivatives by values and level, through where the surface is met. Which samples meet it has none.
+            Shading has derivatives by values, level and camera: the place where the surface is met is held to be a root of field
+            less level, whatever piece of the ray it was found in. Which samples meet it has none: silhouettes do not move.
         """
         grid, _ = self._viewed()
         ends = _ends(task)
         inside, front, back = _clipped(grid, *(grid.coordinates(place) for place in ends))
         begin, end = (grid.interpolate(place) - self.level for place in (front, back))
         met = inside & ((begin >= 0) != (end >= 0))
-        pieces = front, back, begin, end, lax.stop_gradient(_ray(ends))
+        pieces = front, back, begin, end, _ray(ends)
         front, back, begin, end, ray = jax.tree.map(lambda of_samples: _first(met, of_samples), pieces)
-        found = lax.stop_gradient(_crossing(grid, self.level, front, back, begin, end))
-        slope = lax.stop_gradient(end - begin)
-        place = _between(front, back, found)
-        off = grid.interpolate(place) - self.level  # one step of Newton's: it moves with values and level as the surface does
-        place = _between(front, back, jnp.clip(found - off / jnp.where(slope != 0, slope, 1), 0, 1))
-        return met, self._shade(grid.directions(_gradient(grid, place)), ray)
+        share = _crossing(grid, self.level, front, back, begin, end)
+        for _ in range(POLISHED):  # of what comes before a step nothing is left in its derivatives, see `_newton`
+            share = _newton(grid, self.level, front, back, lax.stop_gradient(share))
+        return met, self._shade(grid.directions(_gradient(grid, _between(front, back, share))), ray)
 
     def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, Array]:
         """Opaque samples, and how brightly they shine."""
@@ -226,6 +226,17 @@ def _crossing(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordina
 
     start = jnp.zeros_like(begin), jnp.ones_like(begin), begin, end
     return _secant(*lax.fori_loop(0, STEPS, step, start))
+
+
+def _newton(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordinates, share: Array) -> Array:
+    """A root from one that is near: Newton's step, whose derivatives are those of the root as an implicit function."""
+
+    def field(share: Array) -> Array:
+        return grid.interpolate(_between(front, back, share))
+
+    here, slope = jax.jvp(field, (share,), (jnp.ones_like(share),))
+    slope = lax.stop_gradient(slope)
+    return jnp.clip(share - (here - level) / jnp.where(slope != 0, slope, 1), 0, 1)
 
 
 def _secant(low: Array, high: Array, at_low: Array, at_high: Array) -> Array:

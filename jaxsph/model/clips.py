@@ -137,7 +137,21 @@ def ascending(begin: Array, end: Array) -> Spans:
     """Spans that are apart, in order: begins and ends may be sorted each for itself."""
     filled = end > begin
     begin, end = jnp.where(filled, begin, 1), jnp.where(filled, end, 1)
-    return Spans(begin, end) if begin.shape[0] == 1 else Spans(jnp.sort(begin, 0), jnp.sort(end, 0))
+    return Spans(_sorted(begin), _sorted(end))
+
+
+def _sorted(values: Array) -> Array:
+    """Ascending along the first axis, of few: by neighbours that change places, as often as there are values.
+
+    Not by `jnp.sort`, whose cotangents XLA's CPU compiler gets wrong among others that it optimises together with them.
+    """
+    rows = list(values)
+    for turn in range(len(rows)):
+        for k in range(turn % 2, len(rows) - 1, 2):
+            swapped = rows[k] > rows[k + 1]
+            pair = rows[k : k + 2]
+            rows[k : k + 2] = jnp.where(swapped, pair[1], pair[0]), jnp.where(swapped, pair[0], pair[1])
+    return jnp.stack(rows)
 
 
 def fill(clip: Clip, /, **fields: Any) -> None:

@@ -16,6 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.numerics import faults
+from jaxsph.numerics.checks import is_traced
+
 
 @dataclasses.dataclass(frozen=True)
 class Image:
@@ -26,10 +29,12 @@ class Image:
         transmittance: what is left of the background's light, in [0, 1]; alpha is `1 - transmittance`.
         depth: view depth where transmittance falls to 1/2, inf where it never does, length units.
         error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full
-            rate. With a tolerance and `integrator="segments"`, the estimated error against the light integral.
+            rate, and at most 1. With a tolerance and `integrator="segments"`, the estimated error against the light integral;
+            NaN where other integrators than `"samples"` have none.
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound.
-        faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
+        faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them. An image with a fault
+            is not certified, and its `error_bound` is 1.
         stats: `evaluations`, `evaluations_full`, `cells` (slabs of bundles that a particle can touch), `pairs` (particles of
             all bundle lists) and, from an eager render, `seconds`.
         metadata: strings and numbers for the file header.
@@ -56,6 +61,28 @@ class Image:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""
         return np.array(np.asarray(self.color), dtype, copy=copy)
+
+    def check(self) -> Image:
+        """The image itself, unless something went wrong with it under `jit`.
+
+        Returns:
+            This image, so that `jitted(scene).check().color` reads well.
+
+        Raises:
+            CapacityError: the plan had no room for the frame.
+            ValueError: any other fault, in words, with a remedy; or an image that is still traced: check it outside of `jit`.
+        """
+        if is_traced(self.faults):
+            raise ValueError("`Image.check` needs numbers: return the image, or its `faults`, from `jit` and check it outside")
+        for word in np.ravel(np.asarray(self.faults)):
+            faults.raise_for(int(word) & ~faults.TOLD)
+        return self
+
+    @property
+    def fault_messages(self) -> tuple[str, ...]:
+        """What went wrong in words, each with a remedy; nothing where all is well (host side)."""
+        word = int(np.bitwise_or.reduce(np.ravel(np.asarray(self.faults))))
+        return tuple(text for bit, text in faults.MESSAGES.items() if word & bit)
 
     @property
     def alpha(self) -> Float[Array, "height width"]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from typing import Any
 
 import jax
 import numpy as np
 
 from jaxsph.model.registry import ESTIMATING, INTEGRATORS, SCREENS
+from jaxsph.numerics.checks import is_traced
 
 ESTIMATORS = ("interval", "pilot")
 LEAF_PIXELS = 4, 8, 16, 32
@@ -18,7 +20,7 @@ ALLOCATIONS = ("budget", "greedy", "paper", "independent")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Choices of the user; hashable where they fix a shape. `tolerance`, `relax` and `min_transmittance` are leaves.
+    """Choices of the user; hashable where they fix a shape. `tolerance`, `relax` and `min_transmittance` are leaves, and floats.
 
     Changing leaves compiles nothing (but for `min_transmittance` from and to 0, which has nothing looked at).
 
@@ -83,19 +85,41 @@ class Settings:
         return self.tolerance is not None and self.integrator in ESTIMATING and self.screen == "pixels"
 
     def __post_init__(self) -> None:
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
-            raise ValueError(f"`samples` must be an integer of at least 1, got {self.samples!r}")
-        if self.samples > 1 << 20:
-            raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
+        for name in NUMBERS:
+            object.__setattr__(self, name, _number(name, getattr(self, name)))
+        self._require_choices()
+        self._require_ranges()
+
+    def require_numbers(self) -> None:
+        """Raise where a leaf that is known is out of range, or not a single number; what is traced is left to fault bits.
+
+        Raises:
+            ValueError: naming the setting, what it is and what it may be.
+        """
+        for name in NUMBERS:
+            value = getattr(self, name)
+            if value is not None and not is_traced(value) and not _is_number(value):
+                raise ValueError(f"`{name}` must be a single number, got {value!r}; to render with several, use `jax.vmap`")
+        self._require_ranges()
+
+    def _require_ranges(self) -> None:
         if _is_number(self.tolerance) and not (np.isfinite(self.tolerance) and self.tolerance >= 0):
             raise ValueError(f"`tolerance` must be >= 0 and finite, got {self.tolerance}; None renders at full rate")
         if _is_number(self.relax) and not 0 <= self.relax <= 1:
             raise ValueError(f"`relax` must lie in [0, 1], got {self.relax}; 0 keeps the certificate")
-        if self.estimator not in ESTIMATORS:
-            raise ValueError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
-        if self.allocation not in ALLOCATIONS:
-            raise ValueError(f"`allocation` must be one of {', '.join(ALLOCATIONS)}, got {self.allocation!r}")
-        for name, known in (("integrator", INTEGRATORS), ("screen", SCREENS)):
+        least = self.min_transmittance
+        if _is_number(least) and not 0 <= least < 0.5:
+            raise ValueError(f"`min_transmittance` must lie in [0, 1/2), got {least}; 0 follows rays to their ends")
+        if _is_number(least) and _is_number(self.tolerance) and 0 < self.tolerance <= least:
+            raise ValueError(f"`min_transmittance` must be less than `tolerance`, of which it takes a part, got {least}")
+
+    def _require_choices(self) -> None:
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
+            raise ValueError(f"`samples` must be an integer of at least 1, got {self.samples!r}")
+        if self.samples > 1 << 20:
+            raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
+        named = {"estimator": ESTIMATORS, "allocation": ALLOCATIONS, "integrator": INTEGRATORS, "screen": SCREENS}
+        for name, known in named.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         step = self.step_tolerance
@@ -107,36 +131,44 @@ class Settings:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.leaf_estimator not in LEAF_ESTIMATORS:
             raise ValueError(f"`leaf_estimator` must be one of {', '.join(LEAF_ESTIMATORS)}, got {self.leaf_estimator!r}")
-        least = self.min_transmittance
-        if _is_number(least) and not 0 <= least < 0.5:
-            raise ValueError(f"`min_transmittance` must lie in [0, 1/2), got {least}; 0 follows rays to their ends")
-        if _is_number(least) and _is_number(self.tolerance) and 0 < self.tolerance <= least:
-            raise ValueError(f"`min_transmittance` must be less than `tolerance`, of which it takes a part, got {least}")
         if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 
 
+def _number(name: str, value: Any) -> Any:
+    """A leaf that is known as a Python float, so that programs are the same whatever kind of number it was given as.
+
+    What is traced stays as it is, and so do arrays of several numbers, for `jax.vmap`.
+    """
+    if value is None or is_traced(value) or (isinstance(value, np.ndarray | jax.Array) and value.ndim):
+        return value
+    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real | np.ndarray | jax.Array):
+        raise ValueError(f"`{name}` must be a number, got {value!r} of type {type(value).__name__}")
+    return float(value)
+
+
 def _is_number(value: Any) -> bool:
     """Whether `value` can be looked at: a number, not a tracer nor what a transformation puts in a leaf's place."""
-    if isinstance(value, jax.core.Tracer) or value is None:
-        return False
-    return isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and np.ndim(value) == 0
+    return not is_traced(value) and isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and np.ndim(value) == 0
 
 
-jax.tree_util.register_dataclass(
-    Settings,
-    data_fields=["tolerance", "relax", "min_transmittance"],
-    meta_fields=[
-        "samples",
-        "estimator",
-        "super_pixels",
-        "merge",
-        "allocation",
-        "integrator",
-        "step_tolerance",
-        "screen",
-        "leaf_pixels",
-        "leaf_estimator",
-        "memory_limit",
-    ],
-)
+def _flatten(settings: Settings) -> tuple[list[Any], tuple[Any, ...]]:
+    return [getattr(settings, name) for name in NUMBERS], tuple(getattr(settings, name) for name in FIXED)
+
+
+def _flatten_with_keys(settings: Settings) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+    leaves, fixed = _flatten(settings)
+    return [(jax.tree_util.GetAttrKey(name), leaf) for name, leaf in zip(NUMBERS, leaves, strict=True)], fixed
+
+
+def _unflatten(fixed: tuple[Any, ...], leaves: Any) -> Settings:
+    """Unchecked, as transformations put things into leaves that are no numbers."""
+    settings = object.__new__(Settings)
+    for name, value in zip((*NUMBERS, *FIXED), (*leaves, *fixed), strict=True):
+        object.__setattr__(settings, name, value)
+    return settings
+
+
+NUMBERS = "tolerance", "relax", "min_transmittance"
+FIXED = tuple(field.name for field in dataclasses.fields(Settings) if field.name not in NUMBERS)
+jax.tree_util.register_pytree_with_keys(Settings, _flatten_with_keys, _unflatten, _flatten)

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.transfer_ways import TransferWays
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.given import plain
 
 
@@ -54,8 +54,8 @@ class TransferFunction(TransferWays):
                 carries one quantity, both are functions of that, each with its own control points.
 
         Raises:
-            ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0, values
-                that the dtype cannot hold apart.
+            ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0 (by
+                more than rounding, which is taken back), values that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
         given = {name: numbers(name, value) for name, value in given.items() if value is not None}
@@ -75,9 +75,9 @@ class TransferFunction(TransferWays):
         if not is_traced(*given.values()):
             for name, value in given.items():
                 require_finite(name, value)
-            require_positive("extinction", given["extinction"], "extinction is a loss of light, never a gain", strict=False)
-            require_positive("colors", given["colors"], "colours lie in [0, 1]", strict=False)
-            require_positive("1 - colors", 1 - np.asarray(given["colors"], np.float64), "colours lie in [0, 1]", strict=False)
+            given["colors"] = rounded_into("colors", given["colors"], (0, 1), "colours lie in [0, 1]")
+            darkest = "extinction is a loss of light, never a gain"
+            given["extinction"] = rounded_into("extinction", given["extinction"], (0, np.inf), darkest)
             for name in control:
                 _require_ascending(name, given[name])
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)

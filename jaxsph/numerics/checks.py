@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
+ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
+
 
 def is_traced(*values: Any) -> bool:
     """Whether any leaf of `values` is an abstract tracer, so that its numbers cannot be looked at."""
@@ -62,3 +64,22 @@ def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True)
         entry = value[where] if where else value[()]
         at = f"[{', '.join(map(str, where))}]" if where else ""
         raise ValueError(f"`{name}` must be {'> 0' if strict else '>= 0'}, but {name}{at} = {entry}; {remedy}")
+
+
+def rounded_into(name: str, value: Any, ends: tuple[float, float], remedy: str) -> Any:
+    """`value` in a range that rounding alone may have led out of; `ValueError` names the first entry that is farther out."""
+    given = np.asarray(value)
+    kept = np.clip(given, *ends).astype(given.dtype)
+    if (kept == given).all():
+        return value
+    slack = 0.0
+    if np.issubdtype(given.dtype, np.floating):
+        finite = np.abs(given[np.isfinite(given)], dtype=np.float64)
+        slack = ROUNDED * float(np.finfo(given.dtype).eps) * max(finite.max(initial=0), 0 if np.isinf(ends[1]) else ends[1])
+    bad = np.abs(given.astype(np.float64) - kept.astype(np.float64)) > slack
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        low, high = ends
+        wanted = f">= {low:g}" if np.isinf(high) else f"in [{low:g}, {high:g}]"
+        raise ValueError(f"`{name}` must be {wanted}, but {name}[{', '.join(map(str, where))}] = {given[where]}; {remedy}")
+    return kept

@@ -24,6 +24,8 @@ TOLERANCE_MISSED = 1024
 GHOST_OVERFLOW = 4096
 BAD_BOX = 8192
 BEYOND_HALO = 16384
+BAD_SETTINGS = 32768
+CLIPPED_LOOK = 65536
 
 MESSAGES = {
     TILE_OVERFLOW: "more (particle, tile) pairs than the plan has room for; make a new plan with `jaxsph.plan`",
@@ -32,8 +34,12 @@ MESSAGES = {
     "or a volume < 0; remove or repair these particles",
     BAD_CAMERA: "the camera is not usable: eye and axes must be finite, the field of view > 0 and 0 < near < far (perspective) "
     "or near < far (orthographic)",
-    BAD_TRANSFER: "the transfer function is not usable: values must ascend, colours lie in [0, 1] and extinction be >= 0 "
-    "and finite, and not all values so small that they are no normal numbers",
+    BAD_TRANSFER: "the transfer function is not usable: values, colours and extinction must be finite, and not all values so "
+    "small that they are no normal numbers",
+    CLIPPED_LOOK: "a transfer function or points were clipped: values must ascend, colours lie in [0, 1] and extinction be >= 0; "
+    "keep them there, as by a sigmoid or a softplus",
+    BAD_SETTINGS: "a traced number of the settings is out of range: `tolerance` must be >= 0 and finite, `relax` lie in [0, 1], "
+    "`min_transmittance` in [0, 1/2) and below a tolerance that is not 0",
     UNRESOLVED: "lengths are too far apart for this precision: samples nearer each other than 16 eps of their depth, a particle "
     "in view that is seen more closely than the rounding of its distance from the eye allows, or lengths outside "
     "1e-15 .. 1e15 (float32); widen near and far or take fewer samples, move the eye nearer instead of narrowing the view, "
@@ -56,6 +62,23 @@ MESSAGES = {
 OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | OCTREE_OVERFLOW | GHOST_OVERFLOW
 TOLD = TOLERANCE_MISSED  # the image is as good as can be: eager rendering warns
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
+
+
+class CapacityError(ValueError):
+    """A given plan has no room for this frame: make a new one with `jaxsph.plan`."""
+
+
+def raise_for(word: int, planned: bool = False) -> None:
+    """Raise what a fault word says; `planned`: whether capacities were made for the very frame.
+
+    Raises:
+        CapacityError: a given plan has no room.
+        ValueError: any other fault.
+    """
+    if word & OVERFLOWS and not planned:
+        raise CapacityError(f"`plan` is too small for this frame: {describe(word)}")
+    if word:
+        raise ValueError(f"this frame cannot be rendered: {describe(word)}")
 
 
 def raised(bit: int, when: Bool[Array, "*any"]) -> Int[Array, "*any"]:

@@ -27,7 +27,18 @@ QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parall
 of its two emitters. Of the stages so compiled none runs for longer; the march would take four times as long."""
 MAX_PROGRAMS = 128  # those of about fourteen frames of different shapes: some 20,000 memory maps of 65,530, and 600 MB
 
+FLAGS = (
+    "jax_enable_x64",
+    "jax_default_device",
+    "jax_default_matmul_precision",
+    "jax_debug_nans",
+    "jax_debug_infs",
+    "jax_numpy_dtype_promotion",
+)
+"""Settings of JAX's that a program is compiled under."""
+
 Function = TypeVar("Function")
+Cached = TypeVar("Cached")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +101,7 @@ class Programs:
         return program
 
     def make_room(self) -> None:
-        """Let go of programs as long as the process holds too many memory maps: first of these, then of all that JAX holds."""
+        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
             while self._kept and memory_maps.crowded():
                 for _ in range(-(-len(self._kept) // 2)):
@@ -98,14 +109,16 @@ class Programs:
                 gc.collect()
             if not memory_maps.crowded():
                 return
-            jax.clear_caches()
+            for let_go in _LET_GO:
+                let_go()
             gc.collect()
-            if not self._warned:
+            if memory_maps.crowded() and not self._warned:
                 self._warned = True
                 warnings.warn(
-                    f"compiled programs held over {memory_maps.CROWDED:.0%} of the {memory_maps.limit()} memory maps that a "
-                    "process may have, so that JAX was made to forget all of them; what is called again is compiled again",
-                    stacklevel=2,
+                    f"this process holds over {memory_maps.CROWDED:.0%} of the {memory_maps.limit()} memory maps that it may "
+                    "have, in programs that are not jaxsph's own, and ends without a word when it needs more: call "
+                    "`jax.clear_caches()`, and jit functions once instead of anew",
+                    stacklevel=3,
                 )
 
     def clear(self) -> None:
@@ -145,7 +158,8 @@ def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
 def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
     shapes = shapes_of(arguments)
     leaves, structure = jax.tree.flatten(shapes)
-    return (function, tuple(sorted(static.items())), structure, tuple(leaves), jax.config.read("jax_enable_x64")), shapes
+    flags = tuple(getattr(jax.config, name) for name in FLAGS)
+    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags), shapes
 
 
 def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
@@ -161,6 +175,13 @@ def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -
 
 
 _QUICKLY: set[Any] = set()
+_LET_GO: list[Callable[[], None]] = []
+
+
+def kept_while_there_is_room(cached: Cached) -> Cached:
+    """Mark a cache of functions that hold programs of their own as one to empty where memory maps are short."""
+    _LET_GO.append(cached.cache_clear)  # type: ignore[attr-defined]
+    return cached
 
 
 def compiled_quickly(function: Function) -> Function:

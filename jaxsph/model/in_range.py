@@ -1,0 +1,94 @@
+"""Looks that an optimiser stepped out of range with are taken back into it, and keep their derivatives.
+
+Flow: scene -> [in_range] -> viewing.
+
+A step beyond the end of a range is taken back to it, and derivatives pass as if it had not been: so a further step may lead
+inside again. What is off by more than rounding sets a fault; the image is that of the nearest colours and extinctions there are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from jaxsph.model.points import Points
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer import TransferFunction
+from jaxsph.numerics import faults
+from jaxsph.numerics.checks import ROUNDED
+
+
+def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
+    """The scene with all looks in range, and a fault word."""
+    off: list[Bool[Array, ""]] = []
+
+    def kept(look: Any) -> Any:
+        if look is None or isinstance(look, tuple):
+            return look if look is None else tuple(map(kept, look))
+        look, out = _points(look) if isinstance(look, Points) else _transfer(look)
+        off.append(out)
+        return look
+
+    looks = {name: kept(getattr(scene, name)) for name in ("transfer", "volume_transfer", "points")}
+    word = jnp.int32(faults.NONE)
+    for out in off:
+        word |= faults.raised(faults.CLIPPED_LOOK, out)
+    return dataclasses.replace(scene, **looks), word
+
+
+def _transfer(transfer: TransferFunction) -> tuple[TransferFunction, Bool[Array, ""]]:
+    shades, off = _shaded(transfer.colors, transfer.extinction)
+    colors, extinction = shades
+    ascending = {"values": transfer.values}
+    if transfer.extinction_values is not None:
+        ascending["extinction_values"] = transfer.extinction_values
+    for values in ascending.values():
+        off |= (_ascending(values) - values > _slack(values)).any()
+    kept = {name: _ascending(values) for name, values in ascending.items()}
+    return dataclasses.replace(transfer, colors=colors, extinction=extinction, **kept), off
+
+
+def _points(points: Points) -> tuple[Points, Bool[Array, ""]]:
+    (color, extinction), off = _shaded(points.color, points.extinction, points.valid)
+    return dataclasses.replace(points, color=color, extinction=extinction), off
+
+
+def _shaded(color: Array, extinction: Array, valid: Any = True) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
+    """Colours in [0, 1] and extinctions >= 0; whether any was off by more than rounding."""
+    shades, darkness = _clipped(color, 0, 1), _clipped(extinction, 0, jnp.inf)
+    bright = (abs(shades - color) > ROUNDED * jnp.finfo(color.dtype).eps).any(-1) & valid
+    glowing = (darkness - extinction > _slack(extinction)) & valid
+    return (shades, darkness), bright.any() | glowing.any()
+
+
+def _slack(values: Array) -> Array:
+    """What rounding may have moved values by that are made of one another."""
+    return ROUNDED * jnp.finfo(values.dtype).eps * jnp.max(jnp.where(jnp.isfinite(values), abs(values), 0), initial=0)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _clipped(value: Array, lo: float, hi: float) -> Array:
+    """`value` in [lo, hi]; its derivative is 1 everywhere, and NaN stays NaN."""
+    return jnp.clip(value, lo, hi)
+
+
+@_clipped.defjvp
+def _clipped_moved(lo: float, hi: float, primals: Any, tangents: Any) -> tuple[Array, Array]:
+    return _clipped(*primals, lo, hi), tangents[0]
+
+
+@jax.custom_jvp
+def _ascending(values: Array) -> Array:
+    """Each value, or the largest before it; derivatives are those of the values themselves."""
+    return lax.cummax(values)
+
+
+@_ascending.defjvp
+def _ascending_moved(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    return _ascending(*primals), tangents[0]

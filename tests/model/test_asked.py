@@ -1,0 +1,60 @@
+"""Arguments of the verbs are what they are called, or refused by name."""
+
+import jax
+import numpy as np
+import pytest
+from forced import ran
+
+import jaxsph as js
+
+
+@pytest.mark.parametrize("verb", [js.render, js.plan])
+@pytest.mark.parametrize("wrong", ["scene", "camera", "settings", "swapped"])
+def test_another_kind_of_argument_is_refused_by_name(frames, verb, wrong):
+    rng = np.random.default_rng(0)
+    scene, camera, settings = frames.scene(rng), frames.camera(rng), frames.settings
+    given = {
+        "scene": (scene.particles, camera, settings),
+        "camera": (scene, "front", settings),
+        "settings": (scene, camera, 64),
+        "swapped": (camera, scene, settings),
+    }
+    name = "scene" if wrong == "swapped" else wrong
+    with pytest.raises(ValueError, match=f"`{name}` must be a `jaxsph.{name.title()}`"):
+        verb(*given[wrong])
+
+
+def test_a_plan_of_another_kind_is_refused_by_name(frames):
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"`plan` must be a `jaxsph\.Plan`, got Settings"):
+        js.render(frames.scene(rng), frames.camera(rng), plan=frames.settings)
+
+
+def test_a_plan_is_any_argument_of_jit(frames):
+    assert jax.tree.leaves(frames.plan()) == []
+    assert jax.jit(lambda plan, number: number * plan.width)(frames.plan(), 2) == 2 * frames.width
+
+
+def test_settings_of_several_numbers_are_for_vmap_alone(frames):
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="`tolerance` must be a single number"):
+        js.render(frames.scene(rng), frames.camera(rng), js.Settings(tolerance=np.array([0.01])))
+
+
+SHARDED = """
+import dataclasses, json, jax, numpy as np, jaxsph as js
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+rng = np.random.default_rng(0)
+particles = js.Particles.from_arrays(rng.uniform(-1, 1, (64, 3)), 0.3, 0.0)
+place = NamedSharding(Mesh(np.array(jax.devices()), ("d",)), PartitionSpec("d"))
+scene = js.Scene(particles=jax.device_put(particles, place), transfer=js.TransferFunction.from_points([0.0], [[1, 1, 1]], [1.0]))
+try:
+    js.render(scene, js.Camera.look_at((0, 0, 5), (0, 0, 0), width=8, height=8, near=3, far=7), js.Settings(samples=8))
+except ValueError as error:
+    print(json.dumps(str(error)))
+"""
+
+
+def test_particles_that_are_sharded_are_refused_by_name():
+    said = ran(SHARDED, devices=2)
+    assert said.startswith("`scene.particles.position` is sharded over 2 devices") and "`devices=`" in said

@@ -1,0 +1,111 @@
+"""Looks that a step of an optimiser has led out of range: taken back, said beyond rounding, and never without derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model.in_range import scene_in_range
+from jaxsph.numerics import faults
+
+TRANSFER = js.TransferFunction.from_points([0.0, 0.5, 1.0], [[1, 0, 0], [0, 1, 0], [0, 0.5, 1]], [0.0, 2.0, 1.0])
+POINTS = js.Points.from_arrays([[0.0, 0, 0]], 1.0, [1.0, 0.5, 0.0], 2.0)
+ULP = float(np.finfo(np.float32).eps)
+
+
+def moved(field, step, of=TRANSFER):
+    return dataclasses.replace(of, **{field: getattr(of, field) + jnp.asarray(step, jnp.float32)})
+
+
+@pytest.mark.parametrize(
+    ("scene", "off"),
+    [
+        (js.Scene(transfer=TRANSFER, points=POINTS), False),
+        (js.Scene(transfer=moved("colors", ULP)), False),
+        (js.Scene(transfer=moved("colors", 1e-3)), True),
+        (js.Scene(transfer=moved("colors", -1e-3)), True),
+        (js.Scene(transfer=moved("extinction", -ULP)), False),
+        (js.Scene(transfer=moved("extinction", -1e-3)), True),
+        (js.Scene(transfer=moved("values", [0.0, 0.6, 0.0])), True),
+        (js.Scene(volume_transfer=(TRANSFER, moved("colors", 1.0))), True),
+        (js.Scene(points=moved("color", 0.1, POINTS)), True),
+        (js.Scene(points=moved("color", ULP, POINTS)), False),
+    ],
+)
+def test_what_is_off_by_more_than_rounding_is_a_fault_and_all_is_taken_back(scene, off):
+    kept, word = jax.jit(scene_in_range)(scene)
+    assert int(word) == (faults.CLIPPED_LOOK if off else 0)
+    for look in jax.tree.leaves(
+        (kept.transfer, kept.volume_transfer), is_leaf=lambda leaf: isinstance(leaf, js.TransferFunction)
+    ):
+        assert ((look.colors >= 0) & (look.colors <= 1)).all() and (look.extinction >= 0).all()
+        assert (np.diff(look.values) >= 0).all()
+    if kept.points is not None:
+        assert bool(kept.points.usable()[0]) and float(kept.points.color.max()) <= 1
+
+
+def test_in_range_not_a_bit_changes():
+    kept, _ = scene_in_range(js.Scene(transfer=TRANSFER, points=POINTS))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), (kept.transfer, kept.points), (TRANSFER, POINTS)))
+
+
+@pytest.mark.parametrize("field", ["colors", "extinction", "values"])
+def test_derivatives_pass_where_numbers_are_taken_back(field):
+    def total(step):
+        scene, _ = scene_in_range(
+            js.Scene(transfer=moved(field, step * jnp.asarray([3.0, -3.0, 3.0]).reshape(-1, *[1] * (field == "colors"))))
+        )
+        return getattr(scene.transfer, field).sum()
+
+    assert float(jax.jit(jax.grad(total))(1.0)) == pytest.approx(9.0 if field == "colors" else 3.0)
+
+
+def test_nan_stays_nan_and_is_not_hidden():
+    kept, _ = scene_in_range(js.Scene(transfer=moved("extinction", np.nan)))
+    assert np.isnan(kept.transfer.extinction).all()
+
+
+def test_an_optimiser_finds_back_from_beyond_the_range(frames):
+    """Adam without any constraint, as it is first tried: steps lead beyond 1 and below 0, and the loss falls all the same."""
+    optax = pytest.importorskip("optax")
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
+    look = js.TransferFunction.from_points(scene.transfer.values, np.eye(5, 3), np.linspace(0.5, 2, 5))
+
+    def draw(colors, extinction):
+        transfer = js.TransferFunction.from_points(look.values, colors, extinction)
+        return js.render(dataclasses.replace(scene, transfer=transfer), camera, frames.settings, plan=plan).color
+
+    target = jax.jit(draw)(look.colors, look.extinction)
+    adam, found = optax.adam(0.05), (jnp.full((5, 3), 0.5), jnp.full(5, 0.3))
+    loss = jax.jit(jax.value_and_grad(lambda found: ((draw(*found) - target) ** 2).mean()))
+    state, losses, outside = adam.init(found), [], False
+    for _ in range(200):
+        value, slope = loss(found)
+        losses.append(float(value))
+        outside |= bool((found[0] > 1).any() or (found[0] < 0).any())
+        assert any(bool(leaf.any()) for leaf in jax.tree.leaves(slope))
+        change, state = adam.update(slope, state)
+        found = optax.apply_updates(found, change)
+    assert outside and losses[-1] < losses[0] / 50
+
+
+@pytest.mark.parametrize(("colors", "extinction"), [(1 + ULP, 1.0), (-ULP, 1.0), (0.5, -1e-8)])
+def test_rounding_is_taken_back_where_a_transfer_function_is_made(colors, extinction):
+    made = js.TransferFunction.from_points([0.0, 1.0], np.full((2, 3), colors, np.float32), [extinction, 1.0])
+    assert float(made.colors.min()) >= 0 and float(made.colors.max()) <= 1 and float(made.extinction.min()) >= 0
+
+
+@pytest.mark.parametrize(
+    ("colors", "extinction", "message"),
+    [
+        (1.001, 1.0, r"`colors` must be in \[0, 1\], but colors\[0, 0\] = 1.001"),
+        (0.5, -1e-3, r"`extinction` must be >= 0, but extinction\[0\]"),
+    ],
+)
+def test_more_than_rounding_is_refused_there(colors, extinction, message):
+    with pytest.raises(ValueError, match=message):
+        js.TransferFunction.from_points([0.0, 1.0], np.full((2, 3), colors), [extinction, 1.0])
