@@ -7,10 +7,11 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxsph.access.slab_windows import CELL_SAMPLES
 from jaxsph.control.bounds import SampleBounds
-from jaxsph.control.errors import SUPER_PIXEL, cell_errors
+from jaxsph.control.errors import EXPONENTIAL, SUPER_PIXEL, cell_errors
 
 BUNDLES = 64
 errors_of = jax.jit(functools.partial(cell_errors, fitting=2), compiler_options={"xla_backend_optimization_level": 0})
@@ -45,3 +46,25 @@ def test_without_relaxation_errors_are_strict_and_grow_with_the_level():
     error, strict, _ = found(0.0)
     np.testing.assert_array_equal(error, strict)
     assert not error[0].any() and (np.diff(error[:SUPER_PIXEL], axis=0) >= 0).all()
+
+
+def exponentials(step):
+    """Largest error of the exponential that marches use, in eps, over all float32 from 2^-25 to 2^7 by steps of so many."""
+    exponential, worst = jax.jit(lambda thickness: jnp.exp(-thickness)), 0.0
+    first, last = (int(np.float32(end).view(np.int32)) for end in (2.0**-25, 2.0**7))
+    for begin in range(first, last, step << 22):
+        bits = np.arange(begin, min(begin + (step << 22), last), step, dtype=np.int32)
+        thickness = bits.view(np.float32)
+        exact = np.exp(-thickness.astype(np.float64))
+        worst = max(worst, float(np.abs(np.asarray(exponential(thickness)) - exact).max()))
+    return worst / np.finfo(np.float32).eps
+
+
+def test_the_exponential_is_as_exact_as_certificates_take_it_to_be():
+    """Every 61st argument: certificates rest on XLA's polynomial, which may change with its version."""
+    assert exponentials(61) <= EXPONENTIAL - 0.6  # the rest is for three half ulp of its argument
+
+
+@pytest.mark.slow
+def test_the_exponential_is_as_exact_for_every_argument_there_is():
+    assert exponentials(1) <= EXPONENTIAL - 0.6
