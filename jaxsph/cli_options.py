@@ -44,7 +44,7 @@ def add_picture(parser: argparse.ArgumentParser, *, means: bool = True) -> None:
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     if means:
-        add("--samples", type=int, default=SAMPLES, metavar="N", help=f"samples along a ray (default {SAMPLES})")
+        add("--samples", type=int, metavar="N", help=f"samples along a ray (default {SAMPLES})")
         integrator = Settings().integrator
         add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
     add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")

@@ -33,6 +33,7 @@ OF_PARTICLES = (*OF_FILES, "slice")
 DENSEST = "densest"
 NOT_OF_SLICES = (
     *("annotate", "eye", "target", "fov", "integrator", "tolerance", "estimator", "screen", "progressive", "relax"),
+    "samples",
     *("opacity", "opacity_by", "memory", "devices", "from_disk", "volume", "points", "mix", "iso"),
 )
 """Options that do nothing to the picture of a plane."""

@@ -29,6 +29,7 @@ import numpy as np
 from jaxsph.model.image import Image
 
 from .damage import DataError, explained
+from .hushed import hushed
 from .optional import require
 from .replace import written_whole
 from .scene_linear import COLOR_KEY, color_of, header_of, is_light, light_of
@@ -85,7 +86,8 @@ def read(path: Path) -> Image:
     with explained(path, SOURCE):
         if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
             raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
-        file = openexr.File(str(path), separate_channels=True)
+        with hushed():  # of what is damaged the library says more, line by line
+            file = openexr.File(str(path), separate_channels=True)
         layers = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
         header = dict(file.header())
         missing = [name for name in "RGB" if name not in layers]
