@@ -19,7 +19,7 @@ from jaxsph.io import ParticleTable
 from jaxsph.model import Camera, Image, Settings
 from jaxsph.model.registry import ESTIMATING
 
-DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.999
+DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 OPTIONS = {
     "values": "--range",
     "low": "the low end of --range",
