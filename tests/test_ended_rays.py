@@ -38,7 +38,6 @@ def differs(image, truth):
     return np.maximum(color, np.abs(np.asarray(image.transmittance) - np.asarray(truth.transmittance)))
 
 
-@pytest.mark.slow
 def test_what_rays_leave_out_is_bounded_and_spares_evaluations(opaque):
     scene, view = opaque
     plan = small_batches(scene, view, settings())

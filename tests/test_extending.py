@@ -63,7 +63,6 @@ def test_the_page_adds_one_of_each():
     assert set(FILES) == {"ball", "trapezoids", "every_other"} and len(ENTRIES) == 2
 
 
-@pytest.mark.slow
 def test_a_ball_without_particles_is_the_light_integral_but_for_its_borders(added):
     view, settings = camera(), js.Settings(samples=512)
     image = js.render(js.Scene(**particles(0), media=(ball(added),)), view, settings)

@@ -65,7 +65,6 @@ def test_gradients_of_bands_and_of_many_control_points_are_those_of_differences(
         assert slope == pytest.approx(float(ahead - behind) / (2 * STEP), abs=CLOSE * (1 + size))
 
 
-@pytest.mark.slow
 def test_depth_has_gradients_of_zero(frames, x64):
     rng = np.random.default_rng(7)
     scene, camera = filled(frames, rng)
@@ -94,7 +93,6 @@ def even(frames, rng):
     return js.Scene(particles, dataclasses.replace(transfer, values=values, extinction=extinction)), camera
 
 
-@pytest.mark.slow
 def test_the_gradient_of_an_adaptive_image_is_that_of_this_image(frames, x64):
     rng = np.random.default_rng(4)
     inputs, cotangent = even(frames, rng), weights(rng, frames)

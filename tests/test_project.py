@@ -313,7 +313,6 @@ def test_gradients_are_those_of_differences(pixel, projection, x64):
     assert abs(backward - forward) < 1e-9 * abs(forward) + 1e-9
 
 
-@pytest.mark.slow
 def test_one_program_serves_moved_particles_and_many_at_once():
     particles, camera = particles_of(13), camera_of()
     plan = js.plan_projection(particles, camera)

@@ -63,7 +63,6 @@ def test_double_precision_is_exact(x64):
     agree(found.values, truth_of(particles, found), 1e-10)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("height", [0.45, 0.02], ids=["middle", "face"])
 def test_of_a_periodic_set_images_count_and_there_is_nothing_outside_of_its_box(height):
     particles = particles_of(SIDES)

@@ -44,7 +44,6 @@ def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
         np.testing.assert_array_equal(found.lists.rank, grid.lists.rank)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["interval", *(pytest.param(other, marks=pytest.mark.slow) for other in ("pilot", None))])
 def test_any_number_of_shards_makes_the_same_image(monkeypatch, estimator):
     scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)

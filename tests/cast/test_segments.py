@@ -206,7 +206,6 @@ def test_points_are_what_they_are_to_samples():
         np.testing.assert_allclose(*(getattr(image, layer) for image in images), atol=2e-6)
 
 
-@pytest.mark.slow
 def test_thicknesses_of_points_particles_and_volumes_add_up():
     """Balls of points, balls of particles and a box that is larger than the view."""
     position, support = CLOUD[:3] * np.float32(0.5), np.float32([0.8, 0.5, 0.3])

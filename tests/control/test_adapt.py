@@ -42,7 +42,6 @@ def adapted(frames, stages):
 ALIKE, MIXED = np.full(24, 0.5), np.tile([0.0, 1.0], 12)
 
 
-@pytest.mark.slow
 def test_what_is_alike_is_coarsened_within_the_tolerance(adapted):
     (schedule, bound, levels), grid, reference = adapted(ALIKE, 0.1)
     full = uncoarsened(grid.windows, reference, True)

@@ -193,7 +193,6 @@ def test_hardly_any_particles(count):
     np.testing.assert_array_equal(image.color, truth.color)
 
 
-@pytest.mark.slow
 def test_jit_agrees_with_eager():
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     truth, image = both("radial")

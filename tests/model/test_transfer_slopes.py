@@ -81,7 +81,6 @@ def test_a_short_range_has_half_the_slope_at_each_end_in_float32(case, width):
     np.testing.assert_allclose(slopes, [slope / 2, slope / 2], rtol=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ends", [(0.3, 0.3), (1, 1), (0, 0), (1e30, 1e30), (-1e30, 3e30), (-1e38, 1e38), (np.inf, -np.inf)])
 @pytest.mark.parametrize("case", ["one", "jumps", "even", "uneven with jumps"])
 def test_derivatives_are_finite_everywhere(case, ends):
