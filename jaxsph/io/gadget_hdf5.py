@@ -49,13 +49,14 @@ GADGET4_KERNELS = {
 """What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
 GIZMO_KERNELS = {
     3: "cubic_spline",
-    4: "quartic_spline",
-    5: "quintic_spline",
+    4: "quintic_spline",
+    5: "quartic_spline",
     6: "wendland_c2",
     7: "wendland_c4",
     9: "wendland_c6",
 }
-"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION."""
+"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has the
+fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
 MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")

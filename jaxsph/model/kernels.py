@@ -128,7 +128,8 @@ def _wendland_c4_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
 def _wendland_c6(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    return _power(xp.maximum(size - r, 0), 8) * (size * size * (size + 8 * r) + square * (25 * size + 32 * r))
+    outer = _power(xp.maximum(size - r, 0), 4)  # half of the power first, half last: all of it could underflow
+    return outer * (size * size * (size + 8 * r) + square * (25 * size + 32 * r)) * outer
 
 
 def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
