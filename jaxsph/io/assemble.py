@@ -17,6 +17,7 @@ from jaxsph.model.particles import Particles
 
 from .damage import DataError
 from .quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
+from .stored import StoredDensity, stored_density, without_placeholder
 from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from .table import ParticleTable
 from .where import select
@@ -87,8 +88,8 @@ def particles_from_table(
     r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
     Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
-    those of the table, else mass over density, else $1 / \sum_j W(|x_i - x_j|, H_i)$. Where supports vary, a stored
-    density is the sum over the particle's own support.
+    those of the table, else mass over density where a sample shows that to be the density (`jaxsph.io.stored`), else
+    $1 / \sum_j W(|x_i - x_j|, H_i)$.
 
     Args:
         table: what was read.
@@ -143,7 +144,10 @@ def _assemble(
     wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
     supports, support_origin = _supports(table, support, progress)
+    stored = stored_density(table)
+    table = without_placeholder(table, stored)
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith("support =")), *notes]
+    notes += [stored.told] if stored.told else []
     mass_name = table.named(*ROLES["mass"])
     mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
     summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
@@ -157,7 +161,7 @@ def _assemble(
         return summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
-    volumes, volume_origin = _volumes(table, supports, mass_name, number_density)
+    volumes, volume_origin = _volumes(table, mass_name, stored, number_density)
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
     rounding = rounding_note(table.position, supports)
@@ -189,18 +193,16 @@ def _assemble(
 
 
 def _volumes(
-    table: ParticleTable, supports: np.ndarray, mass_name: str | None, number_density: Callable[[], np.ndarray]
+    table: ParticleTable, mass_name: str | None, stored: StoredDensity, number_density: Callable[[], np.ndarray]
 ) -> tuple[np.ndarray, str]:
     """Volumes, and one sentence on where they come from."""
-    density_name = table.named(*ROLES["density"])
     if table.volume is not None:
         return table.volume.astype(np.float64), "as the file has it"
-    if mass_name is None or density_name is None or not _positive(table.columns[mass_name], table.columns[density_name]):
+    if mass_name is None or stored.column is None:
         return 1 / number_density(), "1 / sum of kernels within the particle's own support"
-    origin = f"{mass_name} / {density_name}"
-    if len(supports) and supports.min() < supports.max():
-        origin += " (the stored density is the sum over the particle's own support)"
-    return table.columns[mass_name].astype(np.float64) / table.columns[density_name].astype(np.float64), origin
+    mass, density = (table.columns[name].astype(np.float64) for name in (mass_name, stored.column))
+    measured = f" (the stored density is {stored.measured})" if stored.measured else ""
+    return mass / density, f"{mass_name} / {stored.column}{measured}"
 
 
 def opacity_of(
@@ -243,10 +245,6 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
     elif 0 < len(table) <= NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
     return nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
-
-
-def _positive(*columns: np.ndarray) -> bool:
-    return all(column.ndim == 1 and bool((np.isfinite(column) & (column > 0)).all()) for column in columns)
 
 
 def _scaled(volumes: np.ndarray) -> np.ndarray:
