@@ -52,7 +52,7 @@ def test_lengths_within_twice_of_which_codes_count_their_neighbours_are_half_of_
 
 
 def test_lengths_that_follow_the_density_are_too():
-    position, mass = clustered(600), np.full(600, 0.5)
+    position, mass = np.random.default_rng(0).normal(size=(600, 3)), np.full(600, 0.5)
     h = lengths(position, 50)
     for _ in range(6):
         h = (h + 1.2 * (0.5 / io.kernel_sum(position, 2 * h, mass, kernel="cubic_spline")) ** (1 / 3)) / 2
