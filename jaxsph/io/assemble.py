@@ -17,7 +17,7 @@ from jaxsph.model.particles import Particles
 
 from .damage import DataError
 from .quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
-from .stored import StoredDensity, stored_density, without_placeholder
+from .stored import StoredDensity, is_positive, stored_density, without_placeholder
 from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from .table import ParticleTable
 from .where import select
@@ -170,7 +170,7 @@ def _assemble(
     dtype = table.position.dtype
     kept, told = select(table, *wanted[:2], density=density)
     notes += told
-    second, opacity_by = opacity_of(table, name, wanted[2], volumes if mass is None else volumes / mass, density)
+    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, mass), density)
     own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
@@ -203,6 +203,15 @@ def _volumes(
     mass, density = (table.columns[name].astype(np.float64) for name in (mass_name, stored.column))
     measured = f" (the stored density is {stored.measured})" if stored.measured else ""
     return mass / density, f"{mass_name} / {stored.column}{measured}"
+
+
+def _thinness(table: ParticleTable, volumes: np.ndarray, mass: np.ndarray | None) -> np.ndarray:
+    """1 / density: that which would be looked up, where the table holds one, whatever volumes are of."""
+    name = table.named(*ROLES["density"])
+    if mass is None or name is None or table.volume is not None or not is_positive(table.columns[name]):
+        return volumes if mass is None else volumes / mass
+    thinness: np.ndarray = 1 / table.columns[name].astype(np.float64)
+    return thinness
 
 
 def opacity_of(

@@ -91,7 +91,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
         return StoredDensity(None)
     not_used = f"stored density `{name}` is not used for volumes"
     for positive in (mass_name, name):
-        if not _is_positive(table.columns[positive]):
+        if not is_positive(table.columns[positive]):
             return StoredDensity(None, told=f"{not_used}: `{positive}` is not one positive number a particle")
     if len(table) < MIN_PARTICLES or not np.ptp(table.position, axis=0).all():
         return StoredDensity(name, told=f"stored density `{name}` is used unchecked: particles are too few, or in a plane")
@@ -119,7 +119,7 @@ def without_placeholder(table: ParticleTable, stored: StoredDensity) -> Particle
 def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[str]]:
     """Why a column is no smoothing length, `None` where it is, and then sentences on what is used."""
     length = table.columns[name]
-    if not _is_positive(length):
+    if not is_positive(length):
         return "it is not one positive number a particle", []
     if len(table) < MIN_PARTICLES:
         return f"{len(table)} particles are too few to tell a smoothing length from a softening", []
@@ -205,7 +205,8 @@ def _some(mask: np.ndarray, number: int) -> np.ndarray:
     return rows if len(rows) <= number else np.random.default_rng(0).choice(rows, number, replace=False, shuffle=False)
 
 
-def _is_positive(column: np.ndarray) -> bool:
+def is_positive(column: np.ndarray) -> bool:
+    """Whether a column is one positive number a particle, of any particles."""
     return column.ndim == 1 and len(column) > 0 and bool((np.isfinite(column) & (column > 0)).all())
 
 

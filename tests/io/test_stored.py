@@ -154,7 +154,8 @@ def test_a_density_that_is_none_is_derived_instead_by_whatever_name():
 def test_a_density_in_another_unit_is_not_used_for_volumes_but_is_a_quantity(factor):
     position = clustered()
     rho = factor * densities(position)
-    particles, report = io.particles_from_table(with_density(position, rho), "log10:rho")
+    particles, report = io.particles_from_table(with_density(position, rho), "log10:rho", opacity_by="auto")
+    assert report.opacity_by == "log10:rho"
     np.testing.assert_allclose(particles.to_numpy()["quantity"], np.log10(rho), rtol=1e-5)
     assert report.volume.startswith("1 / sum") and any("not used for volumes: it is" in note for note in report.notes)
 
