@@ -19,6 +19,7 @@ from jaxsph.console import UsageError, say, span
 from jaxsph.io.projections import SUFFIXES
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.selection import chosen
+from jaxsph.io.stored import stored_density, without_placeholder
 from jaxsph.model import Camera, Particles
 from jaxsph.model.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
@@ -133,7 +134,8 @@ class _Columns:
     """What a file's particles hold, in float64."""
 
     def __init__(self, table: io.ParticleTable, particles: Particles) -> None:
-        self.table, self._particles = table, particles
+        self._stored = stored_density(table)
+        self.table, self._particles = without_placeholder(table, self._stored), particles
         self.mass_name = table.named(*ROLES[MASS])
 
     @functools.cached_property
@@ -144,8 +146,9 @@ class _Columns:
 
     @functools.cached_property
     def density(self) -> np.ndarray:
-        """As stored, else summed over each particle's support."""
-        return choose_quantity(self.table, "density", density=self._summed)[0]
+        """As stored where that is the density, else summed over each particle's support."""
+        refused = self._stored.column is None and self._stored.told
+        return self._summed() if refused else choose_quantity(self.table, "density", density=self._summed)[0]
 
     @functools.cached_property
     def volume(self) -> np.ndarray:

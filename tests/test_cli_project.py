@@ -139,3 +139,15 @@ def test_what_is_not_in_the_file_is_told_in_one_line(file, capsys):
         assert code == 1 and len(err) == 1 and said in err[0], err
     code, _, err = run(capsys, "bare.npz", "--of", "mass", *TINY)
     assert code == 2 and "has no masses" in err[0]
+
+
+def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(file, capsys):
+    position = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    position = position[np.linalg.norm(position, axis=1) < 1]
+    same = {"mass": np.full(len(position), 1 / len(position)), "rho": np.ones(len(position))}
+    np.savez("ball.npz", position=position, **same)
+    for more in ([], ["--share", "0.999"]):
+        code, out, err = run(capsys, "ball.npz", *TINY, "--of", "volume", "-o", "out.npy", *more)
+        assert (code, err) == (0, []) and "stored density `rho` is not used" in out
+        total = float(out.partition("in the image, of ")[2].split()[0].rstrip(","))
+        assert total == pytest.approx(4 * np.pi / 3, rel=0.15)

@@ -18,6 +18,7 @@ from jaxsph.numerics.given import plain
 
 from .damage import DataError
 from .quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
+from .stored import StoredDensity, is_positive, stored_density, without_placeholder
 from .supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from .table import ParticleTable
 from .where import select
@@ -95,8 +96,8 @@ def particles_from_table(
     r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
     Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
-    those of the table, else mass over density, else $1 / \sum_j W(|x_i - x_j|, H_i)$. Where supports vary, a stored
-    density is the sum over the particle's own support.
+    those of the table, else mass over density where a sample shows that to be the density (`jaxsph.io.stored`), else
+    $1 / \sum_j W(|x_i - x_j|, H_i)$.
 
     Args:
         table: what was read.
@@ -153,7 +154,10 @@ def _assemble(
 ) -> tuple[Particles, Report]:
     supports, support_origin = _supports(table, support, progress)
     kernel, kernel_origin = kernel_of(table, kernel)
+    stored = stored_density(table)
+    table = without_placeholder(table, stored)
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
+    notes += [stored.told] if stored.told else []
     mass_name = table.named(*ROLES["mass"])
     mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
     summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
@@ -167,7 +171,7 @@ def _assemble(
         return summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
-    volumes, volume_origin = _volumes(table, supports, mass_name, number_density)
+    volumes, volume_origin = _volumes(table, mass_name, stored, number_density)
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
     rounding = rounding_note(table.position, supports)
@@ -176,7 +180,7 @@ def _assemble(
     dtype = table.position.dtype
     kept, told = select(table, *wanted[:2], density=density)
     notes += told
-    second, opacity_by = opacity_of(table, name, wanted[2], volumes if mass is None else volumes / mass, density)
+    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, mass), density)
     own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
@@ -210,18 +214,25 @@ def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
 
 
 def _volumes(
-    table: ParticleTable, supports: np.ndarray, mass_name: str | None, number_density: Callable[[], np.ndarray]
+    table: ParticleTable, mass_name: str | None, stored: StoredDensity, number_density: Callable[[], np.ndarray]
 ) -> tuple[np.ndarray, str]:
     """Volumes, and one sentence on where they come from."""
-    density_name = table.named(*ROLES["density"])
     if table.volume is not None:
         return table.volume.astype(np.float64), "as the file has it"
-    if mass_name is None or density_name is None or not _positive(table.columns[mass_name], table.columns[density_name]):
+    if mass_name is None or stored.column is None:
         return 1 / number_density(), "1 / sum of kernels within the particle's own support"
-    origin = f"{mass_name} / {density_name}"
-    if len(supports) and supports.min() < supports.max():
-        origin += " (the stored density is the sum over the particle's own support)"
-    return table.columns[mass_name].astype(np.float64) / table.columns[density_name].astype(np.float64), origin
+    mass, density = (table.columns[name].astype(np.float64) for name in (mass_name, stored.column))
+    measured = f" (the stored density is {stored.measured})" if stored.measured else ""
+    return mass / density, f"{mass_name} / {stored.column}{measured}"
+
+
+def _thinness(table: ParticleTable, volumes: np.ndarray, mass: np.ndarray | None) -> np.ndarray:
+    """1 / density: that which would be looked up, where the table holds one, whatever volumes are of."""
+    name = table.named(*ROLES["density"])
+    if mass is None or name is None or table.volume is not None or not is_positive(table.columns[name]):
+        return volumes if mass is None else volumes / mass
+    thinness: np.ndarray = 1 / table.columns[name].astype(np.float64)
+    return thinness
 
 
 def opacity_of(
@@ -264,10 +275,6 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
     elif 0 < len(table) <= NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
     return nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
-
-
-def _positive(*columns: np.ndarray) -> bool:
-    return all(column.ndim == 1 and bool((np.isfinite(column) & (column > 0)).all()) for column in columns)
 
 
 def _scaled(volumes: np.ndarray) -> np.ndarray:

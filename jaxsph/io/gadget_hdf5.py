@@ -55,8 +55,8 @@ GIZMO_KERNELS = {
     7: "wendland_c4",
     9: "wendland_c6",
 }
-"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has the
-fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
+"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
+the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
 MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")

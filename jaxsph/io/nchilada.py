@@ -2,8 +2,9 @@
 
 Every file is big-endian (XDR): a magic number, time, number of particles in two halves, dimensions and a type code, then least
 and largest value of each dimension, then the values. Types are numbered as in Gadget files: 0 gas, 1 dark matter, 4 stars.
-What codes write as a smoothing length is not told by the file, so that supports are found from neighbours. Source: the field
-header of the NChilada library, University of Washington N-Body Shop.
+The column `smoothlength` is half of the support where a sample of neighbours shows that (`stored`), else supports are found from
+neighbours. Units are those of a file of parameters beside the folder (`param_files`). Source: the field header of the NChilada
+library, University of Washington N-Body Shop.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError, NoParticlesError, explained
+from .param_files import units_beside
+from .stored import with_stored_lengths
 from .table import ParticleTable
 
 SOURCE = "NChilada"
+SMOOTHING = "smoothlength", "smoothing_length", "hsmooth"
 FOLDERS = {0: ("gas",), 1: ("dark",), 4: ("star", "stars")}
 MAGIC = 1062053
 HEADER = np.dtype([("magic", "i4"), ("time", "f8"), ("high", "u4"), ("low", "u4"), ("dimensions", "i4"), ("code", "i4")])
@@ -53,10 +57,12 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
                 if len(columns[file.name]) != len(position):
                     stated = f"{len(columns[file.name])} values, but there are {len(position)} positions"
                     raise DataError(f"{where.parent.name}/{file.name} has {stated}; it is damaged or of another snapshot")
-        said = [f"particles of type {chosen} ({where.parent.name})"]
+        units, said = units_beside(path, columns, time)
+        said = [f"particles of type {chosen} ({where.parent.name})", *said]
         said.append("kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)")
-        more: dict[str, Any] = {"conventions": tuple(said), "time": time, "part_type": chosen, "kernel": "cubic_spline"}
-        return ParticleTable(position, columns, source=SOURCE, **more)
+        more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time, "part_type": chosen}
+        more["kernel"] = "cubic_spline"
+        return with_stored_lengths(ParticleTable(position, columns, source=SOURCE, **more), *SMOOTHING)
 
 
 def _positions(folder: Path, number: int) -> Path | None:

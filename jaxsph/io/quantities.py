@@ -23,7 +23,7 @@ from .damage import DataError
 from .table import ParticleTable, plain
 
 ROLES: dict[str, tuple[str, ...]] = {
-    "density": ("density", "densities", "rho"),
+    "density": ("density", "densities", "rho", "gas_density", "den"),
     "mass": ("mass", "masses", "particle_mass", "m"),
     "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
     "temperature": ("temperature", "temperatures", "temp"),

@@ -13,6 +13,7 @@ import numpy as np
 
 from .assemble import in_box, kernel_of, particles_from_table
 from .quantities import ROLES, choose_quantity
+from .stored import stored_density, without_placeholder
 from .table import ParticleTable, plain
 from .where import select
 
@@ -41,13 +42,15 @@ def chosen(
         boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
     if where is None and share is None:
         return boxed
+    stored = stored_density(boxed)
+    boxed = without_placeholder(boxed, stored)
     particles, report = particles_from_table(boxed, "x", support, kernel)
     density = functools.cache(lambda: _density(boxed, support, kernel))
     kept, told = select(boxed, where, share, density=density)
     columns = dict(boxed.columns)
     if _is_density(boxed, choose_quantity(boxed, quantity, density=density)[1]):
         columns["density"] = density()
-    said = [sentence for sentence in boxed.conventions if not sentence.startswith(ORIGIN)]
+    said = [sentence for sentence in (*boxed.conventions, stored.told) if sentence and not sentence.startswith(ORIGIN)]
     name, why = kernel_of(boxed, kernel)
     own = particles.to_numpy()
     return dataclasses.replace(

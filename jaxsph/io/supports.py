@@ -62,7 +62,7 @@ def nearest_neighbour_supports(
     """
     if neighbours < 1:
         raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
-    position = _in_box(position, box)
+    position = in_period(position, box)
     count = len(position)
     if count == 0:
         return np.zeros(0)
@@ -112,7 +112,7 @@ def kernel_sum(
         ValueError: supports that reach so many particles that the sum would take hours.
     """
     chosen = kernels.by_name(kernel)
-    position = _in_box(position, box)
+    position = in_period(position, box)
     support = np.asarray(support, dtype=np.float64)
     if len(position) == 0:
         return np.zeros(0)
@@ -135,7 +135,7 @@ def kernel_sum(
     return chosen.norm * total[asker_of] / support**3
 
 
-def _in_box(position: np.ndarray, box: Sides | None) -> np.ndarray:
+def in_period(position: np.ndarray, box: Sides | None) -> np.ndarray:
     """Positions in float64, in a periodic box if there is one."""
     position = np.asarray(position, dtype=np.float64)
     if box is None:

@@ -2,8 +2,10 @@
 
 A header (time, numbers of bodies, dimensions, gas, dark matter, stars), then records of gas, dark matter and stars, all of four
 bytes a number; big-endian as the standard has it, or in the order of the machine that wrote it. Types are numbered as in Gadget
-files: 0 gas, 1 dark matter, 4 stars. The length that gas records end with is a softening in some codes and a smoothing length in
-others, so that supports are found from neighbours. Source: the documentation of TIPSY, University of Washington N-Body Shop.
+files: 0 gas, 1 dark matter, 4 stars. The length `hsmooth` of gas records is a softening in some codes and a smoothing length in
+others; arrays beside the file, `FILE.smoothlength` and `FILE.den`, may hold smoothing lengths and densities. Lengths are half of
+the support where a sample of neighbours shows that (`stored`), else supports are found from neighbours. Units are those of a file
+of parameters beside it (`param_files`). Source: the documentation of TIPSY, University of Washington N-Body Shop.
 """
 
 from __future__ import annotations
@@ -16,12 +18,16 @@ import numpy as np
 
 from .damage import DataError, NoParticlesError, explained
 from .leftover import refuse_leftover
+from .param_files import units_beside
+from .stored import with_stored_lengths
 from .table import ParticleTable
+from .tipsy_arrays import arrays_beside
 
 SOURCE = "Tipsy"
 Order = Literal["<", ">"]
 ORDERS: tuple[Order, Order] = (">", "<")
 HEADER = np.dtype([("time", "f8"), ("bodies", "i4"), ("dimensions", "i4"), ("gas", "i4"), ("dark", "i4"), ("stars", "i4")])
+SMOOTHING = "smoothlength", "hsmooth"
 PLACE = ("mass", "x", "y", "z", "vx", "vy", "vz")
 RECORDS = {
     0: ("gas", (*PLACE, "rho", "temp", "hsmooth", "metals", "phi")),
@@ -58,9 +64,11 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             if part_type is not None and chosen not in present:
                 raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {', '.join(map(str, present))}")
             file.seek(begin + sum(counts[number] * sizes[number] for number in RECORDS if number < chosen))
-            kind, fields = RECORDS[chosen]
+            fields = RECORDS[chosen][1]
             values = np.frombuffer(file.read(counts[chosen] * sizes[chosen]), f"{order}f4").reshape(-1, len(fields))
-        return _table(values.astype(np.float32), chosen, kind, fields, float(header["time"]))
+        rows = slice(first := sum(counts[number] for number in RECORDS if number < chosen), first + counts[chosen])
+        beside, said = arrays_beside(path, sum(counts.values()), counts[0], rows)
+        return _table(path, values.astype(np.float32), chosen, beside, said, float(header["time"]))
 
 
 def _refuse_padding(order: Order, padding: bytes) -> None:
@@ -69,15 +77,18 @@ def _refuse_padding(order: Order, padding: bytes) -> None:
         refuse_leftover(len(padding.strip(b"\0")), "its header and its records")
 
 
-def _table(values: np.ndarray, chosen: int, kind: str, fields: tuple[str, ...], time: float) -> ParticleTable:
+def _table(
+    path: Path, values: np.ndarray, chosen: int, beside: dict[str, np.ndarray], said: list[str], time: float
+) -> ParticleTable:
+    kind, fields = RECORDS[chosen]
     columns = {name: values[:, nth] for nth, name in enumerate(fields) if name not in PLACE[1:]}
-    columns["velocity"] = values[:, 4:7]
-    said = [f"particles of type {chosen} ({kind})"]
-    if "hsmooth" in columns:
-        said.append("column `hsmooth` is not used: it is a softening in some codes; pass `support=` to set supports yourself")
+    columns |= {"velocity": values[:, 4:7], **beside}
+    units, told = units_beside(path, columns, time)
+    said = [f"particles of type {chosen} ({kind})", *said, *told]
     said.append("kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)")
-    more: dict[str, Any] = {"conventions": tuple(said), "time": time, "part_type": chosen, "kernel": "cubic_spline"}
-    return ParticleTable(values[:, 1:4], columns, source=SOURCE, **more)
+    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time, "part_type": chosen}
+    more["kernel"] = "cubic_spline"
+    return with_stored_lengths(ParticleTable(values[:, 1:4], columns, source=SOURCE, **more), *SMOOTHING)
 
 
 def _header(start: bytes) -> tuple[Order, np.void]:

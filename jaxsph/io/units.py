@@ -6,6 +6,7 @@ Flow: HDF5 attributes -> [units] -> FileUnits of a ParticleTable -> `unit_names`
 |---|---|
 | GADGET-4, AREPO | at each data set: `to_cgs`, `length_scaling`, ..., and powers of scale factor a and Hubble parameter h |
 | SWIFT | at each data set: `U_L exponent`, ..., `Conversion factor to CGS ...`; those of time in the group `Units` |
+| Tipsy, NChilada | in a file of parameters beside them (`param_files`) |
 | Phantom | `udist`, `umass`, `utime`, `umagfd` in the header, for xyz, h, vxyz, u, masses, densities, Bxyz |
 
 Numbers are left as stored: where a file states powers of a and h, units carry them, and nothing is multiplied out. Gadget files

@@ -57,3 +57,56 @@ def test_the_padding_of_the_standard_is_zero(tmp_path):
     path.write_bytes(content[:200] + b"\1\2\3\4" + content[200:])
     with pytest.raises(ValueError, match=r"run\.00010: has \d more bytes than its header and its records"):
         js.io.read_table(path)
+
+
+def gas(path, **columns):
+    """Two thousand gas particles, two dark ones, and values of gas records by name."""
+    rng = np.random.default_rng(0)
+    position = (rng.normal(size=(2000, 3)) * 10 ** rng.uniform(-2, 0, (2000, 1))).astype(np.float32)
+    names = RECORDS[0][1]
+    values = np.zeros((2000, len(names)), np.float32)
+    values[:, 1:4] = position
+    for name, column in {"mass": 0.25, "rho": 1.0, "temp": 1e4, "hsmooth": 0.1, **columns}.items():
+        values[:, names.index(name)] = column
+    header = np.array((0.25, 2002, 3, 2000, 2, 0), HEADER.newbyteorder(">"))
+    dark = np.ones((2, len(RECORDS[1][1])))
+    path.write_bytes(header.tobytes() + b"\0" * 4 + values.astype(">f4").tobytes() + dark.astype(">f4").tobytes())
+    return position
+
+
+def test_a_softening_and_a_density_of_one_are_not_used_and_that_is_said(tmp_path):
+    position = gas(tmp_path / "run.00010")
+    _, report = js.io.particles_from_table(js.io.read_table(tmp_path / "run.00010"))
+    assert report.support == "distance to neighbour 32" and report.volume.startswith("1 / sum of kernels")
+    assert any("`hsmooth` is not used" in note for note in report.notes)
+    assert any("`rho` is not used for volumes: it is 1 everywhere" in note for note in report.notes)
+    assert len(position) == report.num_particles
+
+
+def test_smoothing_lengths_and_densities_in_the_records_are_used(tmp_path):
+    h = js.io.nearest_neighbour_supports(gas(tmp_path / "run.00010")) / 2
+    position = gas(tmp_path / "run.00010")
+    rho = js.io.kernel_sum(position, 2 * h, np.full(2000, 0.25), kernel="cubic_spline")
+    gas(tmp_path / "run.00010", hsmooth=h, rho=rho)
+    table = js.io.read_table(tmp_path / "run.00010")
+    _, report = js.io.particles_from_table(table)
+    np.testing.assert_allclose(table.support, 2 * h, rtol=1e-6)
+    assert report.support.startswith("support = 2 x hsmooth") and report.volume.startswith("mass / rho (the stored density is 1 ")
+
+
+def test_smoothing_lengths_beside_the_file_come_before_the_softening_in_it(tmp_path):
+    h = js.io.nearest_neighbour_supports(gas(tmp_path / "run.00010")) / 2
+    beside = [2002, *h.tolist(), 1, 1]
+    (tmp_path / "run.00010.smoothlength").write_text("\n".join(map(str, beside)))
+    table = js.io.read_table(tmp_path / "run.00010")
+    np.testing.assert_allclose(table.support, 2 * h)
+    assert "column `smoothlength` is of run.00010.smoothlength" in table.conventions
+    assert js.io.read_table(tmp_path / "run.00010", part_type=1).columns["smoothlength"].tolist() == [1, 1]
+
+
+def test_units_are_those_of_the_file_of_parameters_beside_it(tmp_path):
+    gas(tmp_path / "run.00010")
+    (tmp_path / "any.param").write_text("dKpcUnit = 1\ndMsolUnit = 1\n")
+    table = js.io.read_table(tmp_path / "run.00010")
+    assert table.units.columns["velocity"].cgs == pytest.approx(207.386, rel=1e-5)  # sqrt(G Msun / kpc), cm/s
+    assert table.units.columns["temp"].cgs == 1 and table.units.time == 0.25
