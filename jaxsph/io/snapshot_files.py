@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from .damage import DataError, NoParticlesError
+from .regular import regular_file
 from .table import ParticleTable
 
 NAMED = 3
@@ -60,6 +61,9 @@ def files_of(path: Path, number: int) -> list[Path] | None:
     there = _numbers_beside(path, match[1], match[3] or "", number)
     missing = (f"{match[1]}{nth}{match[3] or ''}" for nth in range(number) if nth not in there)
     named, num_missing = list(itertools.islice(missing, NAMED)), number - len(there)
+    for name in named:
+        if path.with_name(name).exists():
+            regular_file(path.with_name(name))  # says what it is instead
     if named:
         more = f" and {num_missing - NAMED} more" if num_missing > NAMED else ""
         raise DataError(f"{path}: is one of {number} files of a snapshot; beside it {', '.join(named)}{more} cannot be found")
