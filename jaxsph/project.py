@@ -51,6 +51,7 @@ def project(
     plan: ProjectionPlan | None = None,
     name: str | None = None,
     unit: str = "",
+    clock: Clock | None = None,
 ) -> Projection:
     r"""Integrate what particles hold along the rays of an image.
 
@@ -70,6 +71,7 @@ def project(
         depth_range: depths that rays begin and end at, for those of the camera.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
         name, unit: what the values are called in files and figures, and their unit.
+        clock: that books the seconds of compiling and of casting apart; eager only.
 
     Returns:
         Values in the dtype of the particles, in units of `of`, over length squared without weight; as exact as said above.
@@ -93,7 +95,7 @@ def project(
     if traced:
         sums, word = _sums(particles, held.amounts, camera, plan=plan)
     else:
-        sums, word = Clock().one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
+        sums, word = (clock or Clock()).one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
         _raise_for(int(word), planned)
     described = [("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)]
     described += [] if traced else [("jaxsph.camera", camera.describe())]

@@ -139,3 +139,8 @@ def test_what_is_not_in_the_file_is_told_in_one_line(file, capsys):
         assert code == 1 and len(err) == 1 and said in err[0], err
     code, _, err = run(capsys, "bare.npz", "--of", "mass", *TINY)
     assert code == 2 and "has no masses" in err[0]
+
+
+def test_compiling_is_told_apart_in_the_time(file, capsys):
+    line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
+    assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))
