@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import cli_options, cli_where, io
-from jaxsph.console import UsageError, say, span
+from jaxsph.console import UsageError, progress, say, span
 from jaxsph.io.projections import SUFFIXES
 from jaxsph.io.quantities import ROLES, choose_quantity
 from jaxsph.io.selection import chosen
@@ -24,9 +24,10 @@ from jaxsph.model import Camera, Particles
 from jaxsph.model.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.kernels import KERNELS
-from jaxsph.model.projection import NORMS
+from jaxsph.model.projection import NORMS, Projection
+from jaxsph.numerics.executors import Clock
 from jaxsph.project import project
-from jaxsph.projection_plan import PIXELS
+from jaxsph.projection_plan import PIXELS, plan_projection
 from jaxsph.scenes.view import snug
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
@@ -98,15 +99,28 @@ def run(options: argparse.Namespace) -> None:
     say("values", what)
     camera = _camera(particles, options)
     say("camera", camera.describe())
-    started = time.perf_counter()
-    image = project(particles, camera, of, weight, pixel=options.pixel, name=name)
+    image, seconds = _projected(particles, camera, (of, weight), options.pixel, name)
     values = np.asarray(image.values)
-    elapsed = time.perf_counter() - started
     image.save(output, **_look(options))
     say("image", f"{output}, {name} {span(values[np.isfinite(values)])}")
     if weight is None and not camera.is_perspective:
         say("total", f"{float(image.total()):.7g} in the image, of {float(np.sum(of)):.7g}")
-    say("time", f"{elapsed:.2f} s")
+    say("time", f"{sum(seconds.values()):.2f} s: " + ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items()))
+
+
+def _projected(particles: Particles, camera: Camera, held: Any, pixel: str, name: str) -> tuple[Projection, dict[str, float]]:
+    """The image, with a bar while it is made; and the seconds of each stage, compiling told apart."""
+    with progress("project", " stages") as show:
+        tell = show or (lambda done, total: None)
+        tell(0, 2)
+        started = time.perf_counter()
+        plan = plan_projection(particles, camera, pixel=pixel)
+        planned = time.perf_counter() - started
+        tell(1, 2)
+        clock = Clock()
+        image = project(particles, camera, *held, pixel=pixel, plan=plan, name=name, clock=clock)
+        tell(2, 2)
+    return image, {"plan": planned, "compile": clock.seconds["compile"], "cast": clock.seconds["cast"]}
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -52,6 +52,7 @@ def project(
     plan: ProjectionPlan | None = None,
     name: str | None = None,
     unit: str = "",
+    clock: Clock | None = None,
 ) -> Projection:
     r"""Integrate what particles hold along the rays of an image.
 
@@ -72,6 +73,7 @@ def project(
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
         name, unit: what the values are called in files and figures, and their unit; by default that which `of` carries, if it is
             an array with one, over that of positions squared without weight. Numbers are in these units, none is converted.
+        clock: that books the seconds of compiling and of casting apart; eager only.
 
     Returns:
         Values in the dtype of the particles, in units of `of`, over length squared without weight; as exact as said above.
@@ -95,7 +97,7 @@ def project(
     if traced:
         sums, word = _sums(particles, held.amounts, camera, plan=plan)
     else:
-        sums, word = Clock().one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
+        sums, word = (clock or Clock()).one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
         _raise_for(int(word), planned)
     described = [("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)]
     described += [] if traced else [("jaxsph.camera", camera.describe())]

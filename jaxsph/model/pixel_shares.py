@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.columns import whole_column
+from jaxsph.numerics.fusion import barriers_kept
 
 TERMS = 24  # odd Chebyshev polynomials that each g_k is made of
 PRODUCTS = 8  # with more, the error of the fit by polynomials is larger than that of leaving out the rest
@@ -64,14 +65,29 @@ def pixel_shares(
 
 
 def _between(shares: Shares, edges: Array) -> Float[Array, "... pixels products"]:
-    """Differences of all g_k between neighbouring edges, upwards; by Clenshaw's recurrence, of which XLA makes one chain."""
-    at = jnp.clip(edges, -1, 1)[..., None]
-    coefficients, double = shares.polynomials.astype(at.dtype), 4 * at * at - 2  # T_(n+2) = 2 T_2 T_n - T_(n-2)
+    """Differences of all g_k between neighbouring edges, upwards."""
+    at = jnp.clip(edges, -1, 1)
+    values = (_by_product if barriers_kept() else _by_chain)(shares.polynomials.astype(at.dtype), at)
+    return values[..., 1:, :] - values[..., :-1, :]
+
+
+def _by_product(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
+    """All g_k as one product of matrices: on CPUs, where the chain below takes longer."""
+    double = 4 * at * at - 2  # T_(n+2) = 2 T_2 T_n - T_(n-2)
+    odd = [at, at * (double - 1)]
+    for _ in coefficients[2:]:
+        odd.append(double * odd[-1] - odd[-2])
+    return jnp.matmul(jnp.stack(odd, -1), coefficients, precision="highest")
+
+
+def _by_chain(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
+    """The same by Clenshaw's recurrence, which accelerators fuse into one chain and hold in registers."""
+    at = at[..., None]
+    double = 4 * at * at - 2
     last = before = jnp.zeros_like(at * coefficients[0])
     for row in coefficients[::-1]:
         last, before = row + double * last - before, last
-    values = at * (last - before)
-    return values[..., 1:, :] - values[..., :-1, :]
+    return at * (last - before)
 
 
 def _nearest(edges: Array) -> Array:

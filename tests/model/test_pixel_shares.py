@@ -7,6 +7,7 @@ import pytest
 
 from jaxsph.model import columns, kernels
 from jaxsph.model.pixel_shares import pixel_shares
+from jaxsph.numerics.fusion import barriers
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(10)
@@ -51,3 +52,12 @@ def test_gradients_are_what_crosses_the_edges(name, x64):
     at = np.linspace(-1, 1, 4001)
     crossing = np.trapezoid(columns.whole_column(name, 0.09 + at**2, np), at)
     assert abs(slope - crossing) < 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shares_are_the_same_with_and_without_barriers(name):
+    edges = jnp.linspace(-1.2, 1.1, 40)
+    found = pixel_shares(name, edges, edges)
+    with barriers(False):
+        other = pixel_shares(name, edges, edges)
+    np.testing.assert_allclose(found, other, atol=2e-5 * float(other.max()))
