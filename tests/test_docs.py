@@ -33,6 +33,16 @@ def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
     assert not jax.config.jax_enable_x64
 
 
+@pytest.mark.notebook
+def test_the_page_for_users_of_jax_runs_as_pasted():
+    """All of its blocks, one after the other."""
+    page = (ROOT / "docs" / "for_jax_users.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    exec(compile("\n".join(blocks), "for_jax_users.md", "exec"), names)
+    assert len(blocks) == 4 and names["value"] > 0 and names["images"].color.shape == (2, 16, 16, 3)
+
+
 def test_there_are_blocks_to_run():
     assert len(BLOCKS) == 9 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
 

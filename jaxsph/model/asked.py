@@ -19,6 +19,7 @@ def require_asked(scene: Any, camera: Any, settings: Any) -> None:
 
     Raises:
         ValueError: one of another kind, numbers of settings that are none, or arrays of the scene that are sharded.
+        NotImplementedError: within `jax.shard_map` that checks which values vary over its mesh.
     """
     for name, value, kind in (("scene", scene, Scene), ("camera", camera, Camera), ("settings", settings, Settings)):
         if not isinstance(value, kind):
@@ -30,3 +31,16 @@ def require_asked(scene: Any, camera: Any, settings: Any) -> None:
                 f"`scene{jax.tree_util.keystr(path)}` is sharded over {len(leaf.sharding.device_set)} devices, and each needs "
                 "all of it: put the scene on one device, or replicate it, and share out the work by `devices=`"
             )
+    _require_unvarying(scene, camera, settings)
+
+
+def _require_unvarying(*given: Any) -> None:
+    """Raise where a value is known to vary over a mesh: loops within begin with constants, which JAX then refuses to mix with it."""
+    traced = [jax.typeof(leaf) for leaf in jax.tree.leaves(given) if isinstance(leaf, jax.core.Tracer)]
+    kinds = [getattr(kind, "manual_axis_type", None) for kind in traced]
+    over = sorted({axis for kind in kinds if kind is not None for axis in kind.varying})
+    if over:
+        raise NotImplementedError(
+            f"an image within `jax.shard_map` cannot be checked for what varies over its axes {', '.join(map(repr, over))}: "
+            "give `jax.shard_map(..., check_vma=False)`"
+        )

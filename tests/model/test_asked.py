@@ -58,3 +58,36 @@ except ValueError as error:
 def test_particles_that_are_sharded_are_refused_by_name():
     said = ran(SHARDED, devices=2)
     assert said.startswith("`scene.particles.position` is sharded over 2 devices") and "`devices=`" in said
+
+
+MAPPED = """
+import dataclasses, json, jax, jax.numpy as jnp, numpy as np, jaxsph as js
+from jax.sharding import Mesh, PartitionSpec
+rng = np.random.default_rng(0)
+particles = js.Particles.from_arrays(rng.uniform(-1, 1, (16, 3)), 0.4, 0.0)
+scene = js.Scene(particles=particles, transfer=js.TransferFunction.from_points([0.0], [[1, 0.5, 1]], [1.0]))
+camera = js.Camera.look_at((0, 0, 5), (0, 0, 0), width=8, height=8, near=3, far=7)
+settings = js.Settings(samples=8)
+plan = js.plan(scene, camera, settings, headroom=2)
+eyes = jnp.asarray([(0.0, 0, 5), (0.3, 0.2, 5)], jnp.float32)
+
+def picture(eye):
+    return js.render(scene, dataclasses.replace(camera, eye=eye), settings, plan=plan).color
+
+def mapped(**checked):
+    over = {"mesh": Mesh(np.array(jax.devices()), ("d",)), "in_specs": PartitionSpec("d"), "out_specs": PartitionSpec("d")}
+    return jax.jit(jax.shard_map(lambda eyes: jax.vmap(picture)(eyes), **over, **checked))(eyes)
+
+try:
+    mapped()
+except NotImplementedError as error:
+    said = str(error)
+off = [float(abs(one - picture(eye)).max()) for one, eye in zip(mapped(check_vma=False), eyes)]
+print(json.dumps([said, off]))
+"""
+
+
+def test_a_map_over_a_mesh_that_is_checked_is_refused_by_name_and_one_that_is_not_gives_the_images():
+    said, off = ran(MAPPED, devices=2)
+    assert "'d'" in said and "check_vma=False" in said
+    assert max(off) <= 1e-5

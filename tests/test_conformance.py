@@ -1,0 +1,206 @@
+"""One table of what can be combined: media, clips, integrators, screens and kernels, and what is promised of each row.
+
+In float64 a row's derivatives are alike in both modes and those of differences; its image is the same eagerly, under `jit` and
+under `vmap`; where nothing is in view it is finite; after a fault it claims nothing. Or the combination is refused by name.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import QUICKLY, still
+from rows import HEIGHT, SAMPLES, WIDTH, Row
+
+import jaxsph as js
+
+ALIKE = 1e-8  # of a slope's size: forward and reverse mode add up the same terms
+DIFFERENCE = 1e-5  # and what differences make of it; of iso-surfaces, whose roots are found to a tolerance, 1e-3
+OF_SURFACES = 1e-3
+STEP = 1e-6
+ROUNDING = 2.0**16 * np.finfo(np.float64).eps
+DERIVATIVES, ALL_WAYS = "derivatives", "all ways"
+
+TABLE = [
+    Row("particles", quick=(DERIVATIVES,)),
+    Row("particles", "~sphere", "segments", quick=()),
+    Row("particles", "plane & ~sphere", "samples", "quadtree", "wendland_c2"),
+    Row("particles", "box", "segments", "quadtree", "cubic_spline"),
+    Row("particles", "sphere", "samples", "pixels", "quintic_spline"),
+    Row("particles", "plane", "segments", "pixels", "wendland_c6"),
+    Row("two quantities", "plane", "samples", "pixels", "quartic_spline"),
+    Row("two quantities", "plane & ~sphere", "segments", "pixels", "wendland_c4"),
+    Row("two quantities", "everywhere", "segments", "quadtree", "poly6"),
+    Row("volume", "box", "samples", "pixels", quick=(DERIVATIVES,)),
+    Row("volume", "~sphere", "segments", "pixels", quick=(ALL_WAYS,)),
+    Row("volume", "plane", "segments", "quadtree"),
+    Row("points", "sphere", "segments", "pixels"),
+    Row("points", "plane & ~sphere", "samples", "pixels", quick=(ALL_WAYS,)),
+    Row("points", "everywhere", "samples", "quadtree"),
+    Row("points", "box", "segments", "quadtree"),
+    Row("surface", "everywhere", "samples", "pixels", quick=(DERIVATIVES,)),
+    Row("surface", "box", "segments", "pixels"),
+    Row("surface", "~sphere", "samples", "quadtree"),
+    Row("surface", "plane & ~sphere", "segments", "pixels"),
+    Row("all together", "everywhere", "samples", "pixels", "wendland_c2"),
+    Row("all together", "plane & ~sphere", "segments", "pixels", "cubic_spline"),
+    Row("all together", "sphere", "segments", "quadtree", "poly6"),
+    Row("periodic", "everywhere", "segments", "pixels", "wendland_c4"),
+    Row("periodic", "box", "samples", "pixels", "cubic_spline"),
+    Row("periodic", "~sphere", "segments", "quadtree", "quartic_spline"),
+]
+
+
+def rows(promise):
+    """The table, where rows that others keep a promise for are slow."""
+    return [pytest.param(row, id=row.name, marks=[] if promise in row.quick else [pytest.mark.slow]) for row in TABLE]
+
+
+def light(inputs, cotangent, settings, plan):
+    """All layers that have derivatives, weighted."""
+    image = js.render(*inputs, settings, plan=plan)
+    return (jnp.concatenate([image.color, image.transmittance[..., None]], -1) * cotangent).sum()
+
+
+def slopes(inputs, move, cotangent, settings, plan):
+    """The weighted image, its slope by forward mode, and its gradient by reverse mode."""
+
+    def of(inputs):
+        return light(inputs, cotangent, settings, plan)
+
+    return *jax.jvp(of, (inputs,), (move,)), jax.grad(of, allow_int=True)(inputs)
+
+
+def everywhere(inputs, rng):
+    """A direction in which all that floats moves, and the camera turns as cameras do."""
+    camera = inputs[1]
+    x, y, z = rng.normal(size=3)
+    turn = jnp.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ camera.axes
+
+    def any_way(leaf, none):
+        return none if none.dtype == jax.dtypes.float0 else jnp.asarray(rng.normal(size=leaf.shape))
+
+    scene, pose = jax.tree.map(any_way, inputs, still(inputs))
+    return scene, dataclasses.replace(pose, axes=turn)
+
+
+def along(gradient, move):
+    """The slope in a direction, and how large its terms are."""
+    terms = [
+        np.ravel(a * b)
+        for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(move), strict=True)
+        if a.dtype != jax.dtypes.float0
+    ]
+    return float(sum(term.sum() for term in terms)), float(sum(np.abs(term).sum() for term in terms))
+
+
+def figures(row, frames, options):
+    """How far both modes are apart, and from differences, of the size of the slope; and what an empty view has."""
+    plan, settings, rng = row.plan(frames), row.settings, np.random.default_rng(row.seed + 100)
+    inputs, cotangent = row.inputs(frames), jnp.asarray(rng.normal(size=(HEIGHT, WIDTH, 4)))
+    at = jax.jit(slopes, static_argnames="plan", compiler_options=options)
+    move = everywhere(inputs, rng)
+    _, pushed, gradient = at(inputs, move, cotangent, settings, plan=plan)
+    pulled, size = along(gradient, move)
+    ahead, behind = (
+        at(jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + by * d, inputs, move), move, cotangent,
+           settings, plan=plan)[0]
+        for by in (STEP, -STEP)
+    )  # fmt: skip
+    away = dataclasses.replace(inputs[1], eye=inputs[1].eye - 100 * inputs[1].axes[2])
+    nothing, _, flat = at((inputs[0], away), move, cotangent, settings, plan=plan)
+    return {
+        "alike": abs(float(pushed) - pulled) / size,
+        "difference": abs(float(ahead - behind) / (2 * STEP) - pulled) / size,
+        "size": size,
+        "empty": float(nothing) - float(cotangent[..., 3].sum()),
+        "finite": all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(flat) if leaf.dtype != jax.dtypes.float0),
+    }
+
+
+def check_figures(row, found):
+    assert found["size"] > 1e-2
+    assert found["alike"] <= ALIKE
+    assert found["difference"] <= (OF_SURFACES if row.media in ("surface", "all together") else DIFFERENCE)
+    assert abs(found["empty"]) <= ROUNDING and found["finite"]
+
+
+@pytest.mark.parametrize("row", rows(DERIVATIVES))
+def test_both_modes_are_alike_and_those_of_differences_and_an_empty_view_is_finite(row, frames, x64):
+    check_figures(row, figures(row, frames, QUICKLY))
+
+
+def ways(row, frames):
+    """How far images under `jit` and `vmap` are from eager ones, and what an image with a fault claims beside one without."""
+    plan, settings = row.plan(frames), row.settings
+    both = [row.inputs(frames, row.seed + more) for more in (0, 1)]
+    draw = jax.jit(lambda given: js.render(*given, settings, plan=plan), compiler_options=QUICKLY)
+    batch = jax.jit(jax.vmap(lambda given: js.render(*given, settings, plan=plan)), compiler_options=QUICKLY)
+    together, one = batch(_stacked(*both)), draw(both[0])
+    eager = [js.render(*given, settings, plan=plan) for given in both]
+    scene, camera = both[1]
+    bad = batch(_stacked(both[0], (scene, dataclasses.replace(camera, half_height=jnp.nan * camera.half_height))))
+    return {
+        "jit": _apart(one, eager[0]),
+        "vmap": max(_apart(jax.tree.map(lambda leaf, nth=nth: leaf[nth], together), eager[nth]) for nth in (0, 1)),
+        "shown": float(np.ptp(eager[0].color)),
+        "alone": int(bad.faults[0]) == 0 and bool(bad.certified[0]) == eager[0].certified,
+        "disclaimed": int(bad.faults[1]) != 0 and not bad.certified[1] and bool((bad.error_bound[1] == 1).all()),
+        "still finite": bool(np.isfinite(bad.color).all()),
+    }
+
+
+def _stacked(first, second):
+    return jax.tree.map(lambda a, b: jnp.stack([jnp.asarray(a), jnp.asarray(b)]), first, second)
+
+
+def _apart(image, other):
+    return max(float(np.abs(getattr(image, name) - getattr(other, name)).max()) for name in ("color", "transmittance"))
+
+
+@pytest.mark.parametrize("row", rows(ALL_WAYS))
+def test_images_are_one_eagerly_and_under_jit_and_vmap_and_a_fault_disclaims_its_own_alone(row, frames, x64, quick_programs):
+    found = ways(row, frames)
+    assert found["shown"] > 0.05
+    assert found["jit"] <= ROUNDING and found["vmap"] <= ROUNDING
+    assert found["alone"] and found["disclaimed"] and found["still finite"]
+
+
+def test_reverse_mode_is_forward_mode_in_programs_that_are_optimised(frames, x64):
+    """At default options: XLA's optimiser got what passes between spans of a clip wrong, and only there."""
+    row = Row("particles", "~sphere", "segments")
+    scene, camera = row.inputs(frames)
+    small = dataclasses.replace(camera, width=4, height=4)
+    settings = dataclasses.replace(row.settings, samples=8)
+    plan = js.plan(scene, small, settings)
+    cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4, 4)))
+
+    def of(radius):
+        sphere = dataclasses.replace(scene.within.clip, radius=radius)
+        return light((dataclasses.replace(scene, within=~sphere), small), cotangent, settings, plan)
+
+    radius = scene.within.clip.radius
+    pushed = jax.jit(lambda r: jax.jvp(of, (r,), (jnp.ones_like(r),))[1], compiler_options=QUICKLY)(radius)
+    pulled = jax.jit(jax.grad(of))(radius)
+    assert abs(float(pushed)) > 1e-2
+    assert float(pulled) == pytest.approx(float(pushed), rel=ALIKE)
+
+
+STEPS = {"integrator": "step_doubling"}
+REFUSED = [
+    (Row("particles", **STEPS), "jit", ValueError, r"`Scene\(particles=\.\.\.\)` cannot answer; put it into an octree"),
+    (Row("points", "sphere", **STEPS), "jit", ValueError, r"`Scene\(points=\.\.\.\)` cannot answer; put it into an octree"),
+    (Row("surface", **STEPS), "jit", ValueError, "`IsoSurface` cannot answer; leave that out"),
+    (Row("volume", "plane", **STEPS), "grad", NotImplementedError, "step_doubling"),
+]
+
+
+@pytest.mark.parametrize(("row", "how", "error", "match"), REFUSED, ids=[f"{row.name}, {how}" for row, how, *_ in REFUSED])
+def test_what_cannot_be_combined_is_refused_by_name(row, how, error, match, frames, x64):
+    inputs, samples = row.inputs(frames), dataclasses.replace(row, integrator="samples")
+    plan = dataclasses.replace(samples.plan(frames), integrator=row.integrator, step_tolerance=row.settings.step_tolerance)
+    cotangent = jnp.ones((HEIGHT, WIDTH, 4))
+    of = {"jit": light, "grad": jax.grad(light, allow_int=True)}[how]
+    with pytest.raises(error, match=match):
+        jax.eval_shape(lambda inputs: of(inputs, cotangent, row.settings, plan), inputs)
