@@ -44,7 +44,7 @@ def gas():
     given = columns()
     volume = given["mass"] / given["density"]
     position = given["position"].astype(np.float32)
-    particles = js.Particles.from_arrays(position, np.float32(0.3), position[:, 0], volume.astype(np.float32), "cubic_spline")
+    particles = js.Particles.from_arrays(position, np.float32(0.3), position[:, 0], volume.astype(np.float32), "poly6")
     return particles, given, volume
 
 
@@ -151,6 +151,8 @@ def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(f
         assert (code, err) == (0, []) and "stored density `rho` is not used" in out
         total = float(out.partition("in the image, of ")[2].split()[0].rstrip(","))
         assert total == pytest.approx(4 * np.pi / 3, rel=0.15)
+
+
 def test_compiling_is_told_apart_in_the_time(file, capsys):
     line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
     assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))

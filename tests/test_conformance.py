@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY, still
-from rows import HEIGHT, SAMPLES, WIDTH, Row
+from rows import HEIGHT, WIDTH, Row
 
 import jaxsph as js
 
@@ -103,11 +103,12 @@ def figures(row, frames, options):
     move = everywhere(inputs, rng)
     _, pushed, gradient = at(inputs, move, cotangent, settings, plan=plan)
     pulled, size = along(gradient, move)
-    ahead, behind = (
-        at(jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + by * d, inputs, move), move, cotangent,
-           settings, plan=plan)[0]
-        for by in (STEP, -STEP)
-    )  # fmt: skip
+
+    def moved(by):
+        there = jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + by * d, inputs, move)
+        return at(there, move, cotangent, settings, plan=plan)[0]
+
+    ahead, behind = moved(STEP), moved(-STEP)
     away = dataclasses.replace(inputs[1], eye=inputs[1].eye - 100 * inputs[1].axes[2])
     nothing, _, flat = at((inputs[0], away), move, cotangent, settings, plan=plan)
     return {

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.access.lists import ListPlan
 from jaxsph.cast.batches import CastPlan
+from jaxsph.model import kernels
 
 CAPACITY = 6
 RTOL = 1e-4

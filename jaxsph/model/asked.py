@@ -35,7 +35,7 @@ def require_asked(scene: Any, camera: Any, settings: Any) -> None:
 
 
 def _require_unvarying(*given: Any) -> None:
-    """Raise where a value is known to vary over a mesh: loops within begin with constants, which JAX then refuses to mix with it."""
+    """Raise where a value is known to vary over a mesh: loops begin with constants, which JAX refuses to mix with it."""
     traced = [jax.typeof(leaf) for leaf in jax.tree.leaves(given) if isinstance(leaf, jax.core.Tracer)]
     kinds = [getattr(kind, "manual_axis_type", None) for kind in traced]
     over = sorted({axis for kind in kinds if kind is not None for axis in kind.varying})

@@ -75,7 +75,11 @@ def rounded_into(name: str, value: Any, ends: tuple[float, float], remedy: str) 
     slack = 0.0
     if np.issubdtype(given.dtype, np.floating):
         finite = np.abs(given[np.isfinite(given)], dtype=np.float64)
-        slack = ROUNDED * float(np.finfo(given.dtype).eps) * max(finite.max(initial=0), 0 if np.isinf(ends[1]) else ends[1])
+        slack = (
+            ROUNDED
+            * float(np.finfo(jax.dtypes.canonicalize_dtype(given.dtype)).eps)
+            * max(finite.max(initial=0), 0 if np.isinf(ends[1]) else ends[1])
+        )
     bad = np.abs(given.astype(np.float64) - kept.astype(np.float64)) > slack
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.access.lists import ListPlan
 from jaxsph.cast.batches import CastPlan
+from jaxsph.model import kernels
 
 WIDTH, HEIGHT, SAMPLES, CAPACITY = 13, 10, 32, 8
 SETTINGS = js.Settings(samples=SAMPLES, integrator="segments")
@@ -104,7 +105,12 @@ def two_pieces_at_most(rays, position, support, view):
     return not (apart & (inner[0] == inner[1])).any()
 
 
-@pytest.mark.parametrize("kernel", kernels.KERNELS)
+FIRST = "poly6", "cubic_spline", "wendland_c2"
+
+
+@pytest.mark.parametrize(
+    "kernel", [name if name in FIRST else pytest.param(name, marks=pytest.mark.slow) for name in kernels.KERNELS]
+)
 def test_an_image_is_the_integral_of_its_light(kernel):
     """Supports of all sizes, and colours that change from one to the next: but for where that is within a segment or two."""
     particles, view = several(np.random.default_rng(0), kernel), camera()
