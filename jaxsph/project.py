@@ -71,8 +71,7 @@ def project(
             values along the rays through their middles, which miss supports that are smaller than a pixel.
         depth_range: depths that rays begin and end at, for those of the camera.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
-        name, unit: what the values are called in files and figures, and their unit; by default that which `of` carries, if it is
-            an array with one, over that of positions squared without weight. Numbers are in these units, none is converted.
+        name, unit: what the values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
 
     Returns:
@@ -101,8 +100,8 @@ def project(
         _raise_for(int(word), planned)
     described = [("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)]
     described += [] if traced else [("jaxsph.camera", camera.describe())]
-    told: dict[str, Any] = {"faults": word, "name": name or held.name, "unit": unit, "metadata": tuple(described)}
-    return dataclasses.replace(_image(sums, held, camera), **told)
+    image, noted = _image(sums, held, camera), tuple(described)
+    return dataclasses.replace(image, faults=word, name=name or held.name, unit=unit, metadata=noted)
 
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
