@@ -98,10 +98,9 @@ def project(
     else:
         sums, word = (clock or Clock()).one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
         _raise_for(int(word), planned)
-    described = [("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)]
-    described += [] if traced else [("jaxsph.camera", camera.describe())]
-    image, noted = _image(sums, held, camera), tuple(described)
-    return dataclasses.replace(image, faults=word, name=name or held.name, unit=unit, metadata=noted)
+    described: tuple[Any, ...] = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
+    described += () if traced else (("jaxsph.camera", camera.describe()),)
+    return dataclasses.replace(_image(sums, held, camera), faults=word, name=name or held.name, unit=unit, metadata=described)
 
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
