@@ -52,9 +52,19 @@ TABLE = [
 ]
 
 
+# Rows by number that take a minute or two each; of the others, which take longer, none has been run to its end yet.
+SLOW = {DERIVATIVES: {1, 6, 7, 10, 13, 14, 18, 24}, ALL_WAYS: {9}}
+
+
 def rows(promise):
-    """The table, where rows that others keep a promise for are slow."""
-    return [pytest.param(row, id=row.name, marks=[] if promise in row.quick else [pytest.mark.slow]) for row in TABLE]
+    """The table: quick where the row is the holder of a promise, else slow, or for who has a quarter of an hour."""
+
+    def marks(nth, row):
+        if promise in row.quick:
+            return []
+        return [pytest.mark.slow if nth in SLOW[promise] else pytest.mark.endurance]
+
+    return [pytest.param(row, id=row.name, marks=marks(nth, row)) for nth, row in enumerate(TABLE)]
 
 
 def light(inputs, cotangent, settings, plan):
