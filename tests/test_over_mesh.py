@@ -34,7 +34,8 @@ def looked(scene, camera, settings, plan, **given):
 def compared(one, other):
     told = {}
     for layer in ("color", "transmittance", "error_bound", "evaluations"):
-        told[layer] = float(np.abs(np.asarray(getattr(one[0], layer)) - np.asarray(getattr(other[0], layer))).max())
+        ends = (np.nan_to_num(getattr(image, layer), nan=-1) for image in (one[0], other[0]))
+        told[layer] = float(np.abs(next(ends) - next(ends)).max())
     told["gradient"] = float(np.abs(np.asarray(one[1]) - np.asarray(other[1])).max() / np.abs(np.asarray(one[1])).max())
     told["forward"] = float(abs(one[2] - other[2]) / abs(one[2]))
     told["shown"] = float(one[0].color.mean())
@@ -56,7 +57,7 @@ scene, camera, settings, plan = given
 calm = 0.4 + 0.01 * scene.particles.quantity  # such that bounds save something
 scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=calm))
 one, other = (jax.jit(lambda s: js.render(s, camera, settings, plan=plan, devices=devices))(scene) for devices in (None, mesh))
-told = {n: float(np.abs(np.asarray(getattr(one, n)) - np.asarray(getattr(other, n))).max())
+told = {n: float(np.abs(np.nan_to_num(getattr(one, n), nan=-1) - np.nan_to_num(getattr(other, n), nan=-1)).max())
         for n in ("color", "transmittance", "error_bound", "evaluations")}
 told["share"] = float(other.stats["evaluations"] / other.stats["evaluations_full"])
 print(json.dumps(told))
