@@ -53,7 +53,7 @@ test-slow-share: $(VENV)/.installed-test
 	@$(SUITE) -m slow --share=$(SLOW_SHARE) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
 
 test-endurance: $(VENV)/.installed-test
-	@$(VENV)/bin/python -m pytest -q -m endurance $(PYTEST_ARGS) tests/test_endurance.py
+	@$(VENV)/bin/python -m pytest -q --timeout 0 -m endurance $(PYTEST_ARGS) tests/test_endurance.py
 
 notebooks: $(VENV)/.installed-test
 	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py

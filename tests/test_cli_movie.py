@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from exec_after import HEARS_INTERRUPTS, exec_after
 
 import jaxsph as js
 from jaxsph import cli, cli_cluster
@@ -102,7 +103,7 @@ def test_a_command_that_was_killed_goes_on_and_ends_with_the_same_bits(sequence,
     while time.monotonic() < until and killed.poll() is None and not (tmp_path / "m_frames" / "00003.png").exists():
         time.sleep(0.005)
     killed.send_signal(signal.SIGKILL)
-    killed.wait()
+    killed.wait(timeout=60)
     done = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "m_frames").glob("0*.png")}
     assert 3 <= len(done) < 24 and not (tmp_path / "m.mp4").exists()
     again = subprocess.run([*command, "-o", "m.mp4"], capture_output=True, text=True, check=True)
@@ -194,7 +195,7 @@ def test_a_scheduler_that_does_not_answer_is_told_of_before_files_are_read(seque
 
 @pytest.mark.slow
 def test_an_interrupt_leaves_frames_and_no_processes(sequence, tmp_path):
-    command = [sys.executable, "-m", "jaxsph", "movie", *sequence, "--frames", "400", *TINY, "--workers", "2", "-o", "m.mp4"]
+    command = exec_after(HEARS_INTERRUPTS, "movie", *sequence, "--frames", "400", *TINY, "--workers", "2", "-o", "m.mp4")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until = time.monotonic() + 300
     while time.monotonic() < until and process.poll() is None and not (tmp_path / "m_frames" / "00003.png").exists():

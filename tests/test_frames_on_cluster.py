@@ -222,7 +222,15 @@ def test_a_worker_has_a_device_of_its_own_and_the_compiled_programs_of_who_start
             signal.signal(number, handler)
 
 
-def test_an_interrupt_while_processes_are_started_comes_when_they_can_be_closed(monkeypatch):
+@pytest.fixture
+def interrupts():
+    """How interrupts are heard; where this process was begun to ignore them, as in the background of a shell, it hears them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_while_processes_are_started_comes_when_they_can_be_closed(monkeypatch, interrupts):
     class Cluster:
         def __init__(self, **_):
             signal.raise_signal(signal.SIGINT)
@@ -232,11 +240,11 @@ def test_an_interrupt_while_processes_are_started_comes_when_they_can_be_closed(
         def close(self, timeout):
             closed.append(self.started)
 
-    closed, handler = [], signal.getsignal(signal.SIGINT)
+    closed = []
     monkeypatch.setattr(workers.distributed, "LocalCluster", Cluster)
     with pytest.raises(KeyboardInterrupt), workers.local_client(1):
         pass
-    assert closed == [True] and signal.getsignal(signal.SIGINT) is handler
+    assert closed == [True] and signal.getsignal(signal.SIGINT) is interrupts
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_a_place_that_cannot_be_written_to_is_refused_by_name(where, why, tmp_pa
 def ended():
     """The number of a process that has ended."""
     child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
+    child.wait(timeout=60)
     return child.pid
 
 

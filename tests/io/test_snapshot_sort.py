@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from exec_after import exec_after
 from snapshots_made import particles, write
 
 import jaxsph as js
@@ -42,13 +43,9 @@ def test_the_snapshot_itself_and_other_suffixes_are_refused(tmp_path):
 
 def limited(arguments, num_bytes):
     """What a command ends with when it may write files of so many bytes."""
-    import resource
-
-    def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, num_bytes))
-
-    command = [sys.executable, "-m", "jaxsph", *map(str, arguments), "--no-cache"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, preexec_fn=limit)
+    limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({num_bytes}, {num_bytes}))"
+    command = exec_after(limit, *arguments, "--no-cache")
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of processes are POSIX's")
