@@ -3,7 +3,6 @@
 from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
 from jaxsph.coarse import Coarsened, coarse_bound, coarsened
-from jaxsph.depth_slabs import DepthSlabs, render_slabs
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
@@ -39,7 +38,6 @@ __all__ = [
     "CameraPath",
     "CapacityError",
     "Coarsened",
-    "DepthSlabs",
     "FrameFile",
     "FramesError",
     "Image",
@@ -82,7 +80,6 @@ __all__ = [
     "render",
     "render_frames",
     "render_from_disk",
-    "render_slabs",
     "render_tile",
     "resample",
     "scenes",

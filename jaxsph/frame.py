@@ -21,7 +21,6 @@ from jaxsph.access.ordering import Ordered
 from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
-from jaxsph.field.schedule import SlabRange
 from jaxsph.host_stages import MAKE_GRID, ORDER
 from jaxsph.layers import OfShards
 from jaxsph.model import registry
@@ -84,7 +83,7 @@ class Frame:
     """What all bands of a frame have in common; `shards` of each are cast side by side.
 
     `limits` are what rays keep to, of which each may take a share of what is `allowed` where pixels are interpolated too.
-    Particles are shown `within` a clip, or everywhere; slabs are marched of a range that is `own`, or all.
+    Particles are shown `within` a clip, or everywhere.
     """
 
     ordered: Ordered
@@ -98,7 +97,6 @@ class Frame:
     allowed: Float[Array, ""] | None
     min_transmittance: Float[Array, ""] | None
     within: Clip | None = None
-    own: SlabRange | None = None
 
     @classmethod
     def begun(
@@ -141,7 +139,7 @@ class Frame:
         sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "beside": self._beside}
         sizes["tuning"] = plan.cast.tuning
         made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
-        return made if self.own is None else made.among(self.own)
+        return made
 
     def cast(
         self,
@@ -150,16 +148,15 @@ class Frame:
         lattice: Lattice | None,
         run: Executor,
         camera: Camera | None = None,
-        front: Float[Array, "packets rows columns"] | None = None,
     ) -> list[Cast]:
-        """What the rays of all packets of a grid meet, shard by shard; behind what lets so much through in `front` of it."""
+        """What the rays of all packets of a grid meet, shard by shard."""
         plan = self.plan
         each = self._each(run)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
         scene = (grid, camera or self.camera, self.transfer, self.media)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         how = lattice, self.min_transmittance, tolerance
-        inputs = [(*scene, schedule, *how, nth, self.within, front) for schedule, nth in zip(schedules, each, strict=True)]
+        inputs = [(*scene, schedule, *how, nth, self.within) for schedule, nth in zip(schedules, each, strict=True)]
         method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
         return rays
@@ -185,8 +182,7 @@ class Frame:
         if isinstance(self.plan.control, PilotPlan):
             return self._ask_pilot(grid, self.plan.control, run)
         controlled = self.limits is not None and self.plan.control is not None
-        decided = self._bound(grid, run) if controlled else self.leave(grid, run, with_levels=False)
-        return decided if self.own is None else [one.among(self.own) for one in decided], None
+        return (self._bound(grid, run) if controlled else self.leave(grid, run, with_levels=False)), None
 
     def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""

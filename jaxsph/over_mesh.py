@@ -34,7 +34,7 @@ def drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan
     """On every device of a mesh, each for its own bundles; what is returned they all hold."""
     plan = plan.dealt(mesh.size)
 
-    def of_device(shared: tuple[Scene, Camera, Settings], _: Any) -> Drawn:
+    def of_device(shared: tuple[Scene, Camera, Settings]) -> Drawn:
         (scene, camera, settings), run = shared, OnMesh(mesh)
         seen = see(scene, camera, plan, run)
         frame = Frame.begun(seen, camera, settings, plan, scene.formulas, mesh.size, run)
@@ -53,30 +53,22 @@ def drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan
     return Drawn(crop(layers, plan), *(count[0] for count in found[1:]))
 
 
-def over(mesh: Mesh, function: Callable[..., Any], shared: Any, parts: Any = ()) -> Any:
-    """`function(shared, part)` of each device side by side along the first axis, which all then hold; see `on_each`."""
-    return placed_on(on_each(mesh, function, shared, parts), mesh, Spec())
-
-
-def on_each(mesh: Mesh, function: Callable[..., Any], shared: Any, parts: Any = ()) -> Any:
-    """`function(shared, part)` of each device side by side along the first axis, of which each holds its own.
+def over(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
+    """`function(shared)` of each device side by side along the first axis, which all then hold.
 
     Args:
         shared: what all hold before. What of it is no array is no argument: numbers that are known while tracing remain so.
-        parts: what each holds for itself, side by side along the first axis.
     """
     leaves, structure = jax.tree.flatten(shared)
     given = [nth for nth, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
 
-    def of_arrays(arrays: list[Array], parts: Any) -> Any:
+    def of_arrays(arrays: list[Array]) -> Any:
         there = [arrays[given.index(nth)] if nth in given else leaf for nth, leaf in enumerate(leaves)]
-        found = function(jax.tree.unflatten(structure, there), jax.tree.map(lambda leaf: leaf[0], parts))
-        return jax.tree.map(lambda leaf: leaf[None], found)
+        return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.unflatten(structure, there)))
 
-    each = Spec(mesh.axis_names)
-    mapped = jax.shard_map(of_arrays, mesh=mesh, in_specs=(Spec(), each), out_specs=each, check_vma=False)
-    shared = [jnp.copy(leaves[nth]) for nth in given]  # whose tangents may be NumPy's, which `shard_map` takes for constants
-    return mapped(shared, placed_on(parts, mesh, each))
+    mapped = jax.shard_map(of_arrays, mesh=mesh, in_specs=Spec(), out_specs=Spec(mesh.axis_names), check_vma=False)
+    # copied, as their tangents may be NumPy's, which `shard_map` takes for constants
+    return placed_on(mapped([jnp.copy(leaves[nth]) for nth in given]), mesh, Spec())
 
 
 def placed_on(tree: Any, mesh: Mesh, where: Spec) -> Any:

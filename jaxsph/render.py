@@ -67,8 +67,8 @@ def render(
         progress: eager only; called as `progress(done, total)` after every band.
         devices: what the work is shared among: `"all"`, a number, a sequence of `jax.Device`, or a `jax.sharding.Mesh`. Eagerly
             the image is the same bit for bit (with segments for a tolerance, and where rays end, within the estimate); under a
-            trace a mesh of any axes, automatic or explicit, makes the same image to rounding. Each device holds all particles,
-            see `DepthSlabs` for another way. None is where the particles are.
+            trace a mesh of any axes, automatic or explicit, makes the same image to rounding. Each device holds all particles.
+            None is where the particles are.
 
     Returns:
         Image with dtype of the particles.

@@ -32,7 +32,7 @@ from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.control.probe import Probe, worthwhile
 from jaxsph.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.field.nodes import sum_at_nodes
-from jaxsph.field.schedule import SlabRange, SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.field.within import over_slabs
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
@@ -112,12 +112,6 @@ class BandGrid(NamedTuple):
     filled: Int[Array, ""]
     pairs: Int[Array, ""]
 
-    def among(self, own: SlabRange) -> BandGrid:
-        """With nothing in slabs that are not in a range."""
-        inside = own.holds(self.windows.count.shape[0])[:, None]
-        windows = jax.tree.map(lambda value: jnp.where(inside, value, 0), self.windows)
-        return self._replace(windows=windows, filled=(windows.count > 0).sum())
-
     def of(self, ordered: Ordered) -> Grid:
         """The grid of those particles."""
         return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
@@ -142,11 +136,6 @@ class Decided(NamedTuple):
 
     schedule: SlabSchedule
     verdict: Verdict
-
-    def among(self, own: SlabRange) -> Decided:
-        """With nothing marched in slabs that are not in a range."""
-        filled = self.schedule.filled & own.holds(self.schedule.filled.shape[0])[:, None]
-        return self._replace(schedule=dataclasses.replace(self.schedule, filled=filled))
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -368,7 +357,6 @@ def cast_shard(
     tolerance: Float[Array, ""] | None,
     nth: Int[Array, ""],
     within: Clip | None = None,
-    front: Float[Array, "packets rows columns"] | None = None,
     *,
     shards: int,
     cast_plan: CastPlan,
@@ -385,7 +373,7 @@ def cast_shard(
     made = registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within, front)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within)
     spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
     if rays.refined is not None:

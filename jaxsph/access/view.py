@@ -21,7 +21,6 @@ from jaxsph.model import kernels
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.numerics import exponents, faults
-from jaxsph.numerics.across import greatest_of_all
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
 DEAD_CLASS = 255
@@ -133,11 +132,11 @@ def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
 
 def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
     """The class of each particle, by octaves below the largest reach, and the largest reach of each class."""
-    largest = greatest_of_all(jnp.where(live, reach, 0).max(initial=0))
+    largest = jnp.where(live, reach, 0).max(initial=0)
     octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
     octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
     each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
-    return octave, greatest_of_all(jnp.where(live & (octave == each), reach, 0).max(1, initial=0))
+    return octave, jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
 
 
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
@@ -151,9 +150,9 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
     counts = live & (large > 0)
     lowest = jnp.iinfo(jnp.int32).min
-    exponent -= greatest_of_all(jnp.where(counts, exponent, lowest).max(initial=lowest // 2))
+    exponent -= jnp.where(counts, exponent, lowest).max(initial=lowest // 2)
     strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
-    peak = greatest_of_all(lax.stop_gradient(strength.max(initial=0)))
+    peak = lax.stop_gradient(strength.max(initial=0))
     strength = strength / jnp.where(peak > 0, peak, 1)
     kernel = kernels.by_name(particles.kernel)
     lift = 2.0 ** lift_of_sizes(kernel)

@@ -89,7 +89,6 @@ class NonDiffInputs:
     chosen: Any
     min_transmittance: Float[Array, ""] | None
     tolerance: Float[Array, ""] | None
-    front: Float[Array, "packets rows columns"] | None
 
 
 def cast(
@@ -104,11 +103,8 @@ def cast(
     min_transmittance: Float[Array, ""] | None = None,
     tolerance: Float[Array, ""] | None = None,
     within: Clip | None = None,
-    front: Float[Array, "packets rows columns"] | None = None,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
-
-    Rays that have something in `front` of the march, which lets so much through, are met as they then are: no derivatives.
 
     Differentiation:
         Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
@@ -122,9 +118,7 @@ def cast(
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
-    if front is not None:
-        inputs = jax.tree.map(lax.stop_gradient, inputs)
-    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance, front)
+    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance)
     return _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
 
 
@@ -139,7 +133,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
         how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance, fixed.tolerance
-        return march(grid, fixed.schedule, packets, *how, fixed.front)
+        return march(grid, fixed.schedule, packets, *how)
 
 
 def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:

@@ -70,7 +70,6 @@ def march(
     perspective: bool,
     min_transmittance: Float[Array, ""] | None = None,
     tolerance: Float[Array, ""] | None = None,
-    front: Float[Array, "packets rows columns"] | None = None,
 ) -> RayResult:
     """March all packets of a band.
 
@@ -78,7 +77,6 @@ def march(
         schedule: the slabs of samples to march, by bundle.
         min_transmittance: packets all of whose rays let less through end, between batches; None for none.
         tolerance: what slabs are refined for, where the plan has room for that; None where they are not.
-        front: transmittance of what is in front of all slabs; None where nothing is.
     """
     batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
     together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
@@ -112,9 +110,6 @@ def march(
 
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
     rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining)
-    if front is not None:
-        seen_through = rays.transmittance.at[batches.compacted.bundle_rank].set(front.reshape(batches.num_packets, -1))
-        rays = dataclasses.replace(rays, transmittance=seen_through)
     light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining)
     start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
     found = lax.fori_loop(0, batches.number, march_batch, start)

@@ -10,7 +10,6 @@ reference image bit for bit.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,18 +57,6 @@ def full_rate(windows: SlabWindows, references: tuple[Float[Array, "slabs bundle
     filled = windows.count > 0
     level = jnp.zeros_like(windows.count)
     return SlabSchedule(filled, level, windows.begin, windows.length, windows.count, references)
-
-
-class SlabRange(NamedTuple):
-    """Numbers of slabs, from the first up to the one past the last."""
-
-    first: Int[Array, ""]
-    end: Int[Array, ""]
-
-    def holds(self, slabs: int) -> Bool[Array, " slabs"]:
-        """Which of so many slabs are in it."""
-        number = jnp.arange(slabs, dtype=jnp.int32)
-        return (number >= self.first) & (number < self.end)
 
 
 def clipped(schedule: SlabSchedule, meets: Bool[Array, "slabs bundles"] | None) -> SlabSchedule:

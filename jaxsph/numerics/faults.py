@@ -23,7 +23,6 @@ OCTREE_OVERFLOW = 512
 TOLERANCE_MISSED = 1024
 GHOST_OVERFLOW = 4096
 BAD_BOX = 8192
-BEYOND_HALO = 16384
 BAD_SETTINGS = 32768
 CLIPPED_LOOK = 65536
 
@@ -55,8 +54,6 @@ MESSAGES = {
     "plan with `jaxsph.plan`",
     BAD_BOX: "a periodic box must have sides > 0 and finite, and none shorter than the largest support radius; give a larger "
     "box, or smaller supports",
-    BEYOND_HALO: "a particle reaches a depth slab whose device does not hold it, as it has moved or the camera has; make the "
-    "depth slabs again by `jaxsph.DepthSlabs.of`, with a larger `margin` if particles are to move",
     TOLERANCE_MISSED: "the finest segments are too long for the tolerance where `error_bound` is above it; give more `samples`",
 }
 OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | OCTREE_OVERFLOW | GHOST_OVERFLOW
