@@ -34,11 +34,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import workloads
+from leaves_along import LeavesAlong, leaves_along
 
 import jaxsph as js
 from jaxsph.access.octree import Octree
 from jaxsph.access.octree_build import OctreePlan, build_octree, plan_octree
-from jaxsph.access.octree_rays import LeavesAlong, leaves_along
 from jaxsph.provenance import of_this_run
 
 SAMPLES, SIZE, LEAVES = 256, 512, 512

@@ -2,7 +2,6 @@
 
 from jaxsph import image_figure, io, reference, scenes, transfer_figure
 from jaxsph.access.morton import prepare
-from jaxsph.coarse import Coarsened, coarse_bound, coarsened
 from jaxsph.field.in_octree import in_octree, octree_plans
 from jaxsph.field.iso_surface import IsoSurface
 from jaxsph.field.within import Within
@@ -27,7 +26,6 @@ from jaxsph.render import render
 from jaxsph.resample import resample
 from jaxsph.slices import Slice, slice_of
 from jaxsph.snapshots import Snapshots
-from jaxsph.splats import splat_bound
 from jaxsph.sweep import sweep
 from jaxsph.tiles import merge, render_tile
 from jaxsph.version import __version__
@@ -37,7 +35,6 @@ __all__ = [
     "Camera",
     "CameraPath",
     "CapacityError",
-    "Coarsened",
     "FrameFile",
     "FramesError",
     "Image",
@@ -61,8 +58,6 @@ __all__ = [
     "Within",
     "__version__",
     "along_axis",
-    "coarse_bound",
-    "coarsened",
     "control_values",
     "emission",
     "image_figure",
@@ -84,7 +79,6 @@ __all__ = [
     "resample",
     "scenes",
     "slice_of",
-    "splat_bound",
     "sweep",
     "transfer_figure",
 ]

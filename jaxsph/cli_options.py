@@ -13,7 +13,7 @@ from jaxsph.model import Settings, registry
 from jaxsph.model.kernels import KERNELS
 
 SAMPLES = Settings().samples
-INTEGRATORS = tuple(name for name in registry.INTEGRATORS if name not in registry.BOUNDING)
+INTEGRATORS = tuple(registry.INTEGRATORS)
 
 
 def add_source(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False, surface: bool = True) -> None:

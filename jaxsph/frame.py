@@ -207,15 +207,14 @@ class Frame:
         return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice, self.within), **self._cast)], lattice
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
-        static = {"shards": self.shards, "control": self.plan.control, **self._cast}
-        each = self._each(run)
+        static, each = {"shards": self.shards, **self._cast}, self._each(run)
         probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in each], **static)
         pays, wanted = run.one("adapt", wanted_cells, (tuple(run.pooled(probes)),), tuning=self.plan.cast.tuning)
         if not run.may_hold(pays):
             return self.leave(grid, run, with_levels=True)
         view = (grid, self.camera, self.transfer, self.limits)
         inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
-        return run.each("adapt", decide_by_bounds, inputs, **static)
+        return run.each("adapt", decide_by_bounds, inputs, control=self.plan.control, **static)
 
 
 def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:

@@ -26,10 +26,11 @@ from jaxsph.access.view import Viewed
 from jaxsph.cast.adjoint import CastMethod, cast
 from jaxsph.cast.batches import CastPlan
 from jaxsph.cast.march import RayResult
-from jaxsph.control.adapt import ControlPlan, adapt, screen_cells, untouched
+from jaxsph.control.adapt import ControlPlan, adapt, untouched
 from jaxsph.control.interpolation_error import interpolation_error
 from jaxsph.control.pilot import PilotPlan, pilot, worth_a_lattice
-from jaxsph.control.probe import Probe, worthwhile
+from jaxsph.control.probe import Probe, probe, worthwhile
+from jaxsph.control.ranges import tables_of_parts
 from jaxsph.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.field.nodes import sum_at_nodes
 from jaxsph.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
@@ -206,7 +207,7 @@ def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
     return sum_shards(lattices)
 
 
-@stage("shards", "cast", "control", quickly=True)
+@stage("shards", "cast", quickly=True)
 def probe_shard(
     grid: Grid,
     transfer: TransferFunction,
@@ -215,13 +216,13 @@ def probe_shard(
     *,
     shards: int,
     cast: CastPlan,
-    control: ControlPlan,
     tuning: Tuning,
 ) -> Probe:
     """What may be worth bounding, in the `nth` of `shards` of a band."""
     grid, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, transfer, limits))
     transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    return screen_cells(shard_of_grid(grid, nth, shards), transfer, *limits, cast.slab_samples, control, tuning)
+    tables, own = tables_of_parts(transfer), shard_of_grid(grid, nth, shards)
+    return probe(own, tables, limits.tolerance, cast.slab_samples, tuning.cells_probed)
 
 
 @stage(quickly=True)
@@ -229,8 +230,8 @@ def wanted_cells(
     probes: tuple[Probe, ...], *, tuning: Tuning
 ) -> tuple[Bool[Array, ""], tuple[Bool[Array, "cells bundles"], ...]]:
     """Whether any cell is to be analysed; and which, of each shard."""
-    pays = worthwhile([(probe.held, probe.all_held) for probe in probes])
-    return pays & jnp.stack([probe.promising.any() for probe in probes]).any(), tuple(probe.promising & pays for probe in probes)
+    pays = worthwhile([(one.held, one.all_held) for one in probes])
+    return pays & jnp.stack([one.promising.any() for one in probes]).any(), tuple(one.promising & pays for one in probes)
 
 
 @stage("shards", "cast", "halo", "with_levels", quickly=True)

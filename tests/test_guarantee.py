@@ -20,7 +20,7 @@ ADAPTIVE = {
     "budget": ControlPlan(True, True, "budget"),
     "levels": ControlPlan(False, True, "budget"),
     "alone": ControlPlan(True, False, "greedy", 4),
-    "paper": ControlPlan(False, True, "paper"),
+    "greedy": ControlPlan(False, True, "greedy"),
 }
 
 
@@ -64,7 +64,7 @@ def require_kept(image, truth, tolerance):
     (np.float64, "poly6", "budget", 4, "perspective", js.render),
     pytest.param(np.float32, "wendland_c2", "alone", 16, "orthographic", js.render, marks=pytest.mark.slow),
     pytest.param(np.float32, "poly6", "levels", 4, "perspective", jitted, marks=pytest.mark.slow),
-    pytest.param(np.float32, "cubic_spline", "paper", 8, "perspective", js.render, marks=pytest.mark.slow),
+    pytest.param(np.float32, "cubic_spline", "greedy", 8, "perspective", js.render, marks=pytest.mark.slow),
     pytest.param(np.float64, "wendland_c2", "levels", 8, "orthographic", jitted, marks=pytest.mark.slow),
     pytest.param(np.float32, "poly6", "budget", 16, "orthographic", jitted, marks=pytest.mark.slow),
     pytest.param(np.float64, "cubic_spline", "alone", 4, "perspective", js.render, marks=pytest.mark.slow),

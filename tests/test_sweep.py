@@ -392,7 +392,7 @@ def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
         (["-o", "out", "--baselines", "half"], "samples/2"),
         (["-o", "out", "--repeats", "0"], "at least 1"),
         (["-o", "out", "--integral", "-1"], "at least 0"),
-        (["-o", "out", "--integrator", "splat_bound"], "invalid choice"),
+        (["-o", "out", "--integrator", "walks"], "invalid choice"),
         (["-o", "out", "--samples", "0"], "--samples must be"),
         (["-o", "out", "--frames", "1", "1"], "different"),
         (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),

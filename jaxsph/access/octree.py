@@ -1,6 +1,6 @@
 r"""An octree over spheres: which of them can be at a point, in a box.
 
-Flow: spheres -> octree_build -> [octree] -> octree_rays, media.
+Flow: spheres -> octree_build -> [octree] -> media.
 
 Every leaf has an entry for each sphere that it intersects (Kaehler, Abel & Hege 2007, section 3.1), so a point needs to look at
 its own leaf alone. The uppermost levels are one dense grid. Below, the children of a node are a block of eight, and neither

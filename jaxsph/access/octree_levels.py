@@ -16,7 +16,7 @@ Coordinates are those of the unit cube, so that nodes of level l begin at whole 
 computed as (x - lower) rate, which is monotone in x and off by at most eps, as no point of the box is beyond 1. So two points
 that are r apart come to lie at most $r \, \mathrm{rate} \, (1 + 2 \epsilon) + 2 \sqrt 3 \epsilon$ apart, and the distance to a
 box is computed to some 4 eps. Radii are widened by `ROUNDING` eps of themselves and of the cube, which covers these and the
-roundings of rays, see `octree_rays`.
+roundings of positions along rays.
 """
 
 from __future__ import annotations

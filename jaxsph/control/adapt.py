@@ -1,6 +1,6 @@
 """Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
 
-Flow: slab windows -> [screen_cells -> adapt: analysis -> levels -> merge] -> schedule -> cast -> image.
+Flow: slab windows -> probe -> [adapt: analysis -> levels -> merge] -> schedule -> cast -> image.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_window
 from jaxsph.control.analysis import analyse
 from jaxsph.control.levels import Offer, bound, choose
 from jaxsph.control.merge import coarse_schedule, evaluations_of_levels, merged_levels, uncoarsened
-from jaxsph.control.probe import Probe, probe
 from jaxsph.control.ranges import tables_of_parts
 from jaxsph.field.schedule import SlabSchedule
 from jaxsph.model.camera import Camera
@@ -41,20 +40,6 @@ class ControlPlan:
     merge: bool
     allocation: str
     coverage_subdivisions: int = 2
-
-
-def screen_cells(
-    grid: Grid,
-    transfer: TransferFunction,
-    tolerance: Float[Array, ""],
-    relax: Float[Array, ""],
-    slab_samples: int,
-    plan: ControlPlan,
-    tuning: Tuning,
-) -> Probe:
-    """Which cells are worth an analysis, of a band or of a shard of it."""
-    lateral = 1 - relax if plan.allocation == "paper" else 0.0
-    return probe(grid, tables_of_parts(transfer), tolerance, lateral, slab_samples, tuning.cells_probed)
 
 
 def adapt(
@@ -99,7 +84,7 @@ def adapt(
         beside = slab_windows_with_borders(grid.ordered, grid.lists)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         analysis = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
-        chosen = choose(analysis, offer, tolerance, relax, plan.allocation)
+        chosen = choose(analysis, offer, tolerance, plan.allocation)
         free = _nowhere(beside, num_cells, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
         largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.control.analysis import Analysis
-from jaxsph.control.errors import CANDIDATES, SUPER_PIXEL
+from jaxsph.control.errors import CANDIDATES
 
 CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
 HALVINGS = 20
@@ -43,29 +43,18 @@ class Offer:
     rounding: Float[Array, " bundles"]
 
 
-def choose(
-    analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], relax: Float[Array, ""], allocation: str
-) -> Int[Array, "cells bundles"]:
+def choose(analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str) -> Int[Array, "cells bundles"]:
     """The candidate of every cell: level 0 to 4, or super-pixel.
 
     Args:
         analysis: errors of all candidates.
         offer: what they save, and which can be had.
         tolerance: largest error of a pixel.
-        relax: share of the lateral variation that `"paper"` leaves out.
-        allocation: `"budget"`, `"greedy"` (back to front), `"paper"` (back to front, and all cells together may not vary
-            laterally by more than the tolerance either: the strict form of section 4.4), or `"independent"` (each cell as if
-            it were alone: the paper's l_max without its greedy, whose sum may break the tolerance).
+        allocation: `"budget"`, or `"greedy"` (back to front).
     """
     allowed = offer.allowed & (analysis.strict + offer.rounding <= tolerance)
     error = jnp.where(allowed, analysis.error, jnp.inf).at[0].set(0)
-    if allocation == "independent":
-        chosen = _best(offer.saving, error, 0)[0]
-    elif allocation == "paper":
-        lateral = 2 * jnp.where(offer.saving[SUPER_PIXEL] > 0, analysis.error[SUPER_PIXEL], 0).sum(0)
-        lateral = jnp.where(relax < 1, (1 - relax) * lateral, 0)
-        chosen = _back_to_front(offer.saving, error, tolerance - offer.rounding - lateral)
-    elif allocation == "greedy":
+    if allocation == "greedy":
         chosen = _back_to_front(offer.saving, error, tolerance - offer.rounding)
     else:
         chosen = _at_best_price(offer, error, tolerance)

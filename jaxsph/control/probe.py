@@ -55,7 +55,6 @@ def probe(
     grid: Grid,
     tables: tuple[RangeTables, ...],
     tolerance: Float[Array, ""],
-    lateral: Float[Array, ""] | float,
     slab_samples: int,
     cells_at_once: int,
 ) -> Probe:
@@ -66,8 +65,6 @@ def probe(
 
     Args:
         tables: of the parts of the transfer function.
-        lateral: share of the variation between neighbouring rays, of all cells of a bundle together, that is to be taken from
-            the tolerance before anything is saved.
     """
     quantities, rank, cells = grid.ordered.quantities, grid.lists.rank, grid.windows
     slabs, bundles = cells.count.shape
@@ -97,7 +94,6 @@ def probe(
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
     found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
-    found &= 2 * lateral * (front * change).sum(0) <= tolerance
     held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
     return Probe(found, held, all_held)
 

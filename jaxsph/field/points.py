@@ -23,7 +23,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.access.grid import Grid
 from jaxsph.field.fetch import particle_at
-from jaxsph.field.moved import LEAST_ROUNDING, ROUNDINGS, Moved, Places, Splats
 from jaxsph.field.point_rays import NUM_COLUMNS, PointRays, Row
 from jaxsph.field.sums import Sums, sums_of
 from jaxsph.field.tasks import SlabTask
@@ -159,62 +158,6 @@ class PointsMedium(Medium):
     def every_other(self, gathered: tuple[Array, ...]) -> tuple[Array, ...]:
         """Sums of two intervals each."""
         return tuple(value[:, ::2] + value[:, 1::2] for value in gathered)
-
-    def moved(self, task: SlabTask) -> Moved | None:
-        """Of those points whose thickness is not laid along chords.
-
-        Raises:
-            ValueError: where what is laid along pieces of a chord does not add up to what is laid along the whole.
-        """
-        if self.spread == "chords" and self.splat is None:
-            return None
-        if not self.profile.closed:
-            name = type(self.profile).__name__
-            raise ValueError(
-                f"`profile` must be 'gaussian' or 'ball' where splats are bounded, got {name}: its integrals are sums"
-            )
-        sums = Moved(*(jnp.zeros(task.between_shape, self.table.dtype) for _ in Moved._fields))
-
-        def add(nth: Array, sums: Moved, task: SlabTask) -> Moved:
-            def found(nth: Array) -> Moved:
-                return self._splats(self._fetch(task, nth), PointRays.of(task, self.axes)).moved()
-
-            return jax.tree.map(jnp.add, sums, fusion_barrier(nth >= 0, found, nth))
-
-        for turns in task.turns(BLOCK, PARTS):
-            sums = turns.put(lax.fori_loop(turns.begin, turns.end, functools.partial(add, task=turns.task), turns.of(sums)), sums)
-        return sums
-
-    def _splats(self, some: _Some, rays: PointRays) -> Splats:
-        """A block of points as splats; of no strength where they are none."""
-        if self.lists is None:
-            raise ValueError("points are asked for without the lists of a band; call `in_band` first")
-        row, borders = Row(*(column[:, :, None] for column in some.row)), self.lists.border
-        foot, away = rays.nearest(row)
-        middle = foot if self.spread == "feet" else row.z
-        end = jnp.searchsorted(borders, middle)  # the first border that is not in front
-        middle, end = jnp.broadcast_to(middle, foot.shape), jnp.broadcast_to(end, foot.shape)
-        own = jnp.clip(end, 1, borders.shape[0] - 1)
-        scale = rays.slant[:, None] * row.inverse
-
-        def along_ray(depth: Array) -> Array:
-            return ((depth - foot) * scale)[:, :, None]
-
-        ends = (jnp.broadcast_to(depth, foot.shape) for depth in (borders[0], borders[-1]))
-        near, far, front, back = (along_ray(depth) for depth in (*ends, borders[own - 1], borders[own]))
-        seen, border = (end == own)[:, :, None], rays.border[:, None]
-        before, behind = (
-            seen & case for case in (border[:, :, 1:] < middle[:, :, None], border[:, :, :-1] >= middle[:, :, None])
-        )
-        lateral = jnp.abs(rays.u[:, None]) + jnp.abs(rays.v[:, None])
-        size = jnp.abs(row.z) * (1 + lateral) if rays.perspective else jnp.abs(row.z) + lateral
-        off = jnp.finfo(size.dtype).eps * (ROUNDINGS * size * row.inverse + LEAST_ROUNDING)[:, :, None]
-        square = ((away[0] ** 2 + away[1] ** 2 + away[2] ** 2) * row.inverse**2)[:, :, None]
-        splat = True if self.spread != "chords" else some.splat[:, :, None]  # type: ignore[index]
-        strength = jnp.where(splat, jnp.broadcast_to(row.strength, foot.shape), 0)[:, :, None]
-        at = (border - foot[:, :, None]) * scale[:, :, None]
-        places = Places(before, seen & ~before & ~behind, behind)
-        return Splats(square, strength, at, near, far, front, back, seen, places, off, self.profile)
 
     def no_cotangents(self) -> PointsMedium:
         """None yet; of the points themselves, not of where they are listed."""

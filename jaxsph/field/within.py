@@ -121,17 +121,6 @@ class Within(Medium):
         """See `Medium`."""
         return self.medium.every_other(gathered)
 
-    def moved(self, task: SlabTask) -> Any:
-        """Refused: what is moved may lie on the other side of a face.
-
-        Raises:
-            ValueError: where the medium moves anything.
-        """
-        found = self.medium.moved(task)
-        if found is not None:
-            raise ValueError("splats are not bounded where a clip cuts them; leave out `within`")
-        return found
-
     def no_cotangents(self) -> Within:
         """None of either yet."""
         return Within(self.medium.no_cotangents(), jax.tree.map(jnp.zeros_like, self.clip))

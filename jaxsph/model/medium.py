@@ -137,10 +137,6 @@ class Medium(abc.ABC):
             return self.means(self.intervals(gathered, task), task, LIGHT)
         return self.optics(gathered, task)
 
-    def moved(self, task: Any) -> Any:
-        """What is laid elsewhere along rays than it is, summed for intervals (`field.moved.Moved`); by default nothing."""
-        return None
-
     def no_cotangents(self) -> Any:
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)

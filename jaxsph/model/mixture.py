@@ -76,11 +76,6 @@ class Mixture(Medium):
         """Of each."""
         return tuple(medium.every_other(one) for medium, one in zip(self.media, gathered, strict=True))
 
-    def moved(self, task: Any) -> Any:
-        """Of all that move anything."""
-        moving = [moved for medium in self.media if (moved := medium.moved(task)) is not None]
-        return jax.tree.map(lambda *sums: functools.reduce(operator.add, sums), *moving) if moving else None
-
     def no_cotangents(self) -> tuple[Any, ...]:
         """Of each."""
         return tuple(medium.no_cotangents() for medium in self.media)

@@ -12,7 +12,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,14 +43,7 @@ class Chord(NamedTuple):
 
 
 class Profile(abc.ABC):
-    """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0.
-
-    Attributes:
-        closed: whether `along` is in closed form, so that pieces of a chord add up to the whole; and the profile at most 1 and of
-            a slope of at most 2 a radius.
-    """
-
-    closed: ClassVar[bool] = False
+    """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0."""
 
     @property
     def is_radial(self) -> bool:
@@ -78,8 +71,6 @@ class Profile(abc.ABC):
 class Gaussian(Profile):
     r"""$f(q) = \exp(-4.5 q^2)$, which the radius cuts off at three standard deviations (Kaehler et al. 2007, section 3.2)."""
 
-    closed = True
-
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """See `Profile`."""
         return jnp.exp(-FALLOFF * square)
@@ -94,8 +85,6 @@ class Gaussian(Profile):
 @dataclasses.dataclass(frozen=True)
 class Ball(Profile):
     """f(q) = 1: the same everywhere inside."""
-
-    closed = True
 
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """See `Profile`."""

@@ -15,13 +15,10 @@ INTEGRATORS = {
     "samples": "jaxsph.cast.samples:PointSamples",
     "segments": "jaxsph.cast.segments:Segments",
     "step_doubling": "jaxsph.cast.step_doubling:StepDoubling",
-    "splat_bound": "jaxsph.cast.splat_bound:SplatBound",
 }
 """Classes without arguments, each a `jaxsph.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
 AT_POINTS = {"step_doubling"}
 """Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
-BOUNDING = {"splat_bound"}
-"""Integrators that tell how wrong a picture can be, and make none."""
 ESTIMATING = {"segments"}
 """Integrators that estimate their error against the light integral, and are refined for a tolerance."""
 SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel", "quadtree": "jaxsph.screen.quadtree:Quadtree"}

@@ -15,7 +15,7 @@ from jaxsph.numerics.checks import is_traced
 ESTIMATORS = ("interval", "pilot")
 LEAF_PIXELS = 4, 8, 16, 32
 LEAF_ESTIMATORS = "hierarchical", "corner_variance", "uniform"  # see `screen.estimators`
-ALLOCATIONS = ("budget", "greedy", "paper", "independent")
+ALLOCATIONS = ("budget", "greedy")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,14 +40,12 @@ class Settings:
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
-            does, `"paper"` moreover takes from the tolerance how much the rays of a bundle differ at full rate, as its strict
-            form does, and `"independent"` lets every cell spend all of it (to compare with: it breaks the tolerance).
+            does.
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
             (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear from one to the next,
             the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where supports begin and end
             in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those that two halves disagree
-            with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point. `"splat_bound"` is for
-            `jaxsph.splat_bound`.
+            with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
         step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
             ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs
             are compiled for it.

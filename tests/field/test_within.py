@@ -195,10 +195,3 @@ def test_a_cell_is_whole_where_all_of_its_slabs_are():
     slabs = jnp.asarray([[True], [True], [True], [True], [True], [False]])
     assert np.array_equal(whole_cells(slabs, 4), [[True], [False]])
     assert np.array_equal(whole_cells(slabs[:5], 4), [[True], [True]])
-
-
-def test_splats_are_not_bounded_where_a_clip_cuts_them():
-    rng = np.random.default_rng(0)
-    points = js.Points.from_arrays(rng.uniform(-0.5, 0.5, (20, 3)), 0.2, (1, 1, 1), opacity=0.9, spread="feet")
-    with pytest.raises(ValueError, match="splats are not bounded where a clip cuts them"):
-        js.splat_bound(js.Scene(points=points, within=BOX), camera())

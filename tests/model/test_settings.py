@@ -17,7 +17,7 @@ import jaxsph as js
         ({"tolerance": float("nan")}, "`tolerance` must be >= 0"),
         ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
         ({"estimator": "guess"}, "`estimator` must be one of interval, pilot, got 'guess'"),
-        ({"allocation": "fair"}, "`allocation` must be one of budget, greedy, paper, independent"),
+        ({"allocation": "fair"}, "`allocation` must be one of budget, greedy"),
     ],
 )
 def test_bad_settings_are_refused(change, message):

@@ -1,6 +1,6 @@
 r"""The leaves along rays, one after the other, and what is between them skipped.
 
-Flow: octree, rays -> [octree_rays] -> media.
+Flow: octree, rays -> [leaves_along] -> octree.
 
 Where a ray leaves a leaf follows from the leaf's borders, which follow from its level (Kaehler, Abel & Hege 2007, section 3.2).
 The next leaf is not looked for a little behind the border, where it may be missed: the integer coordinate of the axis that is
