@@ -6,6 +6,7 @@ Flow: layers, fault word -> [claims] -> Image.
 from __future__ import annotations
 
 import dataclasses
+import sys
 import warnings
 
 import jax.numpy as jnp
@@ -87,8 +88,16 @@ def missed(image: Image, settings: Settings) -> Int[Array, ""]:
 
 
 def tell(word: int, image: Image, settings: Settings) -> None:
-    """Warn the caller of who calls this of what is no reason to raise."""
+    """Warn whoever called this package of what is no reason to raise."""
     if word & faults.TOLD:
         number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
         pixels = f"{number} of {image.error_bound.size} pixels"
-        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=4)
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=_caller())
+
+
+def _caller() -> int:
+    """Frames between the function that asks and the first outside of this package."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == __name__.partition(".")[0]:
+        level, frame = level + 1, frame.f_back
+    return level

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jaxsph.cast.adjoint import KEPT
 from jaxsph.control.pilot import PilotPlan
 from jaxsph.field.lattice import Lattice
 from jaxsph.host_stages import MAKE_GRID, ORDER
-from jaxsph.layers import OfShards
+from jaxsph.layers import Band, Drawn, OfShards
 from jaxsph.model import registry
 from jaxsph.model.camera import Camera
 from jaxsph.model.clips import Clip
@@ -52,30 +52,6 @@ from jaxsph.stages import (
 from jaxsph.viewing import Seen
 
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
-
-
-class Band(NamedTuple):
-    """What is known of a band.
-
-    Attributes:
-        of_shards: what its rays met and what was decided, shard by shard.
-        faults: fault word of its lists.
-        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
-    """
-
-    of_shards: OfShards
-    faults: Int[Array, ""]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
-
-
-class Drawn(NamedTuple):
-    """Layers of an image; its fault word, and how many cells and pairs its grids hold."""
-
-    layers: Any
-    faults: Int[Array, ""]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.access.lists import TILE
-from jaxsph.along_rays import along_rays
-from jaxsph.field.in_octree import reachable
+from jaxsph.bands import Progress, Work
+from jaxsph.images import image_of
 from jaxsph.measures import Measures
 from jaxsph.model.camera import Camera
 from jaxsph.model.frusta import seen_by
@@ -36,8 +36,8 @@ from jaxsph.numerics.executors import Clock
 from jaxsph.on_disk import MOST_EXTREMES, Columns, OnDisk
 from jaxsph.panes import CROWDED, Crowd, Need, Pane, Sides, cut_to_fit
 from jaxsph.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
-from jaxsph.planning import MAX_CLASSES, measured, see, shape_of_scene, stride_of
-from jaxsph.render import Progress, image_of
+from jaxsph.planning import MAX_CLASSES, measured, see, shape_of, sorted_and_measured
+from jaxsph.request import Request
 from jaxsph.tiles import joined, of_columns, of_rows
 from jaxsph.viewing import Seen
 
@@ -175,7 +175,7 @@ class _Renderer:
     @property
     def whole_rows(self) -> bool:
         """Whether panes reach from side to side: the pilot's lattice reaches from bundle to bundle."""
-        return self._along.estimator == "pilot"
+        return self._asked.along.estimator == "pilot"
 
     def panes(self) -> list[Pane]:
         """As few as memory allows, as far as the sample tells.
@@ -237,7 +237,7 @@ class _Renderer:
         tiles, bundles = (np.full(tile_rows, count) for count in (need.tile_pairs, need.bundle_pairs))
         measures = Measures(tiles, bundles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
         shape = self._shape_of(self._shape, need.height, capacity_class(need.particles))
-        return smallest(measures, shape, self._along, self._choices)
+        return smallest(measures, shape, self._asked.along, self._choices)
 
     def _shape_of(self, shape: FrameShape, height: int, capacity: int) -> FrameShape:
         return dataclasses.replace(shape, height=height, num_particles=capacity, num_classes=self._classes, headroom=1.0)
@@ -256,24 +256,23 @@ class _Renderer:
 
     def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image | None:
         particles = self.on_disk.particles(columns, capacity)
-        scene = reachable(Scene(particles=particles, transfer=self.transfer), self.settings)
-        along, clock = along_rays(scene, self.settings), Clock()
-        shape = self._shape_of(shape_of_scene(scene, self.camera, along), self.camera.height, capacity)
-        seen = _within(see(scene, self.camera, shape, clock), pane)
-        seen, measures = measured(seen, self.camera, shape.samples, shape.tuning, stride_of(along))
+        asked, clock = Request.of(Scene(particles=particles, transfer=self.transfer), self.camera, self.settings), Clock()
+        shape = self._shape_of(shape_of(asked), self.camera.height, capacity)
+        seen = _within(see(asked.scene, self.camera, shape, clock), pane)
+        seen, measures = sorted_and_measured(seen, asked, shape)
         rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
-        plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows, along)
+        plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows)
         clock.mark("plan")
         if plan is None:
             return None
-        given = seen, self.camera, self.settings, plan, scene.formulas
-        image = image_of(*given, clock, None, planned=True, first_row=pane.top)
+        drawn = Work(seen, self.camera, self.settings, plan, asked.scene.formulas, pane.top).drawn(clock)
+        image = image_of(drawn, self.camera, self.settings, plan, clock)
         return of_columns(image, pane.left, pane.right)
 
-    def _plan_for(self, needed: Measures, shape: FrameShape, along: Settings) -> Plan | None:
+    def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:
         """The plan there is, if it serves; else with room for more like this if memory allows; None where it allows none."""
         limit = min(self._limit, self.memory - READ_BYTES * shape.num_particles)
-        given, roomy = (along, self._choices), dataclasses.replace(shape, headroom=CROWDED)
+        given, roomy = (self._asked.along, self._choices), dataclasses.replace(shape, headroom=CROWDED)
         kept = self.plans.get((shape.height, shape.num_particles))
         if kept is not None:
             sizes = kept.bands, kept.cast.batch_slabs
@@ -299,30 +298,25 @@ class _Renderer:
         return int(min(2 + np.ceil(max(octaves, 0)), MAX_CLASSES))
 
     @functools.cached_property
-    def _scene(self) -> Scene:
+    def _asked(self) -> Request:
         """Of the sample, with the supports of all particles."""
         sample = self.on_disk.sample
         thinned = np.cbrt(max(sample.num_particles, 1) / max(len(self.on_disk), 1))
         true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
-        return reachable(Scene(particles=true, transfer=self.transfer), self.settings)
-
-    @functools.cached_property
-    def _along(self) -> Settings:
-        return along_rays(self._scene, self.settings)
+        return Request.of(Scene(particles=true, transfer=self.transfer), self.camera, self.settings)
 
     @functools.cached_property
     def _shape(self) -> FrameShape:
-        return shape_of_scene(self._scene, self.camera, self._along)
+        return shape_of(self._asked)
 
     @functools.cached_property
     def _sample(self) -> Seen:
-        return see(self._scene, self.camera, self._shape, Clock())
+        return see(self._asked.scene, self.camera, self._shape, Clock())
 
     @functools.cached_property
     def _choices(self) -> Choices:
         """By how large supports of the sample appear."""
-        measures = measured(self._sample, self.camera, self._shape.samples, self._shape.tuning, stride_of(self._along))[1]
-        return choose(measures, self._along)
+        return choose(measured(self._sample, self._asked, self._shape), self._asked.along)
 
 
 def _within(seen: Seen, pane: Pane) -> Seen:

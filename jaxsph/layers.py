@@ -6,7 +6,9 @@ Flow: cast -> [layers] -> Image.
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+import operator
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from jaxsph.access.lists import BUNDLE
 from jaxsph.access.shards import unshard
 from jaxsph.cast.march import RayResult
 from jaxsph.model import registry
-from jaxsph.model.image import Image
+from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.plan import Plan
 from jaxsph.stages import Cast, Verdict
@@ -50,6 +52,41 @@ class Layers(NamedTuple):
     full: Float[Array, "rows columns"]
     levels: Int[Array, "bundle_rows bundle_columns cells"] | None
     rays: Int[Array, ""] | None = None
+
+
+class Band(NamedTuple):
+    """What is known of a band.
+
+    Attributes:
+        of_shards: what its rays met and what was decided, shard by shard.
+        faults: fault word of its lists.
+        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
+    """
+
+    of_shards: OfShards
+    faults: Int[Array, ""]
+    filled: Int[Array, ""]
+    pairs: Int[Array, ""]
+
+
+class Drawn(NamedTuple):
+    """Layers of an image; its fault word, and how many cells and pairs its grids hold: numbers, or parts of a trace."""
+
+    layers: Any
+    faults: Any
+    filled: Any
+    pairs: Any
+
+    @classmethod
+    def of(cls, layers: Layers | None, bands: Sequence[Band], faults: Int[Array, ""]) -> Drawn:
+        """Of all bands; `faults` are those of what is seen. Of a forecast's bands, which are shapes, nothing is counted."""
+        if isinstance(bands[0].faults, jax.ShapeDtypeStruct):
+            return cls(layers, faults, 0, 0)
+        counts: list[tuple[Any, Any, Any]] = [(faults, 0, 0), *((band.faults, band.filled, band.pairs) for band in bands)]
+        if not is_traced(counts):
+            counts = [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]
+        words, filled, pairs = zip(*counts, strict=True)
+        return cls(layers, functools.reduce(operator.or_, words), sum(filled), sum(pairs))
 
 
 @compiled_quickly
@@ -98,8 +135,3 @@ def crop(bands: Layers, plan: Plan) -> Layers:
         return image
     rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
     return image._replace(levels=jnp.moveaxis(levels[:rows, :columns], -1, 0))
-
-
-def assemble(layers: Layers, word: Array | int) -> Image:
-    """The image of those layers."""
-    return Image(*layers[:3], layers.bound, layers.evaluations, True, word, {}, levels=layers.levels)

@@ -20,8 +20,8 @@ from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
 from jaxsph.control.pilot import PilotPlan
-from jaxsph.frame import Drawn, Frame
-from jaxsph.layers import Layers, OfShards, crop, of_band
+from jaxsph.frame import Frame
+from jaxsph.layers import Drawn, Layers, OfShards, crop, of_band
 from jaxsph.model.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

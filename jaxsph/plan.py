@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from jaxsph.access.lists import TILE, ListPlan
-from jaxsph.along_rays import DOUBLINGS, along_rays, first_samples
 from jaxsph.cast.batches import CastPlan
 from jaxsph.control.adapt import ControlPlan
 from jaxsph.control.pilot import PilotPlan
@@ -29,6 +28,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.spheres import num_spheres
 from jaxsph.numerics.tuning import CPU, MEMORY, Tuning
+from jaxsph.request import DOUBLINGS, first_samples
 from jaxsph.screen.quadtree import QuadtreePlan
 
 MIN_PACKETS = 64  # bundles cast together, by a quadtree
@@ -102,8 +102,8 @@ class Plan:
         return dataclasses.replace(self, lists=dataclasses.replace(self.lists, tile_columns=columns))
 
     def check(self, scene: Scene, camera: Camera, settings: Settings) -> None:
-        """Raise `ValueError` where the plan is for other shapes than those given, or settings do not suit the scene."""
-        self.check_image(camera, along_rays(scene, settings))
+        """Raise `ValueError` where the plan is for other shapes than those given; `settings` are those kept along rays."""
+        self.check_image(camera, settings)
         capacity = num_spheres(scene)
         if capacity > self.num_particles:
             raise ValueError(

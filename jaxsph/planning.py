@@ -20,11 +20,8 @@ import jax
 import numpy as np
 
 from jaxsph.access.host_sorting import depth_order
-from jaxsph.along_rays import along_rays, first_samples
-from jaxsph.field.in_octree import reachable
 from jaxsph.measures import Measures, measure
 from jaxsph.model import registry
-from jaxsph.model.asked import require_asked
 from jaxsph.model.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.periodic import num_ghosts
@@ -36,6 +33,7 @@ from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.programs import compiled_quickly
 from jaxsph.numerics.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.plan import FrameShape, Plan, choose, fitted, fitting, next_class
+from jaxsph.request import Request, first_samples
 from jaxsph.viewing import Seen, longest_interval, view_scene
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -68,23 +66,19 @@ def plan(
         ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
             `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
-    settings = Settings() if settings is None else settings
-    require_asked(scene, camera, settings)
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     if not headroom >= 1:
         raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
-    scene = reachable(scene, settings)
-    settings = along_rays(scene, settings)
-    shape = dataclasses.replace(shape_of_scene(scene, camera, settings), headroom=1.0)
+    asked = Request.of(scene, camera, Settings() if settings is None else settings)
+    settings, shape = asked.along, dataclasses.replace(shape_of(asked), headroom=1.0)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    seen = see(scene, camera, shape, Clock())
-    measures = measure(seen.viewed, camera, shape.samples, stride_of(settings))
+    measures = measured(see(asked.scene, camera, shape, Clock()), asked, shape)
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     if headroom > 1 and (like is None or not like.serves(made)):
@@ -124,13 +118,18 @@ def pad(particles: Particles, *, capacity: int) -> Particles:
     return particles.padded(capacity)
 
 
-def measured(seen: Seen, camera: Camera, samples: int, tuning: Tuning, stride: int) -> tuple[Seen, Measures]:
+def measured(seen: Seen, asked: Request, shape: FrameShape) -> Measures:
+    """What there is to be marched, counted."""
+    return measure(seen.viewed, asked.camera, shape.samples, _stride_of(asked.along))
+
+
+def sorted_and_measured(seen: Seen, asked: Request, shape: FrameShape) -> tuple[Seen, Measures]:
     """What is seen, measured; and beside that sorted, if the host is to."""
-    if not tuning.sorts_on_host:
-        return seen, measure(seen.viewed, camera, samples, stride)
+    if not shape.tuning.sorts_on_host:
+        return seen, measured(seen, asked, shape)
     with ThreadPoolExecutor(1) as thread:
         order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
-        measures = measure(seen.viewed, camera, samples, stride)
+        measures = measured(seen, asked, shape)
         return seen._replace(order=order.result()), measures
 
 
@@ -141,15 +140,13 @@ class Plans:
         self._kept: list[Plan] = []
         self._lock = threading.Lock()
 
-    def for_frame(self, scene: Scene, camera: Camera, settings: Settings, run: Clock) -> tuple[Plan, Seen]:
+    def for_frame(self, asked: Request, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
-        settings = along_rays(scene, settings)
-        own = shape_of_scene(scene, camera, settings)
+        settings, own = asked.along, shape_of(asked)
         limit = settings.memory_limit or own.memory
         for shape in dict.fromkeys((self._similar(own), own)):  # the room of a kept plan may be more than there is memory for
             run.mark("plan")
-            seen = see(scene, camera, shape, run)
-            seen, measures = measured(seen, camera, shape.samples, shape.tuning, stride_of(settings))
+            seen, measures = sorted_and_measured(see(asked.scene, asked.camera, shape, run), asked, shape)
             choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0)
             needed = fitting(measures, tight, settings, choices, limit)
             if needed is not None:
@@ -201,30 +198,25 @@ class Plans:
 PLANS = Plans()
 
 
-def stride_of(settings: Settings) -> int:
+def _stride_of(settings: Settings) -> int:
     """Pixels between the rays of the first lattice; 1 where every pixel has its own."""
     return settings.leaf_pixels // 2 if settings.screen == "quadtree" else 1
 
 
-def shape_of_scene(scene: Scene, camera: Camera, settings: Settings) -> FrameShape:
-    """The same of all of a scene, ghosts of periodic sets included."""
-    spheres, shape = spheres_of(scene), shape_of(spheres_of(scene), camera, settings)
-    if scene.particles is None or scene.particles.box is None:
-        return shape
-    margin = longest_interval(camera, shape.samples) if _between(scene, settings.integrator) else 0.0
-    ghosts = num_ghosts(scene.particles, margin)
-    return dataclasses.replace(shape, num_particles=capacity_class(spheres.capacity + ghosts), headroom=1.0)
-
-
-def shape_of(particles: Particles, camera: Camera, settings: Settings) -> FrameShape:
-    """What is known of a frame before it is measured."""
-    capacity, valid = particles.capacity, np.asarray(particles.valid)
+def shape_of(asked: Request) -> FrameShape:
+    """What is known of a frame before it is measured, ghosts of periodic sets included."""
+    scene, camera, settings = asked.scene, asked.camera, asked.along
+    spheres, samples = spheres_of(scene), first_samples(settings)
+    capacity, valid = spheres.capacity, np.asarray(spheres.valid)
     headroom = capacity / max(int(valid.sum()), 1)
     headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
-    number = np.dtype(particles.dtype).itemsize
-    size = camera.width, camera.height, first_samples(settings)
-    classes = _num_classes(np.asarray(particles.support)[valid])
-    machine = tuning_for(particles.support), memory_for(particles.support)
+    number = np.dtype(spheres.dtype).itemsize
+    classes = _num_classes(np.asarray(spheres.support)[valid])
+    machine = tuning_for(spheres.support), memory_for(spheres.support)
+    if scene.particles is not None and scene.particles.box is not None:
+        margin = longest_interval(camera, samples) if _between(scene, settings.integrator) else 0.0
+        capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
+    size = camera.width, camera.height, samples
     return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)
 
 

@@ -6,17 +6,13 @@ Flow: scene, camera, settings -> plan -> coarse lattice -> [progressive: mark ->
 from __future__ import annotations
 
 import dataclasses
-import functools
-import operator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
-from jaxsph.claims import with_ended_rays
-from jaxsph.field.in_octree import reachable
 from jaxsph.frame import Frame
-from jaxsph.layers import assemble
+from jaxsph.images import image_of
+from jaxsph.layers import Drawn
 from jaxsph.model.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -26,8 +22,8 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.executors import Clock, Executor, Forecast
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.planning import PLANS
-from jaxsph.refinement import Decisions, Refinement
-from jaxsph.render import metadata_of
+from jaxsph.refinement import Decisions, Refinement, counted
+from jaxsph.request import Request
 from jaxsph.screen.canvas import Canvas
 from jaxsph.screen.marking import Quality
 from jaxsph.screen.packets import Queue
@@ -111,11 +107,11 @@ class _Band(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _State:
-    """What is known after a stage; no band is before the first."""
+    """What is known after a stage; no band is before the first. Of `grids` there are faults and counts, and no layers."""
 
     filling: Refinement
     clock: Clock
-    word: int
+    grids: Drawn
     canvas: Canvas
     quality: Quality
     bands: tuple[_Band, ...]
@@ -138,9 +134,10 @@ class _State:
     def _opened(self, worst: int | None, share: float) -> _State:
         """With all bands known, and what their leaves want."""
         made = [self.filling.decided(row) for row in self._rows]
-        word = functools.reduce(operator.or_, (int(grid.lists.faults) for _, grid in made), self.word)
-        faults.raise_for(word, True)
-        return dataclasses.replace(self, word=word)._marked(self.canvas, [one for one, _ in made], worst, share)
+        of_bands = Drawn.of(None, [counted(grid) for _, grid in made], self.grids.faults)
+        faults.raise_for(of_bands.faults, True)
+        grids = of_bands._replace(filled=self.grids.filled + of_bands.filled, pairs=self.grids.pairs + of_bands.pairs)
+        return dataclasses.replace(self, grids=grids)._marked(self.canvas, [one for one, _ in made], worst, share)
 
     def _marked(self, canvas: Canvas, decisions: list[Decisions], worst: int | None, share: float) -> _State:
         bands, quality = [], self.quality
@@ -157,10 +154,8 @@ class _State:
     def image(self, settings: Settings) -> Image:
         """What it looks like."""
         layers = self.filling.finished(self.canvas, [band.decisions for band in self.bands])
-        image = with_ended_rays(assemble(layers, self.word), settings)
-        stats: dict[str, Any] = {
-            "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
-            "evaluations_full": int(np.asarray(layers.full, np.float64).sum()),
+        plan = self.filling.frame.plan
+        told: dict[str, Any] = {
             "stage": self.stage,
             "rays": int(self.canvas.rays),
             "rays_left": int((~self.canvas.known).sum()),
@@ -168,10 +163,8 @@ class _State:
             "max_error": float(self.quality.largest),
             "leaves_over": int(self.quality.over),
         }
-        self.clock.mark("image")
-        stats["seconds"] = dict(self.clock.seconds)
-        metadata = metadata_of(self.filling.frame.camera, settings, False)
-        return dataclasses.replace(image, certified=False, faults=self.word, stats=stats, metadata=metadata)
+        drawn = self.grids._replace(layers=layers)
+        return image_of(drawn, self.filling.frame.camera, settings, plan, self.clock, **told)
 
 
 def _with_quadtree(settings: Settings) -> Settings:
@@ -179,20 +172,20 @@ def _with_quadtree(settings: Settings) -> Settings:
 
 
 def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) -> _State:
-    clock, scene = Clock(), reachable(scene, settings)
-    plan, seen = PLANS.for_frame(scene, camera, settings, clock)
+    clock, asked = Clock(), Request.of(scene, camera, settings)
+    plan, seen = PLANS.for_frame(asked, clock)
     shards = shards_at_hand(plan.cast.tuning)
 
     def filling(run: Executor) -> Refinement:
-        frame = Frame.begun(seen, camera, settings, plan, scene.formulas, shards, run)
+        frame = Frame.begun(seen, camera, settings, plan, asked.scene.formulas, shards, run)
         return Refinement.of(frame, run)
 
     clock.foresee(lambda known: _rehearse(filling(Forecast(known)), worst))
     begun = filling(clock)
     canvas, made = begun.begun()
-    word = int(seen.viewed.faults) | int(made.lists.faults)
-    faults.raise_for(word, True)
-    return _State(begun, clock, word, canvas, begun.judged(canvas), (), 0)
+    grids = Drawn.of(None, [counted(made)], seen.viewed.faults)
+    faults.raise_for(grids.faults, True)
+    return _State(begun, clock, grids, canvas, begun.judged(canvas), (), 0)
 
 
 def _rehearse(filling: Refinement, worst: int | None) -> None:

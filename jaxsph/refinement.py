@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 from jaxsph.access.grid import Grid
 from jaxsph.field.lattice import Lattice
 from jaxsph.field.schedule import SlabSchedule
-from jaxsph.frame import Band, Frame
-from jaxsph.layers import Layers, OfShards
+from jaxsph.frame import Frame
+from jaxsph.layers import Band, Drawn, Layers, OfShards
 from jaxsph.numerics.executors import Executor
 from jaxsph.refinement_stages import Shot, Told, begin, choose, finish, join, judge, mark, paint, shoot, spread_over
 from jaxsph.screen.canvas import Canvas
@@ -178,19 +178,20 @@ class Refinement:
         return canvas
 
 
-def refined(frame: Frame, run: Executor, progress: Callable[[int, int], None] | None) -> tuple[list[Band], Layers]:
-    """All bands of a frame, of which the first is that of its coarse lattice; and the layers of the image."""
+def refined(frame: Frame, run: Executor, faults: Int[Array, ""], progress: Callable[[int, int], None] | None = None) -> Drawn:
+    """All bands of a frame, after its coarse lattice; `faults` are those of what is seen."""
     filling = Refinement.of(frame, run)
     canvas, coarse = filling.begun()
-    bands, decided, plan = [_counted(coarse)], [], frame.plan
+    bands, decided, plan = [counted(coarse)], [], frame.plan
     for nth in range(plan.bands):
         canvas, made, decisions = filling.band(canvas, jnp.int32(nth * plan.band_height))
-        bands.append(_counted(made))
+        bands.append(counted(made))
         decided.append(decisions)
         if progress is not None:
             progress(nth + 1, plan.bands)
-    return bands, filling.finished(canvas, decided)
+    return Drawn.of(filling.finished(canvas, decided), bands, faults)
 
 
-def _counted(made: BandGrid) -> Band:
+def counted(made: BandGrid) -> Band:
+    """What is known of a band whose rays are those of the whole canvas."""
     return Band(OfShards((), ()), made.lists.faults, made.filled, made.pairs)

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.access.lists import BUNDLE, TILE
-from jaxsph.along_rays import along_rays
-from jaxsph.field.in_octree import reachable
+from jaxsph.bands import Progress, Work
+from jaxsph.images import image_of
 from jaxsph.io.exr import FIRST_ROW, ROWS
 from jaxsph.measures import Measures
 from jaxsph.model.camera import Camera
@@ -29,8 +29,8 @@ from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.numerics.executors import Clock
 from jaxsph.plan import choose, fitted, fitting
-from jaxsph.planning import measured, see, shape_of_scene, stride_of
-from jaxsph.render import Progress, image_of
+from jaxsph.planning import see, shape_of, sorted_and_measured
+from jaxsph.request import Request
 from jaxsph.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
@@ -64,11 +64,9 @@ def render_tile(
     settings = settings or Settings()
     _require_parts(scene, camera, settings, index, count)
     mark = picture_of(scene, camera, settings)
-    clock = Clock()
-    scene = reachable(scene, settings)
-    along = along_rays(scene, settings)
-    shape = shape_of_scene(scene, camera, along)
-    seen, measures = measured(see(scene, camera, shape, clock), camera, shape.samples, shape.tuning, stride_of(along))
+    clock, asked = Clock(), Request.of(scene, camera, settings)
+    scene, along, shape = asked.scene, asked.along, shape_of(asked)
+    seen, measures = sorted_and_measured(see(scene, camera, shape, clock), asked, shape)
     rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
@@ -77,7 +75,8 @@ def render_tile(
     if plan is None:  # no room for more than this part needs
         plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
     clock.mark("plan")
-    image = image_of(seen, camera, settings, plan, scene.formulas, clock, progress, planned=True, first_row=first)
+    drawn = Work(seen, camera, settings, plan, scene.formulas, first).drawn(clock, progress)
+    image = image_of(drawn, camera, settings, plan, clock)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

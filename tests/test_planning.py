@@ -15,6 +15,7 @@ from jaxsph.numerics.executors import Clock
 from jaxsph.numerics.programs import PROGRAMS
 from jaxsph.plan import next_class
 from jaxsph.planning import PLANS, Plans, shape_of
+from jaxsph.request import Request
 
 SETTINGS = js.Settings(samples=24)
 
@@ -80,9 +81,9 @@ def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(pla
     scene, camera = snapshot(1000)
     js.render(scene, camera, SETTINGS)
     (kept,) = plans._kept
-    assert plans._similar(shape_of(scene.particles, camera, SETTINGS)).num_particles == kept.num_particles
+    assert plans._similar(shape_of(Request.of(scene, camera, SETTINGS))).num_particles == kept.num_particles
     smaller = snapshot(kept.num_particles // 2)[0]
-    assert plans._similar(shape_of(smaller.particles, camera, SETTINGS)).num_particles == smaller.particles.capacity
+    assert plans._similar(shape_of(Request.of(smaller, camera, SETTINGS))).num_particles == smaller.particles.capacity
     narrow = dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1))
     assert not narrow.serves(kept) and kept.serves(narrow)
     assert not dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1 << 20)).is_near(kept)
@@ -201,14 +202,14 @@ def test_room_for_more_than_a_frame_needs_is_no_reason_to_refuse_it():
     scene, camera = snapshot(700)
     tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, scene, camera)))
     assert js.plan(scene, camera, tight, headroom=1.5) == js.plan(scene, camera, tight)
-    assert Plans().for_frame(scene, camera, tight, Clock())[0].bytes <= tight.memory_limit
+    assert Plans().for_frame(Request.of(scene, camera, tight), Clock())[0].bytes <= tight.memory_limit
 
 
 def test_the_room_of_an_earlier_frame_is_no_reason_to_refuse_the_next():
     plans, frames = Plans(), [snapshot(count) for count in (880, 700)]
     tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, *frames[1])))
-    plans.for_frame(*frames[0], SETTINGS, Clock())
-    assert plans.for_frame(*frames[1], tight, Clock())[0].bytes <= tight.memory_limit
+    plans.for_frame(Request.of(*frames[0], SETTINGS), Clock())
+    assert plans.for_frame(Request.of(*frames[1], tight), Clock())[0].bytes <= tight.memory_limit
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ one device, and so are the bits of an image.
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -39,8 +38,13 @@ class OnDevices(Clock):
 
     def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
         super().__init__(programs)
-        self.devices = devices
+        self._devices = devices
         self._copies: dict[tuple[int, jax.Device], tuple[Any, Any]] = {}
+
+    @property
+    def devices(self) -> Devices:
+        """As given."""
+        return self._devices
 
     def forecast(self, known: Sequence[bool]) -> Forecast:
         """Of the same devices."""
@@ -65,12 +69,6 @@ class OnDevices(Clock):
     def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
         """That of the first device."""
         return super().program(stage, function, placed(arguments, self.devices[0]), **static)
-
-    def absorb(self, others: Sequence[Clock]) -> None:
-        """Book the seconds of executors that ran side by side meanwhile: of each stage those of the slowest."""
-        for stage in self.seconds:
-            self.seconds[stage] += max(other.seconds[stage] for other in others)
-        self._last = time.perf_counter()
 
     def _given(self, pairs: list[tuple[tuple[Any, ...], jax.Device]]) -> list[tuple[Any, ...]]:
         """Arguments where they are wanted; what several calls in a row are given is copied once."""

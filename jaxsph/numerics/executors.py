@@ -87,6 +87,15 @@ class Clock(AllShards):
         self._known: list[bool] = []
         self._foresee: Callable[[list[bool]], Any] | None = None
 
+    @property
+    def devices(self) -> tuple[jax.Device, ...]:
+        """That are chosen; none where all is done wherever arrays are."""
+        return ()
+
+    def forecast(self, known: Sequence[bool]) -> Forecast:
+        """What has programs compiled for this executor, given flags that are known."""
+        return Forecast(known, self._programs)
+
     def foresee(self, draw: Callable[[list[bool]], Any]) -> None:
         """Have all that is to follow compiled side by side, by `draw`, given the flags that are known; anew with each flag."""
         self._foresee = draw
@@ -99,6 +108,12 @@ class Clock(AllShards):
         now = time.perf_counter()
         self.seconds[stage] += now - self._last
         self._last = now
+
+    def absorb(self, others: Sequence[Clock]) -> None:
+        """Book the seconds of executors that ran side by side meanwhile: of each stage those of the slowest."""
+        for stage in self.seconds:
+            self.seconds[stage] += max(other.seconds[stage] for other in others)
+        self._last = time.perf_counter()
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """Compile `function` for `arguments` if need be, run it, and book both."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from jaxsph.access.lists import BUNDLE, bundle_origins
 from jaxsph.access.shards import shard
-from jaxsph.over_devices import dealing
+from jaxsph.bands import dealing
 
 SAME_BITS = """
 import json, sys

@@ -1,16 +1,17 @@
-"""One frame over several devices of this process: bands dealt out by their pairs, and the bundles of a band like cards.
+"""All bands of a frame, one by one: on one device, or dealt out to several of this process.
 
-Flow: seen, plan -> [over_devices: groups of devices -> Frame -> bands] -> layers.
+Flow: seen, plan -> [bands: groups of devices -> Frame -> bands] -> Drawn -> images.
 
 Bundles are independent of each other, and so are bands: each has the lists, the decisions and the estimates that it has on one
 device. So devices form groups of one size: every group ranks the particles for itself and renders the bands that are dealt to it,
 the fullest first; within a group, each device decides and casts the bundles of its shard. Nothing is exchanged but the lists of a
-band within a group, and pixels.
+band within a group, and pixels. One device is a group of its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -19,14 +20,14 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 
-from jaxsph.frame import Band, Frame
-from jaxsph.layers import Layers, develop
+from jaxsph.frame import Frame
+from jaxsph.layers import Band, Drawn, Layers, develop
 from jaxsph.measures import measure
 from jaxsph.model.camera import Camera
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.device_executors import Devices, OnDevices
-from jaxsph.numerics.executors import Executor, Forecast
+from jaxsph.numerics.executors import Clock, Executor
 from jaxsph.numerics.tuning import shards_at_hand
 from jaxsph.plan import Plan
 from jaxsph.refinement import refined
@@ -34,6 +35,63 @@ from jaxsph.viewing import Seen
 
 MANY = 4  # bands for each device, of which one more or less does not matter
 Progress = Callable[[int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """A frame to be drawn: what is seen, and how.
+
+    Attributes:
+        plan: of the frame, or of those of its rows that begin at `first_row`.
+    """
+
+    seen: Seen
+    camera: Camera
+    settings: Settings
+    plan: Plan
+    formulas: Formulas
+    first_row: int = 0
+
+    def drawn(self, clock: Clock, progress: Progress | None = None) -> Drawn:
+        """All bands, on the devices of a clock."""
+        least, told = shards_at_hand(self.plan.cast.tuning), _Told(progress, self.plan.bands)
+        if not clock.devices:
+            dealt, work = Dealing(((),), (tuple(range(self.plan.bands)),), least), self
+        else:
+            pairs, whole = _pairs_of_bands(self.seen, self.camera, self.plan), self.plan.quadtree is not None
+            dealt = dealing(clock.devices, pairs, least, whole)
+            work = dataclasses.replace(self, plan=self.plan.dealt(dealt.shards))
+        if len(dealt.groups) > 1:
+            bands = _side_by_side(work, dealt, clock, told)
+            return work.developed(clock, bands)
+        draw = functools.partial(work.in_order, dealt.shards)
+        clock.foresee(lambda known: draw(clock.forecast(known), None))
+        return draw(clock, told)
+
+    def in_order(self, shards: int, run: Executor, told: _Told | None) -> Drawn:
+        """All bands one after the other; a quadtree is of all of them."""
+        if self.plan.quadtree is None:
+            return self.developed(run, self.bands(shards, run, range(self.plan.bands), told))
+        return refined(self.begun(shards, run), run, self.seen.viewed.faults, None if told is None else told.progress)
+
+    def begun(self, shards: int, run: Executor) -> Frame:
+        """With the particles ranked."""
+        return Frame.begun(self.seen, self.camera, self.settings, self.plan, self.formulas, shards, run)
+
+    def bands(self, shards: int, run: Executor, numbers: Sequence[int], told: _Told | None) -> list[Band]:
+        """Bands of those numbers."""
+        frame, found = self.begun(shards, run), []
+        for number in numbers:
+            found.append(frame.band(jnp.int32(self.first_row + number * self.plan.band_height), run))
+            if told is not None:
+                told.one_more()
+        return found
+
+    def developed(self, run: Executor, bands: list[Band]) -> Drawn:
+        """The layers of the image, of all bands."""
+        of_shards = tuple(band.of_shards for band in bands)
+        layers: Layers = run.one("image", develop, (of_shards,), plan=dataclasses.replace(self.plan, control=None))
+        return Drawn.of(layers, bands, self.seen.viewed.faults)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,42 +133,21 @@ def _num_groups(devices: int, bands: int, whole: bool) -> int:
     return devices if bands >= MANY * devices else math.gcd(devices, bands)
 
 
-def draw_over_devices(
-    seen: Seen, camera: Camera, settings: Settings, plan: Plan, formulas: Formulas, clock: OnDevices, progress: Progress | None
-) -> tuple[list[Band], Layers]:
-    """All bands in order, and the layers of the image."""
-    pairs, whole = _pairs_of_bands(seen, camera, plan), plan.quadtree is not None
-    dealt = dealing(clock.devices, pairs, shards_at_hand(plan.cast.tuning), whole)
-    plan = plan.dealt(dealt.shards)
-    work = _Work(seen, camera, settings, plan, formulas, dealt.shards, _Told(progress, plan.bands))
-    if whole:
-        clock.foresee(lambda known: work.refined(clock.forecast(known)))
-        return work.refined(clock)
-    if len(dealt.groups) == 1:
-        bands = work.foreseen(clock, dealt.bands[0])
-    else:
-        bands = _side_by_side(work, dealt, clock)
-    images = tuple(band.of_shards for band in bands)
-    return bands, clock.one("image", develop, (images,), plan=dataclasses.replace(plan, control=None))
-
-
-def _side_by_side(work: _Work, dealt: Dealing, clock: OnDevices) -> list[Band]:
-    """The bands of each group on a thread of its own."""
+def _side_by_side(work: Work, dealt: Dealing, clock: Clock, told: _Told) -> list[Band]:
+    """All bands in order, those of each group drawn on a thread of its own."""
     runs, wide = [OnDevices(group) for group in dealt.groups], jax.config.read("jax_enable_x64")
     clock.mark("plan")
 
     def draw(run: OnDevices, numbers: tuple[int, ...]) -> list[Band]:
         with jax.enable_x64(wide):  # which a thread does not inherit
-            return work.foreseen(run, numbers)
+            run.foresee(lambda known: work.bands(dealt.shards, run.forecast(known), numbers, None))
+            return work.bands(dealt.shards, run, numbers, told)
 
     with ThreadPoolExecutor(len(runs)) as threads:
         found = list(threads.map(draw, runs, dealt.bands))
     clock.absorb(runs)
-    places = {
-        number: band
-        for numbers, bands in zip(dealt.bands, found, strict=True)
-        for number, band in zip(numbers, bands, strict=True)
-    }
+    pairs = [zip(numbers, bands, strict=True) for numbers, bands in zip(dealt.bands, found, strict=True)]
+    places = {number: band for of_group in pairs for number, band in of_group}
     return [places[number] for number in range(work.plan.bands)]
 
 
@@ -121,41 +158,6 @@ def _pairs_of_bands(seen: Seen, camera: Camera, plan: Plan) -> list[int]:
     rows = measure(seen.viewed, camera, plan.samples).bundle_pairs
     tiles = plan.lists.tile_rows
     return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Work:
-    """A frame that several executors share."""
-
-    seen: Seen
-    camera: Camera
-    settings: Settings
-    plan: Plan
-    formulas: Formulas
-    shards: int
-    told: _Told
-
-    def begun(self, run: Executor) -> Frame:
-        """With the particles ranked."""
-        return Frame.begun(self.seen, self.camera, self.settings, self.plan, self.formulas, self.shards, run)
-
-    def bands(self, run: Executor, numbers: tuple[int, ...]) -> list[Band]:
-        """Bands of those numbers."""
-        frame, found = self.begun(run), []
-        for number in numbers:
-            found.append(frame.band(jnp.int32(number * self.plan.band_height), run))
-            if not isinstance(run, Forecast):
-                self.told.one_more()
-        return found
-
-    def foreseen(self, run: OnDevices, numbers: tuple[int, ...]) -> list[Band]:
-        """The same, compiled side by side before."""
-        run.foresee(lambda known: self.bands(run.forecast(known), numbers))
-        return self.bands(run, numbers)
-
-    def refined(self, run: Executor) -> tuple[list[Band], Layers]:
-        """By a quadtree, which all bands share."""
-        return refined(self.begun(run), run, None if isinstance(run, Forecast) else self.told.progress)
 
 
 class _Told:

@@ -1,17 +1,48 @@
-"""What error control along rays can do for a scene and settings, and with how many samples it begins.
+"""What is asked for: a scene that can be marched, a camera, and settings that it can keep; what cannot be is refused here.
 
-Flow: scene, settings -> [along_rays] -> plan.
+Flow: scene, camera, settings -> [request] -> planning, render.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
+from jaxsph.field.in_octree import reachable
+from jaxsph.model.asked import require_asked
+from jaxsph.model.camera import Camera
 from jaxsph.model.registry import AT_POINTS, ESTIMATING
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
+
+
+class Request(NamedTuple):
+    """A picture that is asked for.
+
+    Attributes:
+        scene: with particles and points in octrees, where the integrator chooses for itself where it asks them.
+        camera: in whose view.
+        settings: as they were given.
+        along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
+    """
+
+    scene: Scene
+    camera: Camera
+    settings: Settings
+    along: Settings
+
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
+        """Of concrete arrays.
+
+        Raises:
+            ValueError: arguments of other kinds, or a combination that nothing can render.
+        """
+        require_asked(scene, camera, settings)
+        scene = reachable(scene, settings)
+        return cls(scene, camera, settings, along_rays(scene, settings))
 
 
 def first_samples(settings: Settings) -> int:
