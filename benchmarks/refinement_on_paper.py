@@ -1,7 +1,7 @@
 """Refinement of an image that is known already: which rays would be cast, and how wrong the image would be, exactly.
 
-No ray is cast: marking and estimators are those of `jaxsph.screen`, and what they may see of the finest image is what has been
-asked for. The rules are those of Kratz et al. 2011, section 5, and nothing else: every pixel counts, none is known to be empty,
+No ray is cast: marking and estimators are those of `jaxsph.screen`, and what they may see of the finest image is what has
+been asked for. The rules are those of Kratz et al. 2011, section 5, and nothing else: every pixel counts, none is known to be empty,
 and no bundle is cast whole.
 """
 

@@ -58,7 +58,7 @@ def plan(
             what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
         slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
             support is in samples.
-        tuning: of another kind of machine than holds the particles (`jaxsph.numerics.tuning`), to compile for it or to compare.
+        tuning: of another kind of machine (`jaxsph.numerics.tuning`) than the one at hand: to compile for it, or to compare.
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
             There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
 
