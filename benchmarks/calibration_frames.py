@@ -16,6 +16,7 @@ from jax import Array
 import jaxsph as js
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.cast.adjoint import CastMethod
 from jaxsph.engine.control import pilot
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
 from jaxsph.engine.field.gather import gather
@@ -26,7 +27,9 @@ from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL,
 from jaxsph.engine.field.sums import Sums
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, make_grid
+from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.viewing import half_steps, view_scene
+from jaxsph.model import registry
 from jaxsph.model.transfer.function import TransferFunction
 
 REACHES = 1.0, 1.25, 1.5, 2.0, 2.5, 3.0  # node spacings
@@ -65,14 +68,15 @@ class Frame:
     def decide(self, tolerance: float) -> SlabSchedule:
         """What the pilot decides."""
         limits = Limits(jnp.float32(tolerance), jnp.float32(0))
-        view = self.grid, self.camera, self.transfer
-        return decide_by_pilot(*view, limits, self.lattice, cast=self.plan.cast, **self.sizes).schedule
+        shown = Shown(self.camera, self.transfer)
+        return decide_by_pilot(self.grid, shown, limits, self.lattice, cast=self.plan.cast, **self.sizes).schedule
 
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
-        inputs = self.grid, self.camera, self.transfer, (), schedule, self.lattice, jnp.int32(0)
-        how = {"integrator": self.plan.chosen_integrator, "screen": self.plan.screen, "kernel": self.kernel}
-        rays = cast_shard(*inputs, shards=1, cast_plan=self.plan.cast, **how, **self.sizes).rays
+        inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
+        integrator, packets = registry.integrator(*self.plan.chosen_integrator), registry.screen(self.plan.screen).packets
+        method = CastMethod(self.kernel, self.plan.cast, integrator, packets)
+        rays = cast_shard(*inputs, shards=1, method=method, **self.sizes).rays
         return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
 
 

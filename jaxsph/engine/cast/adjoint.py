@@ -35,6 +35,7 @@ from jaxsph.engine.field.transposed import COLUMNS
 from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.engine.media.particles import ParticleMedium, Wanted
+from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import Within
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
@@ -44,6 +45,7 @@ from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
+NO_LIMITS = RayLimits()
 KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
 Layers = tuple[Array, Array]  # colour and transmittance of an image, or their cotangents
 
@@ -87,22 +89,18 @@ class NonDiffInputs:
     camera: Camera
     lattice: Lattice | None
     chosen: Any
-    min_transmittance: Float[Array, ""] | None
-    tolerance: Float[Array, ""] | None
+    limits: RayLimits
 
 
 def cast(
     grid: Grid,
     schedule: SlabSchedule,
-    camera: Camera,
-    transfer: TransferFunction | None,
-    media: tuple[Medium, ...],
+    shown: Shown,
     method: CastMethod,
+    *,
     lattice: Lattice | None = None,
     chosen: Any = None,
-    min_transmittance: Float[Array, ""] | None = None,
-    tolerance: Float[Array, ""] | None = None,
-    within: Clip | None = None,
+    limits: RayLimits = NO_LIMITS,
 ) -> RayResult:
     """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
@@ -117,8 +115,9 @@ def cast(
     """
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
+    camera, transfer, media, within = shown
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
-    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance)
+    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, limits)
     return _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
 
 
@@ -132,7 +131,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
         medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
-        how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance, fixed.tolerance
+        how = medium, method.integrator, method.plan, camera.is_perspective, *fixed.limits
         return march(grid, fixed.schedule, packets, *how)
 
 
@@ -209,7 +208,7 @@ def _require_values(fixed: NonDiffInputs) -> None:
             "an image with super-pixels has no derivatives, as their colours come from bounds; "
             "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
         )
-    if fixed.tolerance is not None:
+    if fixed.limits.tolerance is not None:
         raise NotImplementedError(
             "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
             "as it needs"
@@ -243,7 +242,7 @@ def _pull(
     grid, camera = _seen(inputs, fixed)
     packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
     integrator = method.integrator
-    how = camera.is_perspective, bool(integrator.halo), fixed.min_transmittance, integrator.between
+    how = camera.is_perspective, bool(integrator.halo), fixed.limits.min_transmittance, integrator.between
     batches = batches_of(grid, fixed.schedule, packets, plan, *how)
     dtype = grid.half_steps.dtype
     medium = Mixture.of(media, method.mix)

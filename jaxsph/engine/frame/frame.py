@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.cast.adjoint import KEPT
+from jaxsph.engine.cast.adjoint import KEPT, CastMethod
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
@@ -40,6 +40,7 @@ from jaxsph.engine.frame.stages import (
     sum_shard,
     wanted_cells,
 )
+from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.runtime.executors import Executor
@@ -129,16 +130,21 @@ class Frame:
         plan = self.plan
         each = self._each(run)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
-        scene = (grid, camera or self.camera, self.transfer, self.media)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
-        how = lattice, self.min_transmittance, tolerance
-        inputs = [(*scene, schedule, *how, nth, self.within) for schedule, nth in zip(schedules, each, strict=True)]
-        method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
-        rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.min_transmittance, tolerance)
+        inputs = [(grid, shown, schedule, lattice, limits, nth) for schedule, nth in zip(schedules, each, strict=True)]
+        integrator, packets = registry.integrator(*plan.chosen_integrator), registry.screen(plan.screen).packets
+        method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets, self.formulas.mix)
+        rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
         return rays
 
     def _each(self, run: Executor) -> list[Int[Array, ""]]:
         return run.own([jnp.int32(nth) for nth in range(self.shards)])
+
+    @property
+    def shown(self) -> Shown:
+        """All but the particles."""
+        return Shown(self.camera, self.transfer, self.media, self.within)
 
     @property
     def _halo(self) -> int:
@@ -162,7 +168,8 @@ class Frame:
 
     def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
-        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth, self.within) for nth in self._each(run)]
+        shown = self.shown._replace(camera=camera or self.camera)
+        inputs = [(grid, shown, nth) for nth in self._each(run)]
         static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
         return run.each("adapt", decide_full_rate, inputs, **static)
 
@@ -180,7 +187,7 @@ class Frame:
         several, tuning = self.shards > 1, self.plan.cast.tuning
         lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
-        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice, self.within), **self._cast)], lattice
+        return [run.one("adapt", decide_by_pilot, (grid, self.shown, self.limits, lattice), **self._cast)], lattice
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
         static, each = {"shards": self.shards, **self._cast}, self._each(run)
@@ -188,8 +195,8 @@ class Frame:
         pays, wanted = run.one("adapt", wanted_cells, (tuple(run.pooled(probes)),), tuning=self.plan.cast.tuning)
         if not run.may_hold(pays):
             return self.leave(grid, run, with_levels=True)
-        view = (grid, self.camera, self.transfer, self.limits)
-        inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
+        view = (grid, self.shown, self.limits)
+        inputs = [(*view, of_shard, nth) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
         return run.each("adapt", decide_by_bounds, inputs, control=self.plan.control, **static)
 
 

@@ -22,6 +22,7 @@ from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import SlabSchedule, evaluations
 from jaxsph.engine.frame.layers import Layers
 from jaxsph.engine.frame.stages import Cast, Decided, Verdict, stage
+from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas
@@ -176,7 +177,8 @@ def shoot(
     pick, packets_of = KINDS[kind]
     chosen, made = pick(queue, first, packets), registry.integrator(*integrator)
     method = CastMethod(formulas.kernel, cast_plan, made, packets_of, formulas.mix)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, chosen, min_transmittance, None, within)
+    shown = Shown(camera, transfer, media, within)
+    rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=RayLimits(min_transmittance))
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
     spent = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo)[chosen.bundle]
     if rays.left_out is not None:

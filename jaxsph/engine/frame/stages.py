@@ -34,15 +34,13 @@ from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.engine.field.nodes import sum_at_nodes
 from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.engine.runtime.tuning import Tuning
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
-from jaxsph.model.medium import Medium
-from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import is_traced
@@ -237,11 +235,8 @@ def wanted_cells(
 @stage("shards", "cast", "halo", "with_levels", quickly=True)
 def decide_full_rate(
     grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction | None,
-    media: tuple[Medium, ...],
+    shown: Shown,
     nth: Int[Array, ""],
-    within: Clip | None = None,
     *,
     shards: int,
     cast: CastPlan,
@@ -250,8 +245,8 @@ def decide_full_rate(
     tuning: Tuning,
 ) -> Decided:
     """Every cell of the `nth` of `shards` of a band at full rate: without error control, or where none of it would pay."""
-    given = shard_of_grid(grid, nth, shards), camera, transfer, media, within
-    grid, camera, transfer, media, within = jax.tree.map(lax.stop_gradient, given)
+    grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
+    camera, transfer, media, within = shown
     schedule, full = _at_full_rate(grid, transfer, cast, halo, _overlap(grid, camera, within, cast))
     extents = slab_extents(grid, camera, cast.slab_samples) if media else None
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
@@ -263,11 +258,9 @@ def decide_full_rate(
 @stage("cast", quickly=True)
 def decide_by_pilot(
     grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction,
+    shown: Shown,
     limits: Limits,
     lattice: Lattice,
-    within: Clip | None = None,
     *,
     cast: CastPlan,
     tuning: Tuning,
@@ -276,10 +269,11 @@ def decide_by_pilot(
 
     Slabs that a face of a clip may cross are at full rate.
     """
-    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
-    lies = _overlap(grid, camera, within, cast)
-    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
+    lies = _overlap(grid, shown.camera, shown.within, cast)
+    schedule, full = _at_full_rate(grid, shown.transfer, cast, 0, lies)
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
     found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
     able = None if lies is None else lies.holds
     schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples, able)
@@ -289,12 +283,10 @@ def decide_by_pilot(
 @stage("shards", "cast", "control")
 def decide_by_bounds(
     grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction,
+    shown: Shown,
     limits: Limits,
     wanted: Bool[Array, "cells bundles"],
     nth: Int[Array, ""],
-    within: Clip | None = None,
     *,
     shards: int,
     cast: CastPlan,
@@ -305,12 +297,13 @@ def decide_by_bounds(
 
     Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
     """
-    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
-    dtype, grid = grid.half_steps.dtype, shard_of_grid(grid, nth, shards)
-    lies = _overlap(grid, camera, within, cast)
-    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
+    grid = shard_of_grid(grid, nth, shards)
+    lies = _overlap(grid, shown.camera, shown.within, cast)
+    schedule, full = _at_full_rate(grid, shown.transfer, cast, 0, lies)
     wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
-    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
     references = schedule.references
     schedule, bound, levels = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
     return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels))
@@ -346,36 +339,29 @@ class Cast(NamedTuple):
     cut: Bool[Array, " bundles"] | None
 
 
-@stage("shards", "cast_plan", "integrator", "screen", "formulas")
+@stage("shards", "method")
 def cast_shard(
     grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction | None,
-    media: tuple[Medium, ...],
+    shown: Shown,
     schedule: SlabSchedule,
     lattice: Lattice | None,
-    min_transmittance: Float[Array, ""] | None,
-    tolerance: Float[Array, ""] | None,
+    limits: RayLimits,
     nth: Int[Array, ""],
-    within: Clip | None = None,
     *,
     shards: int,
-    cast_plan: CastPlan,
-    integrator: tuple[Any, ...],
-    screen: str,
-    formulas: Formulas,
+    method: CastMethod,
     tuning: Tuning,
 ) -> Cast:
     """The `nth` of `shards` of a band. The grid is of the whole band, and so is the schedule with a lattice."""
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    shown = shown.of_type(grid.half_steps.dtype)
     of_nodes = None if lattice is None else lattice.evaluations
     if lattice is not None:
         schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
-    made = registry.integrator(*integrator)
-    method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
+    method = dataclasses.replace(method, plan=method.plan.of_shard(shards))
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within)
-    spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
+    rays = cast(grid, schedule, shown, method, lattice=lattice, limits=limits)
+    packets = method.packets_of(grid, shown.camera)
+    spent = evaluations(schedule, grid.samples, method.plan.slab_samples, method.integrator.halo)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
     if rays.refined is not None:
         spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)

@@ -21,6 +21,7 @@ from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.control.levels import bound
 from jaxsph.engine.control.merge import coarse_schedule, merged_levels
 from jaxsph.engine.control.ranges import tables_of_parts
+from jaxsph.engine.media.shown import Shown
 from jaxsph.model import registry
 
 CANDIDATES = range(SUPER_PIXEL + 1)
@@ -58,7 +59,7 @@ def look(scene, camera, frame, wished, *, plan, kernel, form):
 
     def pixels(levels):
         schedule = coarse_schedule(windows, levels, reference, analysis.paint, slab_samples)
-        rays = cast(grid, schedule, camera, scene.transfer, (), method)
+        rays = cast(grid, schedule, Shown(camera, scene.transfer), method)
         return jnp.concatenate([rays.color, 1 - rays.transmittance[None]])
 
     exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))

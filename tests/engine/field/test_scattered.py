@@ -18,6 +18,7 @@ from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.schedule import full_rate
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
+from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.tuning import CPU
 from jaxsph.engine.screen.packets import SCATTERED
 from jaxsph.numerics.fusion import barriers
@@ -86,7 +87,7 @@ def test_light_and_cotangents_are_those_of_tensor_products(frames, stages, x64):
         looking = dataclasses.replace(camera, half_height=half_height)
         there = dataclasses.replace(grid, ordered=dataclasses.replace(grid.ordered, **columns), half_steps=half_steps)
         method = CastMethod("poly6", plan.cast, PointSamples(), packets_of)
-        rays = cast(there, schedule, looking, transfer, (), method)
+        rays = cast(there, schedule, Shown(looking, transfer), method)
         layers = jnp.concatenate([rays.color, rays.transmittance[None]])
         if packets_of is apart:
             parts = RAYS // SCATTERED
