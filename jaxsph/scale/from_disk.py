@@ -22,7 +22,6 @@ import numpy as np
 
 from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.bands import Progress, Work
-from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import MAX_CLASSES, measured, see, shape_of, sorted_and_measured
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
@@ -265,8 +264,7 @@ class _Renderer:
         clock.mark("plan")
         if plan is None:
             return None
-        drawn = Work(seen, self.camera, self.settings, plan, asked.scene.formulas, pane.top).drawn(clock)
-        image = image_of(drawn, self.camera, self.settings, plan, clock)
+        image = Work(seen, self.camera, self.settings, plan, asked.scene.formulas, pane.top).image(clock)
         return of_columns(image, pane.left, pane.right)
 
     def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:

@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxsph.engine.access.lists import BUNDLE, TILE
 from jaxsph.engine.frame.bands import Progress, Work
-from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import choose, fitted, fitting
@@ -75,8 +74,7 @@ def render_tile(
     if plan is None:  # no room for more than this part needs
         plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
     clock.mark("plan")
-    drawn = Work(seen, camera, settings, plan, scene.formulas, first).drawn(clock, progress)
-    image = image_of(drawn, camera, settings, plan, clock)
+    image = Work(seen, camera, settings, plan, scene.formulas, first).image(clock, progress)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.layers import Band, Drawn, Layers, develop
 from jaxsph.engine.frame.refinement import refined
 from jaxsph.engine.planning.measures import measure
@@ -30,6 +31,7 @@ from jaxsph.engine.runtime.device_executors import Devices, OnDevices
 from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.runtime.tuning import shards_at_hand
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 
@@ -67,6 +69,10 @@ class Work:
         draw = functools.partial(work.in_order, dealt.shards)
         clock.foresee(lambda known: draw(clock.forecast(known), None))
         return draw(clock, told)
+
+    def image(self, clock: Clock, progress: Progress | None = None, *, planned: bool = True) -> Image:
+        """The image of it; `planned`: whether capacities were made for this very frame."""
+        return image_of(self.drawn(clock, progress), self.camera, self.settings, self.plan, clock, planned=planned)
 
     def in_order(self, shards: int, run: Executor, told: _Told | None) -> Drawn:
         """All bands one after the other; a quadtree is of all of them."""

@@ -106,6 +106,17 @@ def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -
     return seen.with_data(scene)
 
 
+def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
+    """A given plan, and the frame as seen with its capacity.
+
+    Raises:
+        ValueError: the plan is for another image, or another kind of error control.
+    """
+    plan.check(asked.scene, asked.camera, asked.along)
+    run.mark("plan")
+    return plan, see(asked.scene, asked.camera, plan, run)
+
+
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
     return bool(scene.point_sets) or registry.between_samples(integrator)
