@@ -1,8 +1,9 @@
-"""Draw `docs/house.svg`: which rooms the code has, on which floors they are, and which import which.
+"""Draw `docs/house.svg` and `docs/engine.svg`: which rooms the code has, on which floors they are, and which import which.
 
-Everything in the picture is read from the code. Rooms are the folders and modules of `jaxsph/`, with the first line of their
-docstrings; floors are the layers that `pyproject.toml` has import-linter keep; arrows are imports, found with `ast`. An import
-that other arrows already lead to is not drawn: what a room uses is all that can be reached from it downwards.
+Everything in the picture is read from the code. Rooms are the folders and modules of `jaxsph/`, or of `jaxsph/engine/`, with
+the first line of their docstrings; floors are the layers that `pyproject.toml` has import-linter keep; arrows are imports,
+found with `ast`. An import that other arrows already lead to is not drawn: what a room uses is all that can be reached from it
+downwards.
 
     python docs/draw_house.py
 """
@@ -19,8 +20,7 @@ from collections import defaultdict
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGE = "jaxsph"
-PICTURE = ROOT / "docs" / "house.svg"
+PICTURES = {"jaxsph": ROOT / "docs" / "house.svg", "jaxsph.engine": ROOT / "docs" / "engine.svg"}
 
 WIDTH = 840  # of the house, pixels
 MARGIN = 20
@@ -42,9 +42,21 @@ def rooms_of(package: Path) -> list[str]:
 
 
 def modules_of(package: Path, room: str) -> list[Path]:
-    """The files of a room."""
+    """The files of a room, those of its folders too."""
     folder = package / room
-    return sorted(folder.glob("*.py")) if folder.is_dir() else [package / f"{room}.py"]
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else [package / f"{room}.py"]
+
+
+def contents_of(package: Path, room: str) -> list[str]:
+    """What is in the folder of a room: folders, with a stroke, and modules."""
+    inside = rooms_of(package / room)
+    folders = [name for name in inside if (package / room / name).is_dir()]
+    return [*(f"{name}/" for name in folders), *(name for name in inside if name not in folders and name != "__init__")]
+
+
+def dotted(package: Path) -> str:
+    """The name that a package is imported by."""
+    return ".".join(package.relative_to(ROOT).parts)
 
 
 def purpose_of(package: Path, room: str) -> str:
@@ -65,16 +77,15 @@ def imports_of(package: Path, room: str, rooms: list[str]) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 names = [f"{node.module}.{alias.name}" for alias in node.names]
             for name in names:
-                top, _, rest = name.partition(".")
-                first = rest.split(".")[0]
-                if top == package.name:
-                    found.add(first if first in rooms else "__init__")
+                if f"{name}.".startswith(f"{dotted(package)}."):
+                    first = name.removeprefix(dotted(package)).split(".")[1:2]
+                    found.add(first[0] if first and first[0] in rooms else "__init__")
     return found - {room}
 
 
 def named_rooms(package: Path) -> set[str]:
     """Rooms whose modules are looked up by name, `package.room.module:name` in a string."""
-    entry = re.compile(rf"{package.name}\.(\w+)\.[\w.]+:\w+")
+    entry = re.compile(rf"{re.escape(dotted(package))}\.(\w+)\.[\w.]+:\w+")
     strings = (
         node.value
         for file in package.rglob("*.py")
@@ -160,7 +171,7 @@ def furnished(package: Path, room: str, x: float, width: float, alone: bool, by_
     lines = [(PAD, PAD + NAME_SIZE - 2, NAME_SIZE, INK, True, title)]
     texts = [(TEXT_SIZE, SOFT, text) for text in wrapped(said, space, TEXT_SIZE)]
     if folder:
-        files = ", ".join(file.stem for file in modules_of(package, room) if file.stem != "__init__")
+        files = ", ".join(contents_of(package, room))
         texts += [(FILE_SIZE, FAINT, text) for text in wrapped(files, space, FILE_SIZE)]
     lines += [(left, top + k * LINE, size, color, False, text) for k, (size, color, text) in enumerate(texts)]
     return Room(room, folder, x, 0, width, lines[-1][1] + PAD, lines)
@@ -340,11 +351,11 @@ def drawn_room(room: Room) -> list[str]:
     return found
 
 
-def roof(ends: tuple[float, float], height: float) -> list[str]:
+def roof(title: str, ends: tuple[float, float], height: float) -> list[str]:
     """A gable, with what is to be known of the picture."""
     rooms = "Rooms are folders and modules, floors are layers. Imports only point down."
     arrows = "Dark: to the next floor. Light: further down, by the stairs. What other arrows lead to is not drawn."
-    texts = [("The house of jaxsph", -64, NAME_SIZE + 1, INK), (rooms, -44, TEXT_SIZE, SOFT), (arrows, -24, TEXT_SIZE, SOFT)]
+    texts = [(title, -64, NAME_SIZE + 1, INK), (rooms, -44, TEXT_SIZE, SOFT), (arrows, -24, TEXT_SIZE, SOFT)]
     found = [f'<path d="M{ends[0]:.1f} -8 L{WIDTH / 2} {-height:.1f} L{ends[1]:.1f} -8 Z" fill="{FOLDER}" stroke="{WALL}"/>']
     for text, y, size, color in texts:
         at = f'x="{WIDTH / 2}" y="{y}" font-size="{size}"'
@@ -363,12 +374,12 @@ def heads() -> str:
     return f"<defs>{''.join(marks)}</defs>"
 
 
-def picture(root: Path = ROOT) -> str:
-    """The picture, as the code is now."""
-    package = root / PACKAGE
-    settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+def picture(of: str) -> str:
+    """The picture of a package, as the code is now."""
+    package = ROOT / of.replace(".", "/")
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
-    (layers,) = (contract["layers"] for contract in contracts if contract.get("containers") == [PACKAGE])
+    (layers,) = (contract["layers"] for contract in contracts if contract.get("containers") == [of])
     names = rooms_of(package)
     imports = {room: imports_of(package, room, names) for room in names}
     floors = floors_of(layers, imports)
@@ -379,7 +390,7 @@ def picture(root: Path = ROOT) -> str:
     router = Router(rooms, lanes)
     beside = LANE * (max((lane.column for lane in lanes), default=0) + 3)
     height, above = max(room.y + room.height for room in rooms.values()), 150
-    parts = [*roof((-beside, WIDTH + beside), above)]
+    parts = [*roof(f"The house of {of}", (-beside, WIDTH + beside), above)]
     parts += [element for lane in lanes for element in drawn_lane(lane, rooms, router)]
     parts += drawn_straight(straight, rooms)
     parts += [element for room in rooms.values() for element in drawn_room(room)]
@@ -392,4 +403,5 @@ def picture(root: Path = ROOT) -> str:
 
 
 if __name__ == "__main__":
-    PICTURE.write_text(picture(), encoding="utf-8")
+    for of, file in PICTURES.items():
+        file.write_text(picture(of), encoding="utf-8")
