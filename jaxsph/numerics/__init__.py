@@ -1,1 +1,1 @@
-"""Arithmetic that knows nothing of particles: checks, faults, sums, exponents, fusion, programs and tuning."""
+"""Arithmetic that knows nothing of particles: checks, faults, sums, exponents, fusion, digests."""

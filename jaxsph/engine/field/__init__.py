@@ -1,1 +1,1 @@
-"""What a medium is at given points: particles fetched, summed up, and interpolated between."""
+"""Sums over particles at given points: fetched, summed up, and interpolated between nodes."""
