@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import workloads
 
 import jaxsph as js
-from jaxsph.host_stages import MAKE_GRID, ORDER
-from jaxsph.numerics.executors import Clock
-from jaxsph.planning import measured, see
-from jaxsph.provenance import of_this_run
+from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.planning.fit import measured, see
+from jaxsph.engine.runtime.executors import Clock
+from jaxsph.trade.provenance import of_this_run
 
 SIDES = workloads.CUBE, 100
 ACCESS = "view", "measure and sort", "order", "lists"

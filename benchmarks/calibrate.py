@@ -44,9 +44,9 @@ import tolerance
 from calibration_scenes import GROUPS, Look
 
 import jaxsph as js
-from jaxsph.control.interpolation_error import DEVIATIONS_AROUND, MIN_CLEARANCE, SUBSAMPLED_SHARE
-from jaxsph.control.pilot import DEVIATIONS, RESOLVED
-from jaxsph.control.spacing import DEVIATION_PER_BEND
+from jaxsph.engine.control.interpolation_error import DEVIATIONS_AROUND, MIN_CLEARANCE, SUBSAMPLED_SHARE
+from jaxsph.engine.control.pilot import DEVIATIONS, RESOLVED
+from jaxsph.engine.control.spacing import DEVIATION_PER_BEND
 from jaxsph.io.replace import written_whole
 
 TOLERANCES = 0.002, 0.004, 0.01, 0.03

@@ -25,9 +25,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from calibration_scenes import GROUPS, Kind
 
 import jaxsph as js
+from jaxsph.engine.screen.estimators import CAUTION
 from jaxsph.io.replace import written_whole
-from jaxsph.provenance import of_this_run
-from jaxsph.screen.estimators import CAUTION
+from jaxsph.trade.provenance import of_this_run
 
 TOLERANCES = 0.004, 0.01, 0.03, 0.06
 MOST_OVER = 1e-3  # share of pixels

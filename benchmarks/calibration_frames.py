@@ -14,26 +14,20 @@ import numpy as np
 from jax import Array
 
 import jaxsph as js
-from jaxsph.access.grid import Grid
-from jaxsph.access.ordering import rank_particles
-from jaxsph.control import pilot
-from jaxsph.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
-from jaxsph.field.gather import gather
-from jaxsph.field.interpolation import interpolate
-from jaxsph.field.lattice import REACH, Lattice, region_of
-from jaxsph.field.nodes import gather_subsampled, sum_at_nodes
-from jaxsph.field.schedule import (
-    DENSE,
-    INTERPOLATED,
-    MAX_SPACING_LEVEL,
-    SlabSchedule,
-    full_rate,
-)
-from jaxsph.field.sums import Sums
-from jaxsph.field.tasks import SlabTask
-from jaxsph.model.transfer import TransferFunction
-from jaxsph.stages import Limits, cast_shard, decide_by_pilot, make_grid
-from jaxsph.viewing import half_steps, view_scene
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.control import pilot
+from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.interpolation import interpolate
+from jaxsph.engine.field.lattice import REACH, Lattice, region_of
+from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
+from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
+from jaxsph.engine.field.sums import Sums
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, make_grid
+from jaxsph.engine.planning.viewing import half_steps, view_scene
+from jaxsph.model.transfer.function import TransferFunction
 
 REACHES = 1.0, 1.25, 1.5, 2.0, 2.5, 3.0  # node spacings
 CHUNK = 64  # slabs whose sums are compared at once

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 import jaxsph as js
-from jaxsph.screen.canvas import channels_of
+from jaxsph.engine.screen.canvas import channels_of
 
 RESOLUTION = 256  # of the engine and the creature; the mixing layer has 682 points along the flow
 RAMP_SHAPE = 96, 48, 48

@@ -29,10 +29,10 @@ import h5py
 import numpy as np
 
 import jaxsph as js
-from jaxsph.from_disk import TooLittleMemoryError
 from jaxsph.io.replace import written_whole
 from jaxsph.io.snapshot_sort import CELLS, Grid
-from jaxsph.provenance import of_this_run
+from jaxsph.scale.from_disk import TooLittleMemoryError
+from jaxsph.trade.provenance import of_this_run
 
 FILES, NEIGHBOURS = 8, 32
 SAMPLES = 256

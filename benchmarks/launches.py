@@ -26,12 +26,12 @@ import jax.numpy as jnp
 import workloads
 
 import jaxsph as js
-from jaxsph.frame import Frame
-from jaxsph.layers import develop
-from jaxsph.numerics.executors import AllShards, HostStage
-from jaxsph.numerics.tuning import ACCELERATOR, CPU, Tuning
-from jaxsph.planning import see
-from jaxsph.provenance import of_this_run
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.layers import develop
+from jaxsph.engine.planning.fit import see
+from jaxsph.engine.runtime.executors import AllShards, HostStage
+from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
+from jaxsph.trade.provenance import of_this_run
 
 MOST = 3_000
 MEMORY = 16 << 30  # bytes that a plan may take: in one band

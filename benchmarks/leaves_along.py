@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.access.octree import Leaf, Octree
+from jaxsph.engine.access.octree import Leaf, Octree
 
 Cell = tuple[Int[Array, " rays"], ...]
 Coordinates = list[Float[Array, " rays"]]

@@ -37,9 +37,9 @@ import workloads
 from leaves_along import LeavesAlong, leaves_along
 
 import jaxsph as js
-from jaxsph.access.octree import Octree
-from jaxsph.access.octree_build import OctreePlan, build_octree, plan_octree
-from jaxsph.provenance import of_this_run
+from jaxsph.engine.access.octree import Octree
+from jaxsph.engine.access.octree_build import OctreePlan, build_octree, plan_octree
+from jaxsph.trade.provenance import of_this_run
 
 SAMPLES, SIZE, LEAVES = 256, 512, 512
 RATIOS = 1.0, 2.0, 4.0

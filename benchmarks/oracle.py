@@ -29,16 +29,16 @@ import peers
 import workloads
 
 import jaxsph as js
-from jaxsph.access.grid import Grid
-from jaxsph.access.ordering import rank_particles
-from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows, slab_windows_with_borders
-from jaxsph.access.view import view_particles
-from jaxsph.field.gather import gather
-from jaxsph.field.schedule import full_rate, reference_quantities
-from jaxsph.field.tasks import SlabTask
-from jaxsph.model.transfer import Segments, look_up
-from jaxsph.stages import make_grid
-from jaxsph.viewing import half_steps
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, slab_windows_with_borders
+from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.schedule import full_rate, reference_quantities
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.planning.viewing import half_steps
+from jaxsph.model.transfer.function import Segments, look_up
 
 CHUNK = 64  # cells at a time
 HALVINGS = 60

@@ -1,6 +1,6 @@
 """Refinement of an image that is known already: which rays would be cast, and how wrong the image would be, exactly.
 
-No ray is cast: marking and estimators are those of `jaxsph.screen`, and what they may see of the finest image is what has been
+No ray is cast: marking and estimators are those of `jaxsph.engine.screen`, and what they may see of the finest image is what has been
 asked for. The rules are those of Kratz et al. 2011, section 5, and nothing else: every pixel counts, none is known to be empty,
 and no bundle is cast whole.
 """
@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.screen.canvas import LIGHT, Canvas
-from jaxsph.screen.estimators import ESTIMATORS, Hierarchical
-from jaxsph.screen.marking import Leaves, holding, leaves_of, wanted_by, worst
-from jaxsph.screen.pyramid import at_nodes, halved, lattices, num_leaves, over_pixels, places
+from jaxsph.engine.screen.canvas import LIGHT, Canvas
+from jaxsph.engine.screen.estimators import ESTIMATORS, Hierarchical
+from jaxsph.engine.screen.marking import Leaves, holding, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.pyramid import at_nodes, halved, lattices, num_leaves, over_pixels, places
 
 COLORS = 3  # channels of u in the paper; estimators see transmittance too
 SMOOTH = (

@@ -24,9 +24,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import workloads
 
 import jaxsph as js
-from jaxsph.contenders import Contender, baseline, scaled_up
 from jaxsph.io.replace import written_whole
-from jaxsph.provenance import of_this_run
+from jaxsph.trade.contenders import Contender, baseline, scaled_up
+from jaxsph.trade.provenance import of_this_run
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 TOLERANCES = 0.03, 0.01, 0.004

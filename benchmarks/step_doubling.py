@@ -25,9 +25,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 
 import jaxsph as js
-from jaxsph.cast.integrator import Integrator, Segment
-from jaxsph.cast.step_doubling import StepDoubling
-from jaxsph.field.tasks import SlabTask
+from jaxsph.engine.cast.integrator import Integrator, Segment
+from jaxsph.engine.cast.step_doubling import StepDoubling
+from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model import registry
 from jaxsph.model.medium import Medium
 from jaxsph.scenes import fields

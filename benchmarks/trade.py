@@ -20,9 +20,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 
 import jaxsph as js
-from jaxsph import figures
-from jaxsph.contenders import BASELINES
-from jaxsph.measurement import Measurement
+from jaxsph.plot import sweep_figures as figures
+from jaxsph.trade.contenders import BASELINES
+from jaxsph.trade.measurement import Measurement
 
 SCENES = ("mixer", "checker_board", "radial", "letters", "flubber")
 RESULTS = peers.RESULTS.with_name("trade.json")

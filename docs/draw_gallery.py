@@ -11,7 +11,7 @@ import tempfile
 
 from PIL import Image, ImageDraw
 
-from jaxsph import cli
+from jaxsph.cli import main as cli
 
 HERE = pathlib.Path(__file__).parent / "gallery"
 CELL, CAPTION, COLUMNS = 300, 34, 4

@@ -1,34 +1,35 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
-from jaxsph import image_figure, io, reference, scenes, transfer_figure
-from jaxsph.access.morton import prepare
-from jaxsph.field.in_octree import in_octree, octree_plans
-from jaxsph.field.iso_surface import IsoSurface
-from jaxsph.field.within import Within
-from jaxsph.frame_task import FrameFile, FramesError
-from jaxsph.frames import render_frames
-from jaxsph.from_disk import render_from_disk
-from jaxsph.met import Met, met
+from jaxsph import io, reference, scenes
+from jaxsph.analysis.met import Met, met
+from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
+from jaxsph.analysis.projection.project import project
+from jaxsph.analysis.resample import resample
+from jaxsph.analysis.slices import Slice, slice_of
+from jaxsph.engine.access.morton import prepare
+from jaxsph.engine.frame.progressive import Progressive, progressive
+from jaxsph.engine.media.in_octree import in_octree, octree_plans
+from jaxsph.engine.media.iso_surface import IsoSurface
+from jaxsph.engine.media.within import Within
+from jaxsph.engine.planning.fit import plan
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.render import render
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
-from jaxsph.model.clip_shapes import Box, Plane, Sphere
-from jaxsph.model.domains import control_values
-from jaxsph.model.framing import along_axis
+from jaxsph.model.camera.framing import along_axis
+from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.held import emission
 from jaxsph.model.projection import Projection
+from jaxsph.model.transfer.domains import control_values
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.on_disk import OnDisk
-from jaxsph.plan import Plan
-from jaxsph.planning import plan
-from jaxsph.progressive import Progressive, progressive
-from jaxsph.project import project
-from jaxsph.projection_plan import ProjectionPlan, plan_projection
-from jaxsph.render import render
-from jaxsph.resample import resample
-from jaxsph.slices import Slice, slice_of
-from jaxsph.snapshots import Snapshots
-from jaxsph.sweep import sweep
-from jaxsph.tiles import merge, render_tile
-from jaxsph.version import __version__
+from jaxsph.numerics.version import __version__
+from jaxsph.plot import image_figure, transfer_figure
+from jaxsph.scale.from_disk import render_from_disk
+from jaxsph.scale.on_disk import OnDisk
+from jaxsph.scale.parts import merge, render_tile
+from jaxsph.sequence.frames import render_frames
+from jaxsph.sequence.snapshots import Snapshots
+from jaxsph.sequence.task import FrameFile, FramesError
+from jaxsph.trade.sweep import sweep
 
 __all__ = [
     "Box",

@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxsph.cli import main
+from jaxsph.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -15,16 +15,16 @@ import pytest
 from derivatives import QUICKLY as UNOPTIMIZED
 
 import jaxsph as js
-from jaxsph.access.lists import ListPlan
-from jaxsph.access.ordering import rank_particles
-from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
-from jaxsph.access.view import view_particles
-from jaxsph.cast.batches import CastPlan
-from jaxsph.control.errors import fits
-from jaxsph.field.schedule import reference_quantities
-from jaxsph.numerics import memory_maps, programs
-from jaxsph.stages import make_grid
-from jaxsph.viewing import half_steps
+from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
+from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.control.errors import fits
+from jaxsph.engine.field.schedule import reference_quantities
+from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.planning.viewing import half_steps
+from jaxsph.engine.runtime import memory_maps, programs
 
 pytest_plugins = ["share"]
 

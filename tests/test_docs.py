@@ -9,7 +9,8 @@ import jax
 import pytest
 from forced import ran
 
-from jaxsph import cli, io, scenes
+from jaxsph import io, scenes
+from jaxsph.cli import main as cli
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.control.pilot import PilotPlan
+from jaxsph.engine.control.pilot import PilotPlan
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "jaxsph"

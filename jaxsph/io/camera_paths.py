@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.camera import Bounded, Camera
-from jaxsph.model.camera_leg import Leg
-from jaxsph.model.camera_path import CameraPath
+from jaxsph.model.camera.camera import Bounded, Camera
+from jaxsph.model.camera.leg import Leg
+from jaxsph.model.camera.path import CameraPath
 
 from .json_text import read_json
 from .regular import regular_file

@@ -30,7 +30,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     """Give the block a temporary path beside `path`, of the same suffix; rename it to `path` when the block succeeds.
 
     When the block fails, the temporary file is removed and what stood at `path` before still stands there. So it is when the
-    process is asked to end, if it hears (`jaxsph.cli`).
+    process is asked to end, if it hears (`jaxsph.cli.main`).
 
     Raises:
         ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 
 from .json_text import numbers_only, read_json
 from .regular import regular_file

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 

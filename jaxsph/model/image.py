@@ -56,7 +56,7 @@ class Image:
     writer: ClassVar[Callable[[str | os.PathLike[str], Image], None]]
     """How images become files: given by `jaxsph.io`, which knows the formats."""
     drawer: ClassVar[Callable[..., Any]]
-    """How images become figures: given by `jaxsph.image_figure`."""
+    """How images become figures: given by `jaxsph.plot.image_figure`."""
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""
@@ -99,7 +99,7 @@ class Image:
         type(self).writer(path, self)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
-        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time. See `jaxsph.image_figure`."""
+        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time. See `jaxsph.plot.image_figure`."""
         return type(self).drawer(self, scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:

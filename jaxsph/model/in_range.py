@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import ROUNDED
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 
 COLORS, LIGHT = slice(0, 3), slice(0, 4)

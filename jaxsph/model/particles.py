@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model import kernels
-from jaxsph.model.clip_shapes import Box
+from jaxsph.model.clips.shapes import Box
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 

@@ -21,7 +21,7 @@ import scipy
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.clip_shapes import Box
+from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_shape

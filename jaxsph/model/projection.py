@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.colormaps import colormap as colors_of
-from jaxsph.model.colormaps import value_range
+from jaxsph.model.transfer.colormaps import colormap as colors_of
+from jaxsph.model.transfer.colormaps import value_range
 
 NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose

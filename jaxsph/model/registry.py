@@ -12,17 +12,17 @@ import importlib
 from typing import Any
 
 INTEGRATORS = {
-    "samples": "jaxsph.cast.samples:PointSamples",
-    "segments": "jaxsph.cast.segments:Segments",
-    "step_doubling": "jaxsph.cast.step_doubling:StepDoubling",
+    "samples": "jaxsph.engine.cast.samples:PointSamples",
+    "segments": "jaxsph.engine.cast.segments:Segments",
+    "step_doubling": "jaxsph.engine.cast.step_doubling:StepDoubling",
 }
-"""Classes without arguments, each a `jaxsph.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
+"""Classes without arguments, each a `jaxsph.engine.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
 AT_POINTS = {"step_doubling"}
 """Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
 ESTIMATING = {"segments"}
 """Integrators that estimate their error against the light integral, and are refined for a tolerance."""
-SCREENS = {"pixels": "jaxsph.screen.pixels:EveryPixel", "quadtree": "jaxsph.screen.quadtree:Quadtree"}
-"""Classes without arguments, each a `jaxsph.screen.sampler.ScreenSampler`."""
+SCREENS = {"pixels": "jaxsph.engine.screen.pixels:EveryPixel", "quadtree": "jaxsph.engine.screen.quadtree:Quadtree"}
+"""Classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`."""
 
 
 def integrator(name: str, *arguments: Any) -> Any:

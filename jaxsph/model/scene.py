@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxsph.model.clips import Clip, both
+from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import NOTHING, Particles
 from jaxsph.model.points import Points
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))

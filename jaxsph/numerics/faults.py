@@ -49,7 +49,7 @@ MESSAGES = {
     BAD_POINTS: "a point has a position, attribute or extinction that is not finite, a radius that is not > 0 and finite, an "
     "extinction < 0 or a colour outside [0, 1]; remove or repair these points",
     OCTREE_OVERFLOW: "more (sphere, node) pairs than an octree's plan has room for; make a new plan with "
-    "`jaxsph.access.octree_build.plan_octree`, of these spheres",
+    "`jaxsph.engine.access.octree_build.plan_octree`, of these spheres",
     GHOST_OVERFLOW: "more images of particles across the faces of their periodic box than the plan has room for; make a new "
     "plan with `jaxsph.plan`",
     BAD_BOX: "a periodic box must have sides > 0 and finite, and none shorter than the largest support radius; give a larger "

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 
 MOST_CANDIDATES = 1 << 20  # pairs of a ray and a sphere that are looked at at once
 

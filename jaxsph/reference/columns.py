@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model import kernels
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.held import held_by
 from jaxsph.model.particles import Particles
 from jaxsph.model.projection import Projection

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model import kernels
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.points import thickness
 from jaxsph.reference.where import columns_of, to_world

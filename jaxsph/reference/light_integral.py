@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.reference.chords import Rays, blocks, rays_of

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.reference.portions import Portions
 
 NODES = 9

@@ -11,12 +11,12 @@ import dataclasses
 import numpy as np
 
 from jaxsph.model import kernels
-from jaxsph.model.camera import Camera
-from jaxsph.model.clips import Clip
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.model.camera import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
 

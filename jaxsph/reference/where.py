@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsph.model.camera import Camera
-from jaxsph.model.clip_shapes import Box, Plane, Sphere
-from jaxsph.model.clips import Both, Clip, Outside
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Both, Clip, Outside
+from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.particles import Particles
 
 

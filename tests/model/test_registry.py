@@ -3,9 +3,9 @@
 import pytest
 
 import jaxsph as js
-from jaxsph.cast.integrator import Integrator
+from jaxsph.engine.cast.integrator import Integrator
+from jaxsph.engine.screen.sampler import ScreenSampler
 from jaxsph.model import registry
-from jaxsph.screen.sampler import ScreenSampler
 
 
 @pytest.mark.parametrize("name", registry.INTEGRATORS)

@@ -19,13 +19,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.access.grid import Grid
-from jaxsph.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
-from jaxsph.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
-from jaxsph.control.errors import DEPTH_ROUNDING, EXPONENTIAL
-from jaxsph.control.ranges import tables_of_parts
-from jaxsph.model.camera import Camera
-from jaxsph.model.transfer import TransferFunction
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
+from jaxsph.engine.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
+from jaxsph.engine.control.errors import DEPTH_ROUNDING, EXPONENTIAL
+from jaxsph.engine.control.ranges import tables_of_parts
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.transfer.function import TransferFunction
 
 COMPOSITING = 4  # eps a sample, at most, that a computed colour is off by: its transmittance, product, difference and sum
 

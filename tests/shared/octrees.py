@@ -11,7 +11,7 @@ from derivatives import QUICKLY
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from jaxsph.access.octree_build import LevelSizes, OctreePlan, build_octree
+from jaxsph.engine.access.octree_build import LevelSizes, OctreePlan, build_octree
 
 SPHERES = 40
 PLAN = OctreePlan(2, 4096, 4096, tuple(LevelSizes(256, 6144) for _ in range(2)), 16384, most=2)

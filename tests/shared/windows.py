@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.access.slab_windows import CELL_SAMPLES, SlabWindows
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows
 
 CLASSES, CELLS, BUNDLES = 2, 17, 3
 

@@ -1,0 +1,1 @@
+"""Numbers instead of pictures: slices, grids, histograms of light, column integrals."""

@@ -1,0 +1,165 @@
+r"""What rays really meet: how much light each value of a quantity emits and absorbs, as the camera sees it.
+
+Flow: scene, camera -> some rays -> portions -> quantity at nodes, light in front of it -> [met] -> histogram, figure.
+
+A value may be that of most particles and never be seen, as it lies behind others. Along rays of random pixels the quantity is
+taken at the nodes of portions of the float64 reference, and what is there is weighted by the transmittance in front:
+$\int T \sigma\,dl$ is absorbed, $\int T c \sigma\,dl$ is emitted, and the path length alone tells what is there at all. The sum
+of what all values absorb is the mean alpha of the image, if nothing else is in the scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.scales import Scale
+from jaxsph.reference.chords import Rays, blocks, rays_of
+from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
+from jaxsph.reference.media import AllOfVolume, AllParticles, Part, Whole, parts_of
+from jaxsph.reference.portions import Portions, cut
+
+BLOCK = 128  # rays that share arrays
+WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2
+MAX_BINS = 4096
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Met:
+    """What rays meet, by value of the quantity; all are means over the pixels of the image.
+
+    Attributes:
+        edges: of the bins, ascending, even on the scale of the transfer function.
+        there: path length, length units, whatever hides it.
+        absorbed: share of the light of the background that is absorbed there.
+        emitted: red, green and blue that reach the eye from there.
+        rays: how many were cast.
+    """
+
+    edges: Float[np.ndarray, " bins_and_one"]
+    there: Float[np.ndarray, " bins"]
+    absorbed: Float[np.ndarray, " bins"]
+    emitted: Float[np.ndarray, "bins 3"]
+    rays: int
+
+    @property
+    def middles(self) -> Float[np.ndarray, " bins"]:
+        """Between the edges, halfway."""
+        return (self.edges[1:] + self.edges[:-1]) / 2
+
+
+def met(scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, of: int = 0, seed: int = 0) -> Met:
+    """The histogram of what rays meet, over the quantity of one part of a scene (host side, float64).
+
+    An estimate: of random pixels, and of the field at nodes of portions that are not split any further, as
+    `jaxsph.reference.integral` splits them for its own. Everything in the scene hides what lies behind it, of whichever part.
+
+    Args:
+        scene: particles, volumes and points.
+        camera: where from.
+        rays: random pixels, all different; all pixels where there are fewer.
+        bins: of the histogram, from the least to the greatest of control values and of what is met.
+        of: which part that has a transfer function: particles come first, then volumes, in their order.
+        seed: of the choice of pixels.
+
+    Raises:
+        ValueError: a scene of nothing or with `media`, no such part, a number of rays or bins out of range.
+    """
+    scene.check()
+    if scene.media:
+        raise ValueError("`media` are unknown to `met`, which has particles, volumes and points; give `media=()`")
+    for name, number, most in (("rays", rays, 1 << 24), ("bins", bins, MAX_BINS)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= most:
+            raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
+    parts, (transfer, record) = parts_of(scene, camera), _recording(scene, of)
+    looked = [part for part in parts if isinstance(part, AllParticles | AllOfVolume)][of]
+    looked.look = record
+    chosen = _pixels(camera, rays, seed)
+    for some in blocks(chosen, BLOCK):
+        _cast(chosen.some(some), parts, record)
+    return _histogram(record, transfer, bins, len(chosen.u))
+
+
+def _recording(scene: Scene, of: int) -> tuple[TransferFunction, Recording]:
+    looks = [*([] if scene.transfer is None else [scene.transfer]), *(look for _, look in scene.volumes)]
+    if not 0 <= of < len(looks):
+        there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
+        raise ValueError(f"`of` must be the number of a part with a transfer function, got {of}; there are {there}")
+    return looks[of], Recording(looks[of])
+
+
+def _pixels(camera: Camera, rays: int, seed: int) -> Rays:
+    number = camera.width * camera.height
+    chosen = np.random.default_rng(seed).choice(number, min(rays, number), replace=False)
+    return rays_of(camera, *np.unravel_index(chosen, (camera.height, camera.width)))
+
+
+class Recording(Look):
+    """A transfer function that remembers what quantities it was asked for, and what it made of them."""
+
+    def __init__(self, transfer: TransferFunction):
+        super().__init__(transfer)
+        self.found: list[tuple[np.ndarray, ...]] = []
+        self._asked: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
+        """See `Look`."""
+        before = seen.extinction[:, which].copy(), seen.emission[:, :, which].copy()
+        super().add(seen, which, quantities, portions, slant)
+        self._asked.append((which, quantities[0], seen.extinction[:, which] - before[0], seen.emission[:, :, which] - before[1]))
+
+    def weigh(self, path: np.ndarray, transmittance: np.ndarray) -> None:
+        """Keep what was asked for since, with the path length of each node and the transmittance in front of it."""
+        for which, quantity, extinction, emission in self._asked:
+            there = ~np.isnan(quantity)
+            length = np.where(there, path[:, which], 0)
+            seen = length * transmittance[:, which]
+            light = (seen * emission).transpose(1, 2, 0)[there]
+            self.found.append((quantity[there], length[there], (seen * extinction)[there], light))
+        self._asked.clear()
+
+
+def _cast(rays: Rays, wholes: list[Whole], record: Recording) -> None:
+    """One block of rays, in portions as the reference first cuts them."""
+    parts: list[Part] = [whole.seen_by(rays) for whole in wholes]
+    roots = cut(rays, [part.cuts() for part in parts])
+    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
+    for part in parts:
+        part.keep(held)
+    portions = roots.some(held)._replace(root=np.arange(held.sum()))
+    seen = AtNodes.nothing(len(portions.ray))
+    for part in parts:
+        part.add(seen, portions)
+    half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
+    thickness = light_of(seen, half_path).thickness
+    front = np.exp(-_in_front(portions.ray, thickness[:, -1]))
+    record.weigh(WEIGHTS[:, None] * half_path, (front[:, None] * np.exp(-thickness)).T)
+
+
+def _in_front(ray: np.ndarray, thickness: np.ndarray) -> np.ndarray:
+    """Optical thickness of the portions of the same ray that lie before each; they come in order."""
+    before = np.cumsum(thickness) - thickness
+    first = np.searchsorted(ray, ray)
+    return before - before[first] if len(ray) else before
+
+
+def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: int) -> Met:
+    columns = [np.concatenate(column) for column in zip(*record.found, strict=True)] if record.found else None
+    quantity, path, absorbed, emitted = columns or [np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3))]
+    scale = Scale.of(np.asarray(transfer.values, np.float64))
+    place = scale.place(quantity)
+    finite = place[np.isfinite(place)]
+    low, high = min(0.0, finite.min(initial=0)), max(1.0, finite.max(initial=1))
+    at = np.clip((np.maximum(place, low) - low) / (high - low) * bins, 0, bins - 1).astype(int)
+
+    def summed(weight: Any) -> np.ndarray:
+        return np.bincount(at, weight, bins) / rays
+
+    edges = scale.value(low + (high - low) * np.arange(bins + 1) / bins)
+    return Met(edges, summed(path), summed(absorbed), np.stack([summed(channel) for channel in emitted.T], 1), rays)

@@ -1,0 +1,1 @@
+"""Integrals along rays, not normalised."""

@@ -1,0 +1,145 @@
+"""Slices: what the quantity of particles is on a plane, as numbers and as a picture.
+
+Flow: particles, plane -> orthographic camera of one sample -> render -> [slices] -> files, notebooks.
+
+A camera that looks against the plane's normal takes one sample a ray, on the plane. The transfer function is a straight line over
+the range of the quantity, and opaque, so that a pixel's red is the field itself; what rounding adds is an eps of that range.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.engine.render import render
+from jaxsph.io import slices as files
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips.shapes import Plane
+from jaxsph.model.image import Image
+from jaxsph.model.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import require_shape
+from jaxsph.numerics.given import in_unit
+from jaxsph.numerics.version import __version__
+
+OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
+ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
+
+
+@dataclasses.dataclass(frozen=True)
+class Slice:
+    """The field on a plane; made by `slice_of`. Row 0 is the top, column 0 the left.
+
+    Attributes:
+        values: the quantity Q, float32 or float64; NaN outside of every support.
+        camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
+        metadata: strings and numbers for the file header.
+    """
+
+    values: Float[np.ndarray, "height width"]
+    camera: Camera
+    metadata: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def pixel_size(self) -> float:
+        """Of a pixel's side, length units."""
+        return 2 * float(self.camera.half_height) / self.camera.height
+
+    def positions(self) -> Float[np.ndarray, "height width 3"]:
+        """Places of all values, float64, length units."""
+        columns, rows = np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5
+        right = (columns - self.camera.width / 2) * self.pixel_size
+        up = (self.camera.height / 2 - rows) * self.pixel_size
+        axes = np.asarray(self.camera.axes, np.float64)
+        return self.camera.exact_eye() + right[:, None] * axes[0] + up[:, None, None] * axes[1]
+
+    def image(self, transfer: TransferFunction) -> Image:
+        """A picture by the colours of a transfer function, opaque wherever there is a value."""
+        there = np.isfinite(self.values)
+        filled = np.where(there, self.values, 0)
+        colors = np.asarray(transfer.colors, np.float64)
+        shown: Any = np.stack([np.interp(filled, np.asarray(transfer.values, np.float64), one) for one in colors.T], -1)
+        color = np.where(there[..., None], shown, 0).astype(np.float32)
+        transmittance, nothing = np.where(there, 0, 1).astype(np.float32), np.zeros(there.shape, np.float32)
+        depth: Any = np.where(there, 0, np.inf).astype(np.float32)
+        return Image(color, transmittance, depth, nothing, nothing, True, 0, {}, self.metadata)  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
+        """Write to `path`: `.npy` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).
+
+        Raises:
+            ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
+        """
+        files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata)
+
+
+def slice_of(
+    particles: Particles,
+    plane: Plane,
+    *,
+    within: Clip | None = None,
+    center: Any = None,
+    up: Any = None,
+    view_height: float | None = None,
+    width: int = 512,
+    height: int = 512,
+) -> Slice:
+    """The field of particles on a plane (host side).
+
+    Args:
+        particles: whose quantity is shown; of a periodic set one period.
+        plane: a `jaxsph.Plane`, seen from where its normal points to: of one along z, x is to the right and y upwards.
+        within: where it is shown; default everywhere.
+        center: (3,) what is in the middle, moved to the plane; default the middle of the particles.
+        up: (3,) direction that points upwards; default y, or z where the normal is along x or y.
+        view_height: visible height, length units; default all of the particles.
+        width, height: size in pixels.
+
+    Raises:
+        ValueError: arguments out of range, particles that cannot be rendered.
+    """
+    if not isinstance(plane, Plane):
+        raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
+    unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
+    center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
+    if up is None:
+        up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
+    lower, upper = particles.bounds()
+    middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
+    require_shape("center", middle, (3,), "give x, y and z")
+    foot = middle - ((middle - _point(plane)) @ normal) * normal
+    if view_height is None:
+        axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
+        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
+        reach = np.abs(corners @ axes.T).max(0)
+        view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
+    deep = view_height / height
+    camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
+    said = ("jaxsph.slice", f"point={_point(plane).tolist()} normal={normal.round(9).tolist()}")
+    metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
+    return Slice(_field(particles, camera, within, deep), camera, metadata)
+
+
+def _point(plane: Plane) -> np.ndarray:
+    return np.asarray(np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64))
+
+
+def _field(particles: Particles, camera: Camera, within: Clip | None, deep: float) -> np.ndarray:
+    """The quantity at the one sample of each ray; NaN where there is none."""
+    quantity = particles.to_numpy()["quantity"].astype(np.float64)
+    low, high = (float(quantity.min()), float(quantity.max())) if quantity.size else (0.0, 1.0)
+    low, high = (low, high) if low < high else (low - max(abs(low), 1), high + max(abs(high), 1))
+    points = [low, high], [[0, 0, 0], [1, 1, 1]], [OPAQUE / deep] * 2
+    line = TransferFunction(*(jnp.asarray(part, particles.dtype) for part in points))
+    image = render(Scene(particles=particles, transfer=line, within=within), camera, Settings(samples=1, integrator="samples"))
+    share, alpha = np.asarray(image.color)[..., 0].astype(np.float64), np.asarray(image.alpha)
+    return np.where(alpha > 0.5, low + share * (high - low), np.nan).astype(np.asarray(image.color).dtype)

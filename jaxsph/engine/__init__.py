@@ -1,0 +1,1 @@
+"""One frame: from what is asked for to an image."""

@@ -1,0 +1,79 @@
+r"""What a precision can tell apart: which lengths and strengths can be rendered, and which are to be refused.
+
+Flow: particles, camera -> [resolution] -> ordering -> faults.
+
+A view coordinate is off by a few eps of the distance from the eye, whatever the support. That moves a particle; it is a
+fault only where it could be seen: where the move is not small against the support, nor against what the image resolves
+there, the finer of its pixels and its samples.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.kernels import Kernel
+
+ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
+LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow
+OFF = 2  # eps of its distance from the eye that a view coordinate may be off
+SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
+MIN_STEP = 16  # eps of its depth that a sample must be away from the next
+RANGE = 0.4  # power of the largest number that lengths may reach, so that products of two and their quotients stay finite
+MAX_SHELL_BITS = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
+
+
+def longest(dtype: Any) -> float:
+    """Largest length that can be rendered; the least is its inverse."""
+    return float(jnp.finfo(dtype).max) ** RANGE
+
+
+def lift_of_sizes(kernel: Kernel) -> int:
+    """Binary digits that sizes are lifted by, the root of what strengths are lifted by."""
+    return -(-LIFT // kernel.degree)
+
+
+def weakest(kernel: Kernel, dtype: Any) -> float:
+    r"""Least strength, as a share of the largest, of a particle that is seen right up to its edge.
+
+    Where $1 - q = \delta$ a weight is about $\delta^k$ times the strength, with k the kernel's order there. It must be a normal
+    number at $\delta$ = 2^-MAX_SHELL_BITS.
+    """
+    lift = kernel.degree * lift_of_sizes(kernel)
+    return 2.0 ** (int(jnp.finfo(dtype).minexp) + kernel.edge * MAX_SHELL_BITS - lift)
+
+
+def too_fine(camera: Camera, samples: int) -> Bool[Array, ""]:
+    """Whether neighbouring samples have (nearly) the same depth, or depths leave the range of lengths."""
+    near, far = camera.near, camera.far
+    limit = longest(near.dtype)
+    if camera.is_perspective:
+        step, bad = jnp.log(far / near) / samples, (near < 1 / limit) | (far > limit)
+    else:
+        largest = jnp.maximum(jnp.abs(near), jnp.abs(far))
+        step, bad = (far - near) / (samples * largest), (largest < 1 / limit) | (largest > limit)
+    return bad | (step < MIN_STEP * jnp.finfo(near.dtype).eps)
+
+
+def unresolved(
+    view: Float[Array, "particles 3"],
+    distance: Float[Array, " particles"],
+    support: Float[Array, " particles"],
+    camera: Camera,
+    depths: Float[Array, " samples"],
+) -> Bool[Array, " particles"]:
+    """Particles in view whose rounding could be seen, or whose lengths cannot be computed with."""
+    dtype = view.dtype
+    near, far, samples = camera.near.astype(dtype), camera.far.astype(dtype), depths.shape[0]
+    half = camera.half_height.astype(dtype) * jnp.asarray([camera.width / camera.height, 1], dtype)
+    depth = jnp.clip(view[:, 2], near, far) if camera.is_perspective else jnp.ones_like(support)
+    step = depth * jnp.log(far / near) / samples if camera.is_perspective else (far - near) / samples
+    pixel = depth * (2 * half[1] / camera.height)
+    in_view = (jnp.abs(view[:, :2]) <= 2 * (support[:, None] + depth[:, None] * half)).all(1)
+    moved = OFF * jnp.finfo(dtype).eps * distance > SHARE * jnp.maximum(support, jnp.minimum(pixel, step))
+    around = jnp.maximum(distance, jnp.maximum(jnp.abs(near), jnp.abs(far)))
+    beyond = jnp.maximum(around, support) > longest(dtype)
+    return (in_view & (moved | (support < around / longest(dtype)))) | beyond

@@ -1,0 +1,164 @@
+r"""Particles as a camera sees them: view coordinates, strengths, and the pixels that each can touch.
+
+Flow: particles -> [view] -> plan, ordering -> lists -> cells -> cast -> image.
+
+All that is asked of a single particle, whatever the others are: capacities are counted from it, and then it is ranked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.footprint import pixel_ranges
+from jaxsph.engine.access.resolution import ROUNDING, lift_of_sizes, unresolved, weakest
+from jaxsph.model import kernels
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles import Particles
+from jaxsph.numerics import exponents, faults
+
+DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
+DEAD_CLASS = 255
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """Particles in view space; those that no sample can meet are not `live`, and their numbers are 0.
+
+    Attributes:
+        x, y, z: view coordinates, length units.
+        reach: the support widened by the rounding of coordinates: what lies outside has weight zero in floating point.
+        scale, size: the particle's strength m = V / H^3, of which the largest is 2^LIFT, folded into its lengths:
+            `size = m^(1/n)` and `scale = size / H`, with n the degree of its kernel.
+        quantity: that is carried; of two, that of colours.
+        live: whether any sample can meet the particle.
+        left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
+            `left > right` or `top > bottom`.
+        extinction_quantity: the second that is carried; None where there is one alone.
+    """
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    reach: Float[Array, " particles"]
+    scale: Float[Array, " particles"]
+    size: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+    live: Bool[Array, " particles"]
+    left: Int[Array, " particles"]
+    right: Int[Array, " particles"]
+    top: Int[Array, " particles"]
+    bottom: Int[Array, " particles"]
+    extinction_quantity: Float[Array, " particles"] | None = dataclasses.field(default=None, kw_only=True)
+
+    @property
+    def quantities(self) -> tuple[Float[Array, " particles"], ...]:
+        """One or two."""
+        return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
+
+
+@dataclasses.dataclass(frozen=True)
+class Viewed(Columns):
+    """Particles in their own order.
+
+    Attributes:
+        key: class of support above depth, what they are ranked by.
+        widest: largest reach of each class.
+        faults: fault word.
+    """
+
+    key: Int[Array, " particles"]
+    widest: Float[Array, " classes"]
+    faults: Int[Array, ""]
+
+
+def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int) -> Viewed:
+    """See `particles` from `camera`, with samples at `depths` (ascending).
+
+    Differentiation:
+        The columns x, y, z, scale, size and quantities have derivatives; all else is held fixed.
+    """
+    offset = camera.offset(particles.position, particles.position_rest)
+    view = camera.rotate(offset)
+    x, y, z = view[:, 0], view[:, 1], view[:, 2]
+    finite = functools.reduce(jnp.logical_and, map(jnp.isfinite, particles.quantities), jnp.isfinite(view).all(1))
+    usable = finite & (particles.support > 0) & jnp.isfinite(particles.support)
+    usable &= (particles.volume >= 0) & jnp.isfinite(particles.volume)
+    eps = jnp.finfo(view.dtype).eps * ROUNDING
+    distance = jnp.abs(offset).max(1)
+    reach = lax.stop_gradient(particles.support * (1 + eps) + eps * distance)
+    live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
+
+    octave, widest = _classes(reach, live, num_classes)
+    scale, size, vanishes = _folded(particles, live)
+    columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size}
+    columns |= dict(zip(("quantity", "extinction_quantity"), particles.quantities, strict=False))
+    columns = {name: jnp.where(live, column, 0) for name, column in columns.items()}
+    blurred = unresolved(view, distance, particles.support, camera, depths)
+    word = faults.raised(faults.BAD_PARTICLES, particles.valid & ~usable)
+    word |= faults.raised(faults.UNRESOLVED, live & blurred) | faults.raised(faults.WEAK_PARTICLES, vanishes)
+    x, y, z = (lax.stop_gradient(columns[name]) for name in "xyz")
+    still, between = lax.stop_gradient(camera), (depths[0], depths[-1])
+    left, right, top, bottom = pixel_ranges(x, y, z, reach, live, still, between)
+    return Viewed(
+        **columns,
+        reach=reach,
+        live=live,
+        left=left,
+        right=right,
+        top=top,
+        bottom=bottom,
+        key=(octave << DEPTH_BITS) | depth_key(camera, z),
+        widest=widest,
+        faults=jnp.bitwise_or.reduce(word),
+    )
+
+
+def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
+    """Depth as an integer of `DEPTH_BITS` bits, uniform in sample space, clamped at near and far."""
+    z = jnp.clip(z, camera.near, camera.far)
+    if camera.is_perspective:
+        part = jnp.log(z / camera.near) / jnp.log(camera.far / camera.near)
+    else:
+        part = (z - camera.near) / (camera.far - camera.near)
+    part = jnp.clip(part.astype(jnp.float32), 0, 1)
+    return jnp.minimum(part * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
+
+
+def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
+    """The class of each particle, by octaves below the largest reach, and the largest reach of each class."""
+    largest = jnp.where(live, reach, 0).max(initial=0)
+    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
+    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
+    each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
+    return octave, jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
+
+
+def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:
+    """`scale` and `size` of every particle, and which are so weak that they would vanish.
+
+    CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32. What
+    all of them are divided by changes nothing, and carries no gradient; nor does a strength of 0.
+    """
+    support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
+    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
+    mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
+    counts = live & (large > 0)
+    lowest = jnp.iinfo(jnp.int32).min
+    exponent -= jnp.where(counts, exponent, lowest).max(initial=lowest // 2)
+    strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
+    peak = lax.stop_gradient(strength.max(initial=0))
+    strength = strength / jnp.where(peak > 0, peak, 1)
+    kernel = kernels.by_name(particles.kernel)
+    lift = 2.0 ** lift_of_sizes(kernel)
+    size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
+    weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & exponents.is_subnormal(volume))
+    return size / support, size, weak
+
+
+jax.tree_util.register_dataclass(Viewed, data_fields=[field.name for field in dataclasses.fields(Viewed)], meta_fields=[])

@@ -1,0 +1,341 @@
+r"""The march as a function that can be differentiated either way.
+
+Flow: schedule -> [adjoint: march] -> image; cotangents of the image -> [adjoint: replay -> integrator -> media] -> cotangents.
+
+Forward, derivatives are those of the march itself. Backward, the slabs are marched again, a batch at a time: what media gather
+and the light are held, the cotangents of each slab follow from the rays before and behind it (`replay`), and are pulled through
+the integrator by `jax.vjp` and through each medium by `Medium.pull`. So neither needs an adjoint of its own, but where a gather
+is worth one; and memory is that of the march, whatever the number of samples or of particles in a cell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.cast.batches import Batches, CastPlan, batches_of, with_room
+from jaxsph.engine.cast.composite import Together
+from jaxsph.engine.cast.integrator import Integrator, Optics
+from jaxsph.engine.cast.march import RayResult, march
+from jaxsph.engine.cast.replay import ReplayState, fresh_replay, pull_composite
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.field.tasks import RayPackets, SlabTask
+from jaxsph.engine.field.transposed import COLUMNS
+from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.media.mixture import Mixture
+from jaxsph.engine.media.particles import ParticleMedium, Wanted
+from jaxsph.engine.media.within import Within
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.medium import Medium
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.fusion import barriers, fusion_barrier
+from jaxsph.numerics.transposed import forward_only, linear_map
+
+TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
+KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
+Layers = tuple[Array, Array]  # colour and transmittance of an image, or their cotangents
+
+
+@dataclasses.dataclass(frozen=True)
+class CastMethod:
+    """How rays are cast, static: by which kernel, sizes, integrator and mixing of media, and through which packets of rays."""
+
+    kernel: str
+    plan: CastPlan
+    integrator: Integrator
+    packets_of: Callable[..., RayPackets]
+    mix: str = "extinction"
+
+    def packets(self, grid: Grid, camera: Camera, chosen: Any) -> RayPackets:
+        """Of a grid and a camera, and of what was chosen if anything was."""
+        return self.packets_of(grid, camera) if chosen is None else self.packets_of(grid, camera, chosen)
+
+
+@dataclasses.dataclass(frozen=True)
+class DiffInputs:
+    """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any.
+
+    `within` is where particles are shown, None everywhere; other media are so by themselves.
+    """
+
+    columns: dict[str, Float[Array, " particles"]]
+    half_steps: Float[Array, " two_samples_and_one"]
+    half_height: Float[Array, ""]
+    transfer: TransferFunction | None
+    media: tuple[Medium, ...]
+    within: Clip | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class NonDiffInputs:
+    """What is held fixed: which particles and samples meet, and how they are sampled."""
+
+    grid: Grid
+    schedule: SlabSchedule
+    camera: Camera
+    lattice: Lattice | None
+    chosen: Any
+    min_transmittance: Float[Array, ""] | None
+    tolerance: Float[Array, ""] | None
+
+
+def cast(
+    grid: Grid,
+    schedule: SlabSchedule,
+    camera: Camera,
+    transfer: TransferFunction | None,
+    media: tuple[Medium, ...],
+    method: CastMethod,
+    lattice: Lattice | None = None,
+    chosen: Any = None,
+    min_transmittance: Float[Array, ""] | None = None,
+    tolerance: Float[Array, ""] | None = None,
+    within: Clip | None = None,
+) -> RayResult:
+    """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
+
+    Differentiation:
+        Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
+        by the transfer function and by what other media are made of. Lists, windows, levels and the references of sums are
+        held fixed; `depth` has none.
+
+    Raises:
+        NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
+            elsewhere; when differentiated twice; and in reverse mode, of integrators that are `forward_only`.
+    """
+    given = {name: getattr(grid.ordered, name) for name in COLUMNS}
+    columns = {name: column for name, column in given.items() if column is not None}
+    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
+    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, min_transmittance, tolerance)
+    return _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
+    return _march(method, inputs, fixed)
+
+
+def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
+    grid, camera = _seen(inputs, fixed)
+    with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
+        medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
+        packets = method.packets(grid, camera, fixed.chosen)
+        how = medium, method.integrator, method.plan, camera.is_perspective, fixed.min_transmittance, fixed.tolerance
+        return march(grid, fixed.schedule, packets, *how)
+
+
+def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
+    ordered = dataclasses.replace(fixed.grid.ordered, **inputs.columns)
+    grid = dataclasses.replace(fixed.grid, ordered=ordered, half_steps=inputs.half_steps)
+    return grid, dataclasses.replace(fixed.camera, half_height=inputs.half_height)
+
+
+def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
+    """All media, particles first if there are any."""
+    grid, _ = _seen(inputs, fixed)
+    between = method.integrator.between
+    media = tuple(medium.in_band(grid).for_means() if between else medium.in_band(grid) for medium in inputs.media)
+    if inputs.transfer is None:
+        return media
+    segments = tuple(part.segments() for part in inputs.transfer.parts())
+    tables = tuple(map(MeanTables.of, segments)) if between else None
+    return Within.of(ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), inputs.within), *media
+
+
+def _moved(
+    method: CastMethod, primals: tuple[DiffInputs, NonDiffInputs], tangents: tuple[DiffInputs, NonDiffInputs]
+) -> tuple[RayResult, RayResult]:
+    """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
+    inputs, fixed = primals
+    found = _cast(method, inputs, fixed)
+    color, transmittance = (checkpoint_name(layer, KEPT) for layer in (found.color, found.transmittance))
+    found = dataclasses.replace(found, color=color, transmittance=transmittance)
+    still = jax.tree.map(jnp.zeros_like, found)
+    leaves, structure = jax.tree.flatten(inputs)
+    moves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
+    moving = [i for i, move in enumerate(moves) if not _is_zero(move)]
+    if not moving:
+        return found, still
+    _require_values(fixed)
+    wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
+
+    def push(moves: list[Array]) -> Layers:
+        def light(parts: list[Array]) -> Layers:
+            there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
+            rays = _march(method, jax.tree.unflatten(structure, there), fixed)
+            return rays.color, rays.transmittance
+
+        return jax.jvp(light, ([leaves[i] for i in moving],), (moves,))[1]
+
+    def pull(cotangent: Layers) -> list[Array]:
+        cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, (found.color, found.transmittance), cotangent))
+        return [cotangents[i] for i in moving]
+
+    like, why = (found.color, found.transmittance), method.integrator.forward_only
+    if why is not None:
+        color, transmittance = forward_only(push([moves[i] for i in moving]), why)
+        return found, dataclasses.replace(still, color=color, transmittance=transmittance)
+    color, transmittance = linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE)
+    return found, dataclasses.replace(still, color=color, transmittance=transmittance)
+
+
+_cast.defjvp(_moved, symbolic_zeros=True)
+
+
+def _is_zero(move: Any) -> bool:
+    return isinstance(move, SymbolicZero)
+
+
+def _moves(part: Any) -> bool:
+    return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
+
+
+def _require_values(fixed: NonDiffInputs) -> None:
+    """Raise where values come from elsewhere, so that their derivatives would be missing."""
+    if fixed.schedule.paint is not None:
+        raise NotImplementedError(
+            "an image with super-pixels has no derivatives, as their colours come from bounds; "
+            "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
+        )
+    if fixed.tolerance is not None:
+        raise NotImplementedError(
+            "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
+            "as it needs"
+        )
+    if fixed.lattice is not None:
+        raise NotImplementedError(
+            "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Accumulated:
+    """Cotangents added up over slabs.
+
+    Attributes:
+        medium: of all that is met, see `Medium.no_cotangents`.
+        half_steps: of the depths of samples and borders.
+        factor: of a common factor of all ray coordinates.
+    """
+
+    medium: Any
+    half_steps: Float[Array, " two_samples_and_more"]
+    factor: Float[Array, ""]
+
+
+def _pull(
+    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
+) -> DiffInputs:
+    """Cotangents of `inputs`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
+    plan = method.plan.of_shard(2)  # as twice as much is held of each slab
+    grid, camera = _seen(inputs, fixed)
+    packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
+    integrator = method.integrator
+    how = camera.is_perspective, bool(integrator.halo), fixed.min_transmittance, integrator.between
+    batches = batches_of(grid, fixed.schedule, packets, plan, *how)
+    dtype = grid.half_steps.dtype
+    medium = Mixture.of(media, method.mix)
+    start = Accumulated(medium.no_cotangents(), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
+    with barriers(plan.tuning.fusion_barriers):
+        found = _Backward(batches, medium, method.integrator, wanted.field).pull(image, cotangent, start)
+    of_media = found.medium if len(media) > 1 else (found.medium,)
+    columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, of_media
+    within = jax.tree.map(jnp.zeros_like, inputs.within)
+    if inputs.transfer is not None:
+        particles, *others = of_media
+        if inputs.within is not None:
+            particles, within = particles.medium, particles.clip
+        found_columns, transfer = particles.columns(), particles.of_transfer()
+        columns = {name: found_columns[name] for name in columns}
+    pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
+    half_height = found.factor / camera.half_height.astype(dtype)
+    (half_steps,) = pull_room(found.half_steps)
+    total = DiffInputs(columns, half_steps, half_height, transfer, tuple(others), within)
+    return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Backward:
+    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are, too."""
+
+    batches: Batches
+    medium: Medium
+    integrator: Integrator
+    geometry: bool
+
+    def pull(self, image: Layers, cotangent: Layers, start: Accumulated) -> Accumulated:
+        """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
+        batches, items = self.batches, jnp.zeros(self.batches.plan.chunk, jnp.int32)
+        together = Together.of(batches.num_packets, batches.plan.tuning)
+        light, gathered = jax.tree.map(
+            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.march, items)
+        )
+        light = (*light[:3], jnp.ones_like(light[3]))
+
+        def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
+            rays, held, total = carry
+            batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
+
+            def march_chunk(chunk: Array, held: Any) -> Any:
+                items, begin = batches.chunk(batch, chunk)
+                put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
+                return jax.tree.map(put, held, self.march(items))
+
+            light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
+            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together)
+
+            def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
+                items, begin = batches.chunk(batch, chunk)
+                here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
+                return self.pull_slabs(items, here, lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1), total)
+
+            return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+
+        rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
+        return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
+
+    def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
+        """Red, green, blue and transmittance of slabs, and what their medium gathers there."""
+        task = self.batches.task(items)
+        gathered = self.medium.gather(task)
+        light = self.integrator(self.medium, gathered, task)
+        return (*light.color, light.transmittance), gathered
+
+    def pull_slabs(self, items: Array, gathered: Any, of_slabs: Float[Array, "4 tasks rays"], total: Accumulated) -> Accumulated:
+        """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
+        task = self.batches.task(items)
+        through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
+        of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
+        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics)
+        if not self.geometry:
+            return dataclasses.replace(total, medium=of_medium)
+
+        def path(border: Array, factor: Array) -> Array:
+            return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
+
+        of_border, factor = jax.vjp(path, task.border, jnp.ones_like(places.factor))[1](of_path)
+        pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
+        (of_half_steps,) = pull_depths((places.depth, places.border + of_border))
+        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + places.factor + factor)
+
+    def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
+        """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
+        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.met(gathered, task), task.path())
+        of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
+        return of_optics, of_path
+
+
+for _kind in (DiffInputs, NonDiffInputs, Accumulated):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

@@ -1,0 +1,198 @@
+"""Front to back: the light of slabs put into the state of rays, Hochstetter et al. 2016, equation 3.
+
+Flow: integrator -> [composite] -> image.
+
+A slab that emits colour C and lets through t, both as seen from right in front of it, adds T C to a ray and leaves it T t.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxsph.engine.cast.batches import Batch
+from jaxsph.engine.cast.integrator import Segment
+from jaxsph.engine.cast.samples import transmitted
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.numerics.fusion import fusion_barrier
+
+Carry = TypeVar("Carry")
+
+
+@dataclasses.dataclass(frozen=True)
+class Together:
+    """What is composited together.
+
+    Attributes:
+        packets: of a layer.
+        half_depths: packets among them whose half depths are found together.
+        whole: whether that is all of any layer.
+    """
+
+    packets: int
+    half_depths: int
+    whole: bool
+
+    @classmethod
+    def of(cls, packets: int, tuning: Tuning) -> Together:
+        """No more than there are."""
+        together = min(tuning.bundles_composited, packets)
+        return cls(together, min(tuning.half_depths_found, together), together == packets)
+
+
+@dataclasses.dataclass(frozen=True)
+class RayState:
+    """Rays of packets in order of height, and room for as many as are composited together past the last.
+
+    Attributes:
+        color: red, green and blue met so far, premultiplied.
+        transmittance: of all that was met so far.
+        depth: where that fell to one half, infinite where it has not.
+        square: sum of the squared errors that slabs are estimated to have, as they are seen; None where none are.
+    """
+
+    color: tuple[Float[Array, "packets rays"], ...]
+    transmittance: Float[Array, "packets rays"]
+    depth: Float[Array, "packets rays"]
+    square: Float[Array, "packets rays"] | None = None
+
+
+def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False) -> Segment:
+    """Slabs with nothing in them; `estimated`: and with no error."""
+    red, green, blue, error = (jnp.zeros((slots, rays), dtype) for _ in range(4))
+    through, thickness = jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype)
+    return Segment((red, green, blue), through, thickness, error if estimated else None)
+
+
+def fresh_rays(packets: int, rays: int, dtype: Any, together: Together, estimated: bool = False) -> RayState:
+    """Rays that have met nothing."""
+    room = packets + together.packets, rays
+    red, green, blue, square, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 0, 1, jnp.inf))
+    return RayState((red, green, blue), transmittance, depth, square if estimated else None)
+
+
+def over_layers(
+    put: Callable[[Carry, Array, Array, Array], Carry],
+    carry: Carry,
+    starts: Int[Array, " layers_and_one"],
+    batch: Batch,
+    together: Together,
+) -> Carry:
+    """Take all slabs of a batch front to back, some of a layer of the compacted slabs at a time.
+
+    Args:
+        put: `put(carry, place, inside, packet)`: places in the batch, whether each is of the layer, and the packet of the first;
+            packets follow one another.
+        starts: where the layers of the compacted slabs begin.
+    """
+
+    def put_layer(layer: Array, carry: Carry) -> Carry:
+        begin = jnp.maximum(starts[layer] - batch.first, 0)
+        past = jnp.minimum(starts[layer + 1] - batch.first, batch.number)
+        packet = batch.first + begin - starts[layer]
+
+        def put_some(nth: Array, carry: Carry) -> Carry:
+            place = begin + nth * together.packets + jnp.arange(together.packets, dtype=jnp.int32)
+            inside = place < past
+            return put(carry, jnp.where(inside, place, 0), inside, packet + nth * together.packets)
+
+        if together.whole:
+            return put_some(jnp.int32(0), carry)
+        return lax.fori_loop(0, (past - begin + together.packets - 1) // together.packets, put_some, carry)
+
+    top = (starts <= batch.first).sum(dtype=jnp.int32) - 1
+    bottom = (starts < batch.first + batch.number).sum(dtype=jnp.int32)
+    return lax.fori_loop(top, bottom, put_layer, carry)
+
+
+def composite(
+    state: RayState,
+    light: Segment,
+    batch: Batch,
+    borders: Callable[[Array], Array],
+    starts: Int[Array, " layers_and_one"],
+    together: Together,
+) -> RayState:
+    """Put the light of a batch into the rays, whose packets are in order of height.
+
+    Args:
+        light: of the slabs of the batch by slot, and of nothing at the end.
+        borders: of places in the batch, the depths of the borders of their samples.
+        starts: where the layers of the compacted slabs begin.
+    """
+    nothing = light.transmittance.shape[0] - 1
+
+    def put(state: RayState, place: Array, inside: Array, packet: Array) -> RayState:
+        slot = jnp.where(inside, batch.slot[place], nothing)
+        # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
+        rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
+        rays = _behind(rays, light, slot, borders(place), together.half_depths)
+        return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, 0), state, rays)
+
+    return over_layers(put, state, starts, batch, together)
+
+
+def rows(state: Any, first: Array, number: int) -> Any:
+    """Some rows of arrays whose last but one axis is packets, or slabs."""
+    return jax.tree.map(lambda field: lax.dynamic_slice_in_dim(field, first, number, field.ndim - 2), state)
+
+
+def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_depths: int) -> RayState:
+    """Rays behind one more slab each."""
+    emitted, left = [channel[slot] for channel in light.color], light.transmittance[slot]
+    behind = rays.transmittance * left
+    crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
+    depth = _with_half_depth(rays, crossed, light.thickness, slot, border, half_depths)
+    color = tuple(color + rays.transmittance * added for color, added in zip(rays.color, emitted, strict=True))
+    square = rays.square
+    if square is not None and light.error is not None:
+        square = square + (rays.transmittance * light.error[slot]) ** 2
+    return RayState(color, behind, depth, square)
+
+
+def _with_half_depth(
+    rays: RayState, crossed: Array, thickness: Array, slot: Array, border: Array, together: int
+) -> Float[Array, "packets rays"]:
+    """`depth` of rays, found for a few packets at a time of those where any ray has crossed one half: others cost nothing."""
+    number = crossed.shape[0]
+    if together >= number:
+        return _half_depth(rays.depth, crossed, rays.transmittance, thickness, slot, border)
+    some = crossed.any(1)
+    packets = lax.sort(jnp.where(some, jnp.arange(number, dtype=jnp.int32), number))
+
+    def find_some(nth: Array, depth: Array) -> Array:
+        packet = lax.dynamic_slice_in_dim(packets, nth * together, together)
+        here = jnp.minimum(packet, number - 1)
+        of_rays = [value[here] for value in (depth, crossed, rays.transmittance)]
+        found = fusion_barrier(nth >= 0, _half_depth, *of_rays, thickness, slot[here], border[here])
+        return depth.at[packet].set(found, mode="drop")
+
+    return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + together - 1) // together, find_some, rays.depth)
+
+
+def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, slot: Array, border: Array) -> Array:
+    """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they have not `crossed` it.
+
+    Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
+    """
+    thickness = thickness[slot]
+    left, reached = transmitted(thickness), transmittance
+    for k in range(thickness.shape[1]):
+        behind = transmittance * left[:, k]
+        start, end = border[:, k, None], border[:, k + 1, None]
+        filled = thickness[:, k] > 0
+        share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
+        here = crossed & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
+        depth = jnp.where(here, start + jnp.minimum(share, 1) * (end - start), depth)
+        crossed = crossed & ~here
+        reached = behind
+    return depth
+
+
+jax.tree_util.register_dataclass(RayState, data_fields=["color", "transmittance", "depth", "square"], meta_fields=[])

@@ -1,0 +1,144 @@
+"""Marching: from schedule and media to what all rays have met.
+
+Flow: schedule, packets -> batches -> [march: media -> integrator -> composite] -> screen.
+
+What a slab of samples does to light does not depend on what lies in front of it. So a batch of slabs is marched in any order,
+chunk by chunk; what they emit and absorb is held, and then put into the rays' state layer by layer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.cast.batches import Batches, CastPlan, batches_of
+from jaxsph.engine.cast.composite import RayState, Together, composite, empty_segments, fresh_rays
+from jaxsph.engine.cast.integrator import Integrator, Segment
+from jaxsph.engine.cast.refine import CAUTION, errors_seen, refine, shares_of
+from jaxsph.engine.field.schedule import SlabSchedule, evaluations_of_slabs
+from jaxsph.engine.field.tasks import RayPackets
+from jaxsph.model.medium import Medium
+
+
+@dataclasses.dataclass(frozen=True)
+class RayResult:
+    """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance.
+
+    `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
+    ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
+    `cut` is how many slabs they left out, whatever those would have taken.
+    """
+
+    color: Float[Array, "3 packets rows columns"]
+    transmittance: Float[Array, "packets rows columns"]
+    depth: Float[Array, "packets rows columns"]
+    left_out: Float[Array, " packets"] | None = None
+    error: Float[Array, "packets rows columns"] | None = None
+    refined: Float[Array, " packets"] | None = None
+    cut: Float[Array, " packets"] | None = None
+
+
+class Marched(NamedTuple):
+    """What is known between batches.
+
+    Attributes:
+        rays: what they have met.
+        light: of the slabs of the last batch, by slot.
+        left_out: what rays that ended would have taken, and how many slabs that is; None where none can end.
+        refined: what marching slabs again took; None where none are.
+    """
+
+    rays: RayState
+    light: Segment
+    left_out: tuple[Array, Array] | None
+    refined: Array | None
+
+
+def march(
+    grid: Grid,
+    schedule: SlabSchedule,
+    packets: RayPackets,
+    medium: Medium,
+    integrator: Integrator,
+    plan: CastPlan,
+    perspective: bool,
+    min_transmittance: Float[Array, ""] | None = None,
+    tolerance: Float[Array, ""] | None = None,
+) -> RayResult:
+    """March all packets of a band.
+
+    Args:
+        schedule: the slabs of samples to march, by bundle.
+        min_transmittance: packets all of whose rays let less through end, between batches; None for none.
+        tolerance: what slabs are refined for, where the plan has room for that; None where they are not.
+    """
+    batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
+    together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
+    refining = tolerance is not None
+    spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples, integrator.halo) if ending else None
+    starts = batches.compacted.start
+
+    def light_of(items: Array, parts: int = 1) -> Segment:
+        return segments_of(batches, items, medium, integrator, parts, refining)
+
+    def march_batch(nth: Array, state: Marched) -> Marched:
+        rays, light, left_out, refined = state
+        batch = batches.batch(nth, batches.ended(rays.transmittance))
+        if spent is not None and left_out is not None:
+            left_out = left_out[0] + batches.left_out(batch, spent), left_out[1] + batches.left_out(batch, jnp.ones_like(spent))
+
+        def march_chunk(chunk: Array, light: Segment) -> Segment:
+            items, begin = batches.chunk(batch, chunk)
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, light_of(items))
+
+        def borders(place: Array) -> Array:
+            return batches.borders(batch.items[place])
+
+        def seen(light: Segment) -> Array:
+            return errors_seen(batch, light, rays.transmittance, starts, together)
+
+        light = lax.fori_loop(0, batch.chunks, march_chunk, light)
+        if tolerance is not None and refined is not None:
+            light, refined = refine(batches, batch, light, refined, seen, shares_of(batches, tolerance), light_of)
+        return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
+
+    dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
+    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining)
+    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining)
+    start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
+    found = lax.fori_loop(0, batches.number, march_batch, start)
+    left_out, cut = (None, None) if found.left_out is None else found.left_out
+    return dataclasses.replace(result_of(found.rays, batches), left_out=left_out, refined=found.refined, cut=cut)
+
+
+def segments_of(
+    batches: Batches, items: Array, medium: Medium, integrator: Integrator, parts: int = 1, compared: bool = False
+) -> Segment:
+    """What slabs emit and let through, with so many times as many samples; `compared`: and how wrong that may be."""
+    task = batches.task(items)
+    task = task if parts == 1 else task.refined(parts)
+    gathered = medium.gather(task)
+    if not compared:
+        return integrator(medium, gathered, task)
+    light = integrator.compared(medium, gathered, task)
+    tasks, samples, rays = light.thickness.shape
+    return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))
+
+
+def result_of(rays: RayState, batches: Batches) -> RayResult:
+    """Rays in the order of packets, as rows and columns."""
+    rank, shape = batches.compacted.bundle_rank, batches.packets.shape
+    *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
+    error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
+    return RayResult(jnp.stack(color), transmittance, depth, error=error)
+
+
+jax.tree_util.register_dataclass(
+    RayResult, data_fields=["color", "transmittance", "depth", "left_out", "error", "refined", "cut"], meta_fields=[]
+)

@@ -1,0 +1,114 @@
+"""Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
+
+Flow: slab windows -> probe -> [adapt: analysis -> levels -> merge] -> schedule -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, slab_windows_with_borders
+from jaxsph.engine.control.analysis import analyse
+from jaxsph.engine.control.levels import Offer, bound, choose
+from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels, uncoarsened
+from jaxsph.engine.control.ranges import tables_of_parts
+from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.transfer.function import TransferFunction
+
+EMPTY = -1  # what a cell without particles is given
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlPlan:
+    """Static choices of error control.
+
+    Attributes:
+        super_pixels: whether a cell may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
+        merge: whether coarse cells are merged along depth (6.2).
+        allocation: how a bundle's tolerance is shared among its cells, see `levels.choose`.
+        coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
+    """
+
+    super_pixels: bool
+    merge: bool
+    allocation: str
+    coverage_subdivisions: int = 2
+
+
+def adapt(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    references: tuple[Float[Array, "slabs bundles"], ...],
+    wanted: Bool[Array, "cells bundles"],
+    tolerance: Float[Array, ""],
+    relax: Float[Array, ""],
+    slab_samples: int,
+    plan: ControlPlan,
+    tuning: Tuning,
+) -> tuple[SlabSchedule, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
+    r"""Decide how every cell is sampled, at full rate all but the `wanted`; where none is, nothing is analysed.
+
+    Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
+    thicknesses, of which the exponential keeps less than that) and once a slab;
+    a colour once a slab, and by the samples of a slab and three more times its share. With n samples, S to a slab, that is
+    less than (n + 2 n / S + S + 4) eps / 2 a pixel, thus (n + S) eps, and twice that for two images. Only where all cells
+    stay at level 0 are the images the same bits.
+
+    Returns:
+        The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
+        each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
+    """
+    cells = grid.windows
+    bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
+    num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
+    tables = tables_of_parts(transfer)
+    whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
+    empty = _nowhere(cells, num_cells, slab_samples)
+
+    def decide() -> tuple[SlabSchedule, Array, Array]:
+        windows = coarser_windows(cells, slab_samples)
+        costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
+        full = next(cost for cost in costs if cost is not None)
+        saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
+        on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
+        rounding = 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * ((~empty).sum(0) + 1)).astype(dtype)
+        offer = Offer(saving, on_offer & ~empty & whole, rounding)
+        beside = slab_windows_with_borders(grid.ordered, grid.lists)
+        sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
+        analysis = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
+        chosen = choose(analysis, offer, tolerance, plan.allocation)
+        free = _nowhere(beside, num_cells, slab_samples)
+        final = merged_levels(chosen, free & whole, slab_samples)
+        largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
+        paint = analysis.paint if plan.super_pixels else None
+        return coarse_schedule(windows, final, references, paint, slab_samples), largest, final
+
+    def leave() -> tuple[SlabSchedule, Array, Array]:
+        return (
+            uncoarsened(cells, references, plan.super_pixels),
+            jnp.zeros(bundles, dtype),
+            untouched(cells, slab_samples),
+        )
+
+    work, largest, final = lax.cond(wanted.any(), decide, leave)
+    return work, largest, jnp.where(empty, EMPTY, final)
+
+
+def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:
+    """Levels of cells that are all left at full rate."""
+    empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES), slab_samples)
+    return jnp.where(empty, jnp.int32(EMPTY), 0)
+
+
+def _nowhere(cells: SlabWindows, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
+    """Cells that no particle can touch."""
+    count = jnp.pad(cells.count, ((0, num_cells * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
+    return count.reshape(num_cells, -1, count.shape[1]).sum(1) == 0

@@ -1,0 +1,200 @@
+r"""What the samples of a bundle can see: certified bounds of the quantity and of the optics at every depth.
+
+Flow: cells -> [bounds] -> errors -> levels -> merge -> cast -> image.
+
+CSPH values are affine combinations of the quantities of the particles whose supports hold the sample, so the least and the
+greatest quantity among the particles whose spheres meet a *sample slab* (the footprint of the bundle, between two borders of
+fine samples) bound every sample in it, wherever it lies: fine ones, and coarse ones, which lie on the slab's border
+(Hochstetter et al. 2016, section 4.1, over the whole slab instead of at one depth). A slab is *covered* when each of its
+sub-rectangles lies inside the support of a single particle; in any other, a sample may be empty.
+
+Why the bounds hold in floating point: a sphere counts as meeting the slab with its `reach`, outside which computed weights are
+zero; it counts as holding a sub-rectangle with `2 H - reach`, inside of which the computed weight is positive, if the particle
+is `SOLID` enough for that not to underflow. Boxes are made of the very numbers that the cast multiplies, and rounding is
+monotone. Sums are taken of quantities relative to that of a particle near by: a quotient of two computed sums of n terms is
+off by less than (n + 6) eps of how far quantities are from that reference, and adding it rounds once more.
+
+Shapes, once: the last axis is bundles (times slabs of a cell), which vectorises.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.lists import BUNDLE
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.control.ranges import RangeTables, ranges_of_parts
+from jaxsph.engine.field.fetch import particle_at
+from jaxsph.numerics.fusion import fusion_barrier
+
+PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
+COVERERS = 96  # particles in the middle of a window, that is nearest in depth, among which coverage is sought
+SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
+
+
+@dataclasses.dataclass(frozen=True)
+class Footprint:
+    """Where a bundle's rays lie between two borders: ray coordinates ascend along the first axis."""
+
+    columns: Float[Array, "8 bundles"]
+    rows: Float[Array, "8 bundles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleBounds:
+    """Bounds over each sample slab, for all rays of a bundle.
+
+    Attributes:
+        touched: whether a particle meets the slab; if not, every sample in it is empty.
+        covered: whether no sample in it can be empty.
+        lo, hi: red, green, blue and extinction of samples that are not empty.
+    """
+
+    touched: Bool[Array, "samples bundles"]
+    covered: Bool[Array, "samples bundles"]
+    lo: list[Float[Array, "samples bundles"]]
+    hi: list[Float[Array, "samples bundles"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spheres:
+    """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities.
+
+    The latter are one array or two, see `access.view.Columns`.
+    """
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    outer: Float[Array, " particles"]
+    inner: Float[Array, " particles"]
+    quantities: tuple[Float[Array, " particles"], ...]
+
+
+def spheres(ordered: Ordered) -> Spheres:
+    """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive."""
+    outer = jnp.where(ordered.size > 0, 1 / ordered.reach, jnp.inf)
+    inner = 2 * ordered.size / jnp.where(ordered.scale > 0, ordered.scale, 1) - ordered.reach
+    solid = (ordered.size > SOLID * ordered.size.max(initial=0)) & (inner > 0)
+    inner = jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
+    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantities)
+
+
+def sample_bounds(
+    balls: Spheres,
+    rank: Int[Array, " pairs"],
+    window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
+    footprint: Footprint,
+    borders: Float[Array, "samples_and_one bundles"],
+    references: tuple[tuple[Float[Array, " bundles"], Float[Array, " bundles"]], ...],
+    tables: tuple[RangeTables, ...],
+    perspective: bool,
+    subdivisions: int,
+) -> SampleBounds:
+    """Bounds for the samples between `borders`, from the particles of a window.
+
+    Args:
+        references: of each quantity, the least and the greatest that the sums of these samples may be taken relative to.
+        tables: of the parts of the transfer function.
+        subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
+    """
+    lateral_scales = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
+    total = window[1].sum(0)
+    samples, bundles = borders.shape[0] - 1, borders.shape[1]
+    dtype = borders.dtype
+    box = _boxes(footprint.columns, lateral_scales, 1), _boxes(footprint.rows, lateral_scales, 1)
+    boxes = _boxes(footprint.columns, lateral_scales, subdivisions), _boxes(footprint.rows, lateral_scales, subdivisions)
+    sides = jnp.asarray([-1, 1], dtype)[:, None, None]
+    one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
+
+    def add_nearest(block: Array, outermost: tuple[Array, ...]) -> tuple[Array, ...]:
+        ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
+        near, near_depth = fusion_barrier(block >= 0, _nearest, ball, box, borders)
+        for k in range(PARTICLES):
+            meets = near[k] + near_depth[k] <= 1
+            ends = [jnp.where(meets, sides * quantity[k], -jnp.inf) for quantity in ball.quantities]
+            outermost = tuple(map(jnp.maximum, outermost, ends))
+        return outermost
+
+    def add_farthest(block: Array, farthest: Array) -> Array:
+        index = jnp.maximum(total // 2 - COVERERS // 2, 0) + block * PARTICLES + one_block
+        ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, index)
+        column, row, depth = fusion_barrier(block >= 0, _farthest, ball, boxes, borders)
+        for k in range(PARTICLES):
+            farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
+        return farthest
+
+    fullest = total.max()
+    outermost = (jnp.full((2, samples, bundles), -jnp.inf, dtype),) * len(balls.quantities)
+    outermost = lax.fori_loop(0, (fullest + PARTICLES - 1) // PARTICLES, add_nearest, outermost)
+    farthest = jnp.full((samples, subdivisions, subdivisions, bundles), jnp.inf, dtype)
+    enough = jnp.minimum(fullest, COVERERS)
+    farthest = lax.fori_loop(0, (enough + PARTICLES - 1) // PARTICLES, add_farthest, farthest)
+    touched = outermost[0][1] > -jnp.inf
+    quantities = [_rounded_range(touched, *both, total) for both in zip(outermost, references, strict=True)]
+    least, greatest = ranges_of_parts(tables, quantities)
+    return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
+
+
+def _rounded_range(touched: Array, outermost: Array, reference: tuple[Array, Array], terms: Array) -> tuple[Array, Array]:
+    """Least and greatest value that a computed mean can have, of minus the least and of the greatest quantity."""
+    lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
+    eps = jnp.finfo(lo.dtype).eps
+    farthest_off = jnp.maximum(jnp.maximum(hi - reference[0], reference[1] - lo), 0)
+    rounding = sum_rounding(terms, lo.dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
+    return lo - rounding, hi + rounding
+
+
+def sum_rounding(terms: Array, dtype: Any) -> Array:
+    """How far a computed mean of `terms` can be off, as a share of the largest."""
+    return (terms + 6) * jnp.finfo(dtype).eps
+
+
+def _boxes(rays: Array, lateral_scales: tuple[Array, Array], parts: int) -> tuple[Array, Array]:
+    """Least and greatest view coordinate of each part of the footprint, (parts, bundles)."""
+    first, last = rays[:: BUNDLE // parts], rays[BUNDLE // parts - 1 :: BUNDLE // parts]
+    return jnp.minimum(lateral_scales[0] * first, lateral_scales[1] * first), jnp.maximum(
+        lateral_scales[0] * last, lateral_scales[1] * last
+    )
+
+
+def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
+    """A block of particles of each bundle's windows; past the last they do not count."""
+    particle, inside = fusion_barrier(index[0, 0] >= 0, particle_at, rank, *window, index)
+    found = jax.tree.map(lambda column: column.at[particle].get(mode="promise_in_bounds"), balls)
+    outer, inner = (jnp.where(inside, inverse, jnp.inf) for inverse in (found.outer, found.inner))
+    return dataclasses.replace(found, outer=outer, inner=inner)
+
+
+def _nearest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, Array]:
+    """Squared distances, in outer radii, to the nearest points of slabs: across (particles, bundles) and along depth."""
+    (left, right), (bottom, top) = boxes
+    x = jnp.maximum(jnp.maximum(left - ball.x, ball.x - right), 0)
+    y = jnp.maximum(jnp.maximum(bottom - ball.y, ball.y - top), 0)
+    z = ball.z[:, None]
+    z = jnp.maximum(jnp.maximum(borders[:-1] - z, z - borders[1:]), 0)
+    return _square(x, ball.outer) + _square(y, ball.outer), _square(z, ball.outer[:, None])
+
+
+def _farthest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, ...]:
+    """Squared distances, in inner radii, to the farthest points of parts of slabs: across columns, rows, and along depth."""
+    places = [(ball.x, *boxes[0]), (ball.y, *boxes[1]), (ball.z, borders[:-1], borders[1:])]
+    inner = ball.inner[:, None]
+    column, row, depth = (_square(jnp.maximum(place[:, None] - low, high - place[:, None]), inner) for place, low, high in places)
+    return column, row, depth
+
+
+def _square(distance: Array, inverse: Array) -> Array:
+    """(distance / radius)^2, infinite where the particle does not count."""
+    share = distance * jnp.minimum(inverse, jnp.finfo(inverse.dtype).max)
+    return jnp.where(inverse < jnp.inf, share * share, jnp.inf)
+
+
+for _kind in (Footprint, SampleBounds, Spheres):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

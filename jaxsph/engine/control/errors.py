@@ -1,0 +1,208 @@
+r"""How much a cell's light can change when it is sampled more coarsely: Hochstetter et al. 2016, sections 4.2, 5, made additive.
+
+Flow: bounds -> [errors] -> levels -> merge -> cast -> image.
+
+Replace windows of fine samples by coarse ones, one window at a time, from the back to the front. What the reference lets
+through from in front of the window is at most F, and what arrives from behind is some colour B in [0, 1]. With
+$\bar c = \sum c_i \Delta T_i / (1 - T)$ the light that leaves the window is $\bar c (1 - T) + T B$, so against a coarse sample
+$(c, T')$ it changes by
+
+$$\left| \sum_i (c_i - c) \Delta T_i + (T - T')(B - c) \right|
+  \le \sum_i F_i (1 - e^{-\tau_i}) |c_i - c| + F |T - T'|,$$
+
+and $|T - T'| \le T_{max} (1 - e^{-|\tau - \tau'|})$. Changes of windows add up, so the change of a pixel is at most the sum over
+the cells of its bundle. A cell left at level 0 adds nothing, however much its rays differ: this is what the paper's relaxation
+removes without proof. A super-pixel is one more coarse sample, as long as the cell, whose colour and extinction are chosen from
+the bounds; alpha is the channel with c = 1 and B = alpha of what lies behind.
+
+The terms take upper bounds of $|c_i - c|$ and $|\kappa_i - \kappa|$ from `bounds`: a coarse sample lies on the border of its
+two middle slabs, so its optics lie in the ranges of both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
+from jaxsph.engine.control.bounds import SampleBounds
+
+LEVELS = MAX_LEVEL + 1
+SUPER_PIXEL = LEVELS  # the candidate after the last level
+CANDIDATES = LEVELS + 1
+EXPONENTIAL = 2  # eps that a computed transmittance may be off: 2 ulp of the exponential, 3 half ulp of its argument
+DEPTH_ROUNDING = 32  # eps that a sum of 16 optical thicknesses, each three roundings off, stays within
+EVALUATION = 512  # roundings, at most, between the bounds and an error; all terms are >= 0, so that they stay relative
+
+
+def fits(slab_samples: int) -> int:
+    """The level at which a cell is one slab; beyond it, cells are merged."""
+    return (CELL_SAMPLES // slab_samples).bit_length() - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class CellErrors:
+    """Of single cells, as seen from right in front of them.
+
+    Attributes:
+        error: for every candidate (levels 0 to 4, super-pixel), how much the light that leaves the cell can change;
+            ascends with the level.
+        strict: the same without relaxation.
+        paint: red, green, blue and extinction of the super-pixel.
+        tau_lo: least optical thickness.
+    """
+
+    error: Float[Array, "candidates bundles"]
+    strict: Float[Array, "candidates bundles"]
+    paint: Float[Array, "4 bundles"]
+    tau_lo: Float[Array, " bundles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Optics:
+    """Ranges of what the fine samples of a layer of cells are, and of the light that they take away."""
+
+    color: list[tuple[Array, Array]]
+    extinction: tuple[Array, Array]
+    steps: Array
+    tau_lo: Array
+    front: Array
+    absorbed_lo: Array
+    absorbed_hi: Array
+
+
+def cell_errors(
+    bounds: SampleBounds,
+    borders: Float[Array, "samples_and_one bundles"],
+    shortest: Float[Array, " bundles"],
+    longest: Float[Array, " bundles"],
+    merging: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
+    relax: Float[Array, ""],
+    *,
+    fitting: int,
+) -> CellErrors:
+    """Errors of all candidates of cells.
+
+    Args:
+        bounds: of the 16 sample slabs of each cell.
+        borders: depths of their borders.
+        shortest, longest: path length a unit of depth of the bundle's rays.
+        merging: by how much colour and extinction of a sample can be rounded otherwise when cells are merged.
+        relax: share of the lateral variation that is taken off (section 5.1), in cells that are nowhere partly empty; 0 for
+            a certificate.
+        fitting: level beyond which cells are merged.
+    """
+    optics = _optics(bounds, borders, shortest, longest)
+    outward = 1 + EVALUATION * jnp.finfo(borders.dtype).eps
+    paint, lateral = _super_pixel(optics, longest)
+
+    rounding = merging[0] * optics.absorbed_hi.sum(0) + merging[1] * optics.steps.sum(0) * longest
+    whole = (bounds.covered | ~bounds.touched).all(0)
+
+    def of_levels(share: Array) -> Array:
+        errors = [jnp.zeros_like(lateral)]
+        for level in range(1, LEVELS):
+            error = _coarser(level, optics, shortest, longest, share) + (rounding if level > fitting else 0)
+            errors.append(jnp.maximum(errors[-1], error))
+        return jnp.stack([*errors, lateral]) * outward
+
+    strict = of_levels(jnp.zeros_like(relax))
+    error = jnp.where(whole, lax.cond(relax > 0, of_levels, lambda _: strict, relax), strict)
+    return CellErrors(error, strict, paint, optics.tau_lo.sum(0))
+
+
+def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Array) -> _Optics:
+    steps = borders[1:] - borders[:-1]
+    extinction = jnp.where(bounds.covered, bounds.lo[3], 0), jnp.where(bounds.touched, bounds.hi[3], 0)
+    color = [_filled(lo, hi, bounds.touched) for lo, hi in zip(bounds.lo[:3], bounds.hi[:3], strict=True)]
+    rounding = DEPTH_ROUNDING * jnp.finfo(borders.dtype).eps
+    tau_lo, tau_hi = extinction[0] * steps * shortest * (1 - rounding), extinction[1] * steps * longest * (1 + rounding)
+    front_hi, front_lo = (jnp.exp(-_sum_in_front(depth)) for depth in (tau_lo, tau_hi))
+    absorbed_hi, absorbed_lo = front_hi * _opacity(tau_hi), front_lo * jnp.maximum(_opacity(tau_lo) - 2 * _rounding(tau_lo), 0)
+    return _Optics(color, extinction, steps, tau_lo, front_hi, absorbed_lo, absorbed_hi)
+
+
+def _filled(lo: Array, hi: Array, touched: Array) -> tuple[Array, Array]:
+    """An empty slab has no colour, and takes no light; let its range be that of the others, so that it never counts."""
+    lowest, highest = jnp.where(touched, lo, 1).min(0), jnp.where(touched, hi, 0).max(0)
+    return jnp.where(touched, lo, jnp.minimum(lowest, highest)), jnp.where(touched, hi, highest)
+
+
+def _sum_in_front(depth: Array) -> Array:
+    sums = [jnp.zeros_like(depth[0])]
+    for k in range(CELL_SAMPLES - 1):
+        sums.append(sums[-1] + depth[k])
+    return jnp.stack(sums)
+
+
+def _opacity(depth: Array) -> Array:
+    """At least 1 - exp(-depth), and by no more than its rounding: cheaper than `expm1`."""
+    return jnp.minimum(1 - jnp.exp(-depth) + _rounding(depth), depth)
+
+
+def _rounding(like: Array) -> Array:
+    """How far a computed transmittance may be off."""
+    return jnp.asarray(EXPONENTIAL * jnp.finfo(like.dtype).eps, like.dtype)
+
+
+def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax: Array) -> Array:
+    """Error of a cell sampled at `level`, seen from right in front of it."""
+    width = 1 << level
+    middle = slice(width // 2 - 1, width // 2 + 1)
+
+    def windows(value: Array) -> Array:
+        return value.reshape(CELL_SAMPLES // width, width, -1)
+
+    def deviation(lo: Array, hi: Array) -> Array:
+        """How far a fine sample can be from the coarse one, which lies in the ranges of both middle slabs.
+
+        The ranges may be disjoint only if the coarse sample is empty, when it may be given any colour.
+        """
+        lo, hi = windows(lo), windows(hi)
+        ends = lo[:, middle].max(1, keepdims=True), hi[:, middle].min(1, keepdims=True)
+        low, high = jnp.minimum(*ends), jnp.maximum(*ends)
+        strict = jnp.maximum(hi - low, high - lo)
+        union = jnp.maximum(hi.max(1, keepdims=True) - lo, hi - lo.min(1, keepdims=True))
+        return jnp.minimum(strict, jnp.maximum(union - relax * (hi - lo), 0))
+
+    steps, least = windows(optics.steps), windows(optics.extinction[0])
+    off = jnp.stack([(deviation(*channel) * windows(optics.absorbed_hi)).sum(1) for channel in optics.color]).max(0)
+    off_depth = (deviation(*optics.extinction) * steps).sum(1) * longest
+    coarse = least[:, middle].max(1) * steps.sum(1) * shortest * (1 - DEPTH_ROUNDING * jnp.finfo(steps.dtype).eps)
+    thinnest = jnp.minimum(windows(optics.tau_lo).sum(1), coarse)
+    lost = jnp.exp(-thinnest) * _opacity(off_depth)
+    rounding = (width + 1) * _rounding(steps) * (windows(optics.extinction[1]).max(1) > 0)
+    return (off + windows(optics.front)[:, 0] * (lost + rounding)).sum(0)
+
+
+def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
+    """The super-pixel that suits a cell best (section 5.2), and its error seen from right in front of it.
+
+    Its optical thickness is that of the middles of the samples' ranges, and its colour what the middles add up to: of the
+    colours' differences along depth only as much counts as the light that each sample takes is uncertain.
+    """
+    eps = jnp.finfo(optics.steps.dtype).eps
+    lo, hi = optics.extinction
+    depth = optics.steps.sum(0)
+    extinction = (0.5 * (lo + hi) * optics.steps).sum(0) / jnp.where(depth > 0, depth, 1)
+    off_depth = ((0.5 * (hi - lo) * optics.steps).sum(0) + DEPTH_ROUNDING * eps * extinction * depth) * longest
+    absorbed, unsure = 0.5 * (optics.absorbed_lo + optics.absorbed_hi), 0.5 * (optics.absorbed_hi - optics.absorbed_lo)
+    total = absorbed.sum(0)
+    paint, off = [], []
+    for lo, hi in optics.color:
+        middle = 0.5 * (lo + hi)
+        chosen = jnp.clip((middle * absorbed).sum(0) / jnp.where(total > 0, total, 1), 0, 1)
+        paint.append(chosen)
+        uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * absorbed)
+        off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.absorbed_hi + uneven).sum(0))
+    lost = jnp.exp(-optics.tau_lo.sum(0)) * _opacity(off_depth)
+    rounding = (CELL_SAMPLES + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
+    return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding
+
+
+for _kind in (CellErrors, _Optics):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

@@ -1,0 +1,107 @@
+r"""Which candidate every cell gets: as much work saved as the tolerance allows.
+
+Flow: errors -> [levels] -> merge -> cast -> image.
+
+Errors of cells add up (`errors`), so a bundle has a budget to spend: choose a candidate for each cell such that the errors'
+sum stays within the tolerance and the evaluations saved are most. The multiplier rule does that up to one cell: for a price
+$\lambda$, each cell takes what maximises saving $- \lambda$ error; the least price that keeps the tolerance is found by
+bisection. A smaller tolerance has a higher price, at which no cell takes more error: it never spends less.
+
+The paper's order (section 4.4) spends the budget back to front, each cell taking the highest level that still fits.
+
+Decisions carry no gradient.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.control.analysis import Analysis
+from jaxsph.engine.control.errors import CANDIDATES
+
+CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
+HALVINGS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Offer:
+    """What can be chosen for each cell.
+
+    Attributes:
+        saving: kernel evaluations a ray that a candidate saves against level 0.
+        allowed: whether it is on offer; level 0 always is.
+        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
+    """
+
+    saving: Float[Array, "candidates cells bundles"]
+    allowed: Bool[Array, "candidates cells bundles"]
+    rounding: Float[Array, " bundles"]
+
+
+def choose(analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str) -> Int[Array, "cells bundles"]:
+    """The candidate of every cell: level 0 to 4, or super-pixel.
+
+    Args:
+        analysis: errors of all candidates.
+        offer: what they save, and which can be had.
+        tolerance: largest error of a pixel.
+        allocation: `"budget"`, or `"greedy"` (back to front).
+    """
+    allowed = offer.allowed & (analysis.strict + offer.rounding <= tolerance)
+    error = jnp.where(allowed, analysis.error, jnp.inf).at[0].set(0)
+    if allocation == "greedy":
+        chosen = _back_to_front(offer.saving, error, tolerance - offer.rounding)
+    else:
+        chosen = _at_best_price(offer, error, tolerance)
+    return lax.stop_gradient(chosen)
+
+
+def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
+    """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
+    taken = error[0]
+    for candidate in range(1, CANDIDATES):
+        taken = jnp.where(chosen == candidate, error[candidate], taken)
+    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0)
+
+
+def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Array]:
+    """The candidate of most `saving - price * error`, the first of equals, and its error; none with an infinite error."""
+    best, taken, chosen = saving[0], error[0], jnp.zeros(saving.shape[1:], jnp.int32)
+    for candidate in range(1, CANDIDATES):
+        possible = error[candidate] < jnp.inf
+        net = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
+        better = possible & (net > best)
+        best, taken = jnp.where(better, net, best), jnp.where(better, error[candidate], taken)
+        chosen = jnp.where(better, candidate, chosen)
+    return chosen, taken
+
+
+def _at_best_price(offer: Offer, error: Array, tolerance: Array) -> Array:
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        keeps = _best(offer.saving, error, jnp.exp2(middle))[1].sum(0) + offer.rounding <= tolerance
+        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
+
+    low, high = (jnp.full_like(offer.rounding, end) for end in (CHEAPEST, DEAREST))
+    _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
+    chosen, taken = _best(offer.saving, error, jnp.exp2(high))
+    return jnp.where(taken.sum(0) + offer.rounding <= tolerance, chosen, 0)
+
+
+def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
+    def step(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
+        saving, error = cell
+        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
+        return left - taken, chosen
+
+    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
+    return lax.scan(step, left, cells, reverse=True)[1]
+
+
+jax.tree_util.register_dataclass(Offer, data_fields=["saving", "allowed", "rounding"], meta_fields=[])

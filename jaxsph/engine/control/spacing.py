@@ -1,0 +1,86 @@
+r"""Wider spaced samples in interpolated slabs: where light bends little along the rays, fewer samples tell as much.
+
+Flow: interpolation_error -> [spacing] -> schedule -> cast.
+
+Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
+for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean, and twice w also resolves a kink of g that much worse. The nodes
+of the lattice know g, thus their second differences along a ray, so that is known without any sample more. They are taken at
+the nodes only and the rays between may meet a kink that those miss: `DEVIATION_PER_BEND` times their root mean square is one
+deviation.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.control.knapsack import select_under_budget
+from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
+
+DEVIATION_PER_BEND = (
+    3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
+)
+MIN_DEVIATION = 8  # eps: what they differ by, at least
+
+
+def second_differences(
+    colors: list[list[Float[Array, " nodes"]]],
+    extinction: list[Float[Array, " nodes"]],
+    step: Float[Array, "fewer nodes"],
+    before: Float[Array, " nodes"],
+    previous: Float[Array, "4 nodes"],
+) -> tuple[Float[Array, " nodes"], Float[Array, "4 nodes"]]:
+    """How much the light of a slab bends at the nodes: sum over layers of the largest second difference times the step.
+
+    Args:
+        colors, extinction: at the layers of nodes of a slab and at the first of the next.
+        step: path length between layers.
+        before: optical thickness in front of the slab.
+        previous: what reaches the eye from a unit of length, of red, green, blue and as such, one layer before.
+
+    Returns:
+        The bend, and `previous` of the next slab.
+    """
+    light, behind = [], before
+    for k in range(len(extinction)):
+        seen = jnp.exp(-behind) * extinction[k]
+        light.append([*(seen * color[k] for color in colors), seen])
+        if k < step.shape[0]:
+            behind = behind + extinction[k] * step[k]
+    total, last = jnp.zeros_like(before), list(previous)
+    for here, after, length in zip(light, light[1:], step, strict=False):
+        of_channels = [jnp.abs(a - 2 * b + c) for a, b, c in zip(last, here, after, strict=True)]
+        total, last = total + functools.reduce(jnp.maximum, of_channels) * length, here
+    return total, jnp.stack(last)
+
+
+def choose_spacing(
+    taken: Bool[Array, "slabs bundles"], bend: Float[Array, "slabs bundles"], budget: Float[Array, " bundles"], node_samples: int
+) -> tuple[Int[Array, "slabs bundles"], Float[Array, " bundles"]]:
+    """Levels of interpolated slabs, from the widest spaced down: aligned groups of slabs, all interpolated, share samples.
+
+    Args:
+        taken: slabs that are interpolated.
+        bend: root mean square over the nodes of a bundle.
+        budget: variance that wider spacing may add.
+        node_samples: fine samples between nodes.
+
+    Returns:
+        Level of each slab; and the variance.
+    """
+    level, spent = jnp.zeros(taken.shape, jnp.int32), jnp.zeros_like(budget)
+    least = MIN_DEVIATION * jnp.finfo(budget.dtype).eps
+    for coarse in range(MAX_SPACING_LEVEL, 0, -1):
+        share = 1 << coarse
+        whole = taken.shape[0] // share * share
+        if not whole:
+            continue
+        groups = (taken & (level == 0))[:whole].reshape(-1, share, taken.shape[1])
+        curved = functools.reduce(jnp.add, (bend[k:whole:share] for k in range(share)))
+        deviation = DEVIATION_PER_BEND * (share**2 - 1) / (24 * node_samples**2) * curved + least
+        chosen, more = select_under_budget(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
+        level = level.at[:whole].max(coarse * jnp.repeat(chosen, share, 0))
+        spent += more
+    return level, spent

@@ -1,0 +1,65 @@
+r"""Sums over particles at all samples of slabs, as a few fat XLA kernels.
+
+Flow: schedule -> [gather] -> media.
+
+Marching is thread-coherent as in Hochstetter et al. 2016, section 6.3: blocks of `BLOCK` particles are added to all samples of a
+slab at once. Shapes, once: accumulators are (tasks, samples of a slab, rows, columns).
+
+The perspective grid makes the squared distance separable. A sample sits at $(a_k u_c, a_k v_r, s_k)$ with $a = s$
+(perspective) or 1 (orthographic), so the squared distance in supports is $A_{kc} + D_{kr}$ with $A_{kc} = ((a_k u_c - X) / H)^2$
+and $D_{kr} = ((s_k - Z) / H)^2 + ((a_k v_r - Y) / H)^2$: one addition a sample, or for poly6 one subtraction from the margin
+$1 - D_{kr}$. Differences to the particle are taken before they are squared, so nothing cancels.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.field.fetch import fetch, quantities_of
+from jaxsph.engine.field.sums import Sums, sums_of, with_block
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.model import kernels
+from jaxsph.numerics.fusion import fusion_barrier
+
+BLOCK = 16  # particles unrolled in the inner loop
+PARTS = (8,)  # of the slabs of a task that have loops of their own, see `SlabTask.turns`
+
+
+def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
+    """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows."""
+    zero = jnp.zeros((*task.depth.shape, task.v.shape[1], task.u.shape[1]), task.depth.dtype)
+    sums = sums_of([zero] * (1 + len(quantities_of(ordered))))
+    for turns in task.turns(BLOCK, PARTS):
+        add = functools.partial(_add, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
+    return sums
+
+
+def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
+    """With a block of particles more."""
+    entry, s, perspective = task.entry, task.depth, task.perspective
+    lateral_scale = s if perspective else jnp.ones_like(s)
+    su, sv = task.u[:, None, :] * lateral_scale[:, :, None], task.v[:, None, :] * lateral_scale[:, :, None]
+    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
+    smooth = kernels.by_name(kernel)
+
+    def separate(index: Array) -> tuple[Array, Array, Array, tuple[Array, ...]]:
+        """The two parts of the squared distance, sizes and quantities of a block of particles; size 0 past the last."""
+        _, block = fetch(ordered, rank, windows, index, references)
+        x, y, z, scale = (value[:, :, None, None] for value in (block.x, block.y, block.z, block.scale))
+        across = ((su[:, None] - x) * scale) ** 2
+        along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
+        return across, smooth.prepare(along, block.size[:, :, None, None]), block.size, block.quantities
+
+    across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+
+    def weighed(k: int) -> tuple[Array, list[Array]]:
+        w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
+        return w, [quantity[:, k, None, None, None] for quantity in quantities]
+
+    return with_block(sums, [weighed(k) for k in range(BLOCK)])

@@ -1,0 +1,248 @@
+"""Packets of rays, and the slabs of samples along them that are marched together.
+
+Flow: screen -> [tasks: RayPackets] -> cast -> [tasks: SlabTask] -> media, integrators.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.field.schedule import SlabSchedule
+
+Sums = TypeVar("Sums")
+FEWEST = 256  # slabs of a task that are worth more than one loop: each is compiled
+
+
+@dataclasses.dataclass(frozen=True)
+class RayPackets:
+    """Rays in tensor products: of a packet, through all pairs of a column and a row; or one by one.
+
+    Attributes:
+        u, v: ray coordinates of columns and rows: a ray's view coordinates at depth 1 (perspective) or any depth.
+        list_id: bundle whose list of particles a packet reads, and whose schedule it keeps; None where packet k reads list k.
+        real: packets that are cast, others are room; None where all are.
+        scattered: whether ray k goes through (u[k], v[k]), such that there are as many "rows" as "columns", and rays.
+    """
+
+    u: Float[Array, "columns packets"]
+    v: Float[Array, "rows packets"]
+    list_id: Int[Array, " packets"] | None = None
+    real: Bool[Array, " packets"] | None = None
+    scattered: bool = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a packet; scattered rays are one row."""
+        return 1 if self.scattered else self.v.shape[0], self.u.shape[0]
+
+    @property
+    def num_rays(self) -> int:
+        """Rays of a packet."""
+        rows, columns = self.shape
+        return rows * columns
+
+    def reading(self, of_bundles: Array) -> Array:
+        """Of an array whose last axis is bundles, those that packets read."""
+        return of_bundles if self.list_id is None else of_bundles[..., self.list_id]
+
+    def schedule_of(self, of_bundles: SlabSchedule) -> SlabSchedule:
+        """That of packets, of the one of bundles: packets that are room have nothing to march."""
+        schedule = jax.tree.map(self.reading, of_bundles)
+        if self.real is None:
+            return schedule
+        return dataclasses.replace(schedule, filled=schedule.filled & self.real)
+
+    def per_pixel(self, per_ray: Float[Array, " bundles"], pixels: int) -> Float[Array, " bundles"]:
+        """Of what every ray of a bundle takes, what its rays take in all, a pixel of the bundle."""
+        share = self.num_rays / pixels
+        if self.list_id is None:
+            return per_ray if share == 1 else per_ray * share
+        return jnp.zeros_like(per_ray).at[self.list_id].add(share * per_ray[self.list_id])
+
+    def sum_per_pixel(self, of_packets: Float[Array, " packets"], bundles: int, pixels: int) -> Float[Array, " bundles"]:
+        """Of what a ray of each packet takes, what rays take in all, a pixel of each bundle."""
+        share = of_packets * (self.num_rays / pixels)
+        return share if self.list_id is None else jnp.zeros(bundles, share.dtype).at[self.list_id].add(share)
+
+
+class Part(NamedTuple):
+    """What of each interval between samples counts, as shares of its length.
+
+    Attributes:
+        begin, end: where it begins and ends.
+        share: how much that is in all; less than what lies between where it has gaps.
+    """
+
+    begin: Float[Array, "tasks intervals rays"]
+    end: Float[Array, "tasks intervals rays"]
+    share: Float[Array, "tasks intervals rays"]
+
+
+@dataclasses.dataclass(frozen=True)
+class SlabTask:
+    """Slabs that are marched together, and where their samples are.
+
+    Attributes:
+        entry: what the schedule says of each.
+        slab, bundle: which slabs they are, and whose lists they read.
+        u, v: ray coordinates of columns and rows, see `RayPackets`.
+        depth: view depths of the samples: in the middle between borders or, where an integrator asks for it, on them.
+        border: view depths of the borders of what samples stand for.
+        perspective: whether rays spread with depth.
+        scattered: whether u and v are of rays, see `RayPackets`.
+        between: whether what is asked for are means of the intervals between samples, which then lie on borders.
+        part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
+    """
+
+    entry: SlabSchedule
+    slab: Int[Array, " tasks"]
+    bundle: Int[Array, " tasks"]
+    u: Float[Array, "tasks columns"]
+    v: Float[Array, "tasks rows"]
+    depth: Float[Array, "tasks samples"]
+    border: Float[Array, "tasks samples_and_one"]
+    perspective: bool
+    scattered: bool = False
+    between: bool = False
+    part: Part | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Tasks, samples of each, and rays."""
+        rows = 1 if self.scattered else self.v.shape[1]
+        return self.depth.shape[0], self.depth.shape[1], rows * self.u.shape[1]
+
+    @property
+    def between_shape(self) -> tuple[int, int, int]:
+        """Tasks, intervals between borders, and rays."""
+        tasks, _, rays = self.shape
+        return tasks, self.border.shape[1] - 1, rays
+
+    def part_ends(self) -> tuple[Float[Array, "tasks rays"], Float[Array, "tasks rays"]]:
+        """Depths at which, of each ray, the first part that counts begins and the last one ends: of none, in wrong order."""
+        assert self.part is not None
+        begin, length = self.depth[:, :-1, None], (self.depth[:, 1:] - self.depth[:, :-1])[..., None]
+        counts, far = self.part.share > 0, jnp.finfo(self.depth.dtype).max
+        first, last = (begin + length * share for share in (self.part.begin, self.part.end))
+        return jnp.where(counts, first, far).min(1), jnp.where(counts, last, -far).max(1)
+
+    def looked_at(self) -> Bool[Array, "tasks samples rays"]:
+        """Samples at the ends of intervals of which any part counts."""
+        assert self.part is not None
+        counts = jnp.pad(self.part.share > 0, ((0, 0), (1, 1), (0, 0)))
+        return counts[:, 1:] | counts[:, :-1]
+
+    def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
+        """View coordinates x, y, z of all samples."""
+        lateral_scale = self.depth if self.perspective else jnp.ones_like(self.depth)
+        z = jnp.broadcast_to(self.depth[..., None], self.shape)
+        if self.scattered:
+            return self.u[:, None] * lateral_scale[..., None], self.v[:, None] * lateral_scale[..., None], z
+        x = (self.u[:, None, None, :] * lateral_scale[..., None, None]) * jnp.ones_like(self.v)[:, None, :, None]
+        y = (self.v[:, None, :, None] * lateral_scale[..., None, None]) * jnp.ones_like(self.u)[:, None, None, :]
+        return x.reshape(self.shape), y.reshape(self.shape), z
+
+    def ray_coordinates(self) -> tuple[Float[Array, "tasks rays"], Float[Array, "tasks rays"]]:
+        """U and v of each ray."""
+        if self.scattered:
+            return self.u, self.v
+        both = self.u.shape[0], self.v.shape[1], self.u.shape[1]
+        u, v = jnp.broadcast_to(self.u[:, None, :], both), jnp.broadcast_to(self.v[:, :, None], both)
+        return u.reshape(both[0], -1), v.reshape(both[0], -1)
+
+    def path(self) -> Float[Array, "tasks samples rays"]:
+        """Path lengths between borders; of one ray for all where rays do not spread."""
+        step = (self.border[:, 1:] - self.border[:, :-1])[:, :, None]
+        if not self.perspective:
+            return step
+        if self.scattered:
+            return step * jnp.sqrt(1 + self.u**2 + self.v**2)[:, None]
+        slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
+        return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
+
+    def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[Turns]:
+        """All blocks of `block` spheres of all slabs, in order for each slab; of `parts` 4 is the first quarter of the slabs.
+
+        The slabs come in order of how many spheres their windows hold. Where those are clustered the first may hold a thousand
+        times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
+        only a part of them has anything left, then that part alone, and so on. Out of order it takes longer.
+        """
+        blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
+        tasks = blocks.shape[0]
+        numbers = [tasks, *(tasks // part for part in parts if tasks >= FEWEST), 0]
+        begin = jnp.int32(0)
+        for number, fewer in itertools.pairwise(numbers):
+            end = jnp.maximum(blocks[fewer:number].max(), begin)
+            yield Turns(number, self.first(number), begin, end)
+            begin = end
+
+    def first(self, number: int) -> SlabTask:
+        """The first so many slabs."""
+        return self._some(slice(number))
+
+    def at(self, items: Int[Array, " some"]) -> SlabTask:
+        """Those slabs of it."""
+        return self._some(items)
+
+    def _some(self, chosen: Any) -> SlabTask:
+        entry = jax.tree.map(lambda leaf: leaf[..., chosen], self.entry)
+        names = "slab", "bundle", "u", "v", "depth", "border"
+        part = jax.tree.map(lambda leaf: leaf[chosen], self.part)
+        return dataclasses.replace(self, entry=entry, part=part, **{name: getattr(self, name)[chosen] for name in names})
+
+    def refined(self, parts: int) -> SlabTask:
+        """Slabs of so many times as many samples, on borders, evenly spaced in each of the intervals."""
+        begin, end = self.border[:, :-1, None], self.border[:, 1:, None]
+        share = jnp.arange(parts, dtype=begin.dtype) / parts
+        inner = (begin + share * (end - begin)).reshape(begin.shape[0], -1)
+        border = jnp.concatenate([inner, self.border[:, -1:]], 1)
+        return dataclasses.replace(self, depth=border, border=border)
+
+    def every_other(self) -> SlabTask:
+        """Slabs of intervals twice as long."""
+        return dataclasses.replace(self, depth=self.depth[:, ::2], border=self.border[:, ::2])
+
+    def one_by_one(self) -> SlabTask:
+        """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
+        rays, u, v = self.shape[2], self.u, self.v
+        if not self.scattered:
+            both = self.v.shape[1], self.u.shape[1]
+            u = jnp.broadcast_to(self.u[:, None, :], (self.u.shape[0], *both))
+            v = jnp.broadcast_to(self.v[:, :, None], (self.v.shape[0], *both))
+        entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, rays, axis=-1), self.entry)
+        slab, bundle, depth, border = (
+            jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
+        )
+        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, scattered=True)
+
+
+class Turns(NamedTuple):
+    """Blocks of spheres from `begin` up to `end` of the first `number` slabs of a task, which are `task`."""
+
+    number: int
+    task: SlabTask
+    begin: Int[Array, ""]
+    end: Int[Array, ""]
+
+    def of(self, sums: Sums) -> Sums:
+        """Those of these slabs."""
+        return jax.tree.map(lambda value: value[: self.number], sums)  # type: ignore[no-any-return]
+
+    def put(self, some: Sums, sums: Sums) -> Sums:
+        """All sums, with some of these slabs."""
+        return jax.tree.map(lambda new, old: jnp.concatenate([new, old[self.number :]]), some, sums)  # type: ignore[no-any-return]
+
+
+jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])
+jax.tree_util.register_dataclass(
+    SlabTask,
+    data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border", "part"],
+    meta_fields=["perspective", "scattered", "between"],
+)

@@ -1,0 +1,210 @@
+"""A frame, as the calls of its stages: written once for eager rendering, for the forecast of its programs, and for traces.
+
+Flow: viewing, plan -> [frame: order -> make_grid -> decide -> cast_shard] -> layers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.cast.adjoint import KEPT
+from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.frame.layers import Band, Drawn, OfShards
+from jaxsph.engine.frame.stages import (
+    BandGrid,
+    Cast,
+    Decided,
+    Limits,
+    add_lattices,
+    cast_shard,
+    decide_by_bounds,
+    decide_by_pilot,
+    decide_full_rate,
+    ends,
+    least_transmittance,
+    limits_of,
+    probe_shard,
+    sum_shard,
+    wanted_cells,
+)
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.planning.viewing import Seen
+from jaxsph.engine.runtime.executors import Executor
+from jaxsph.model import registry
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.medium import Medium
+from jaxsph.model.scene import Formulas
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
+
+RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """What all bands of a frame have in common; `shards` of each are cast side by side.
+
+    `limits` are what rays keep to, of which each may take a share of what is `allowed` where pixels are interpolated too.
+    Particles are shown `within` a clip, or everywhere.
+    """
+
+    ordered: Ordered
+    camera: Camera
+    transfer: TransferFunction | None
+    media: tuple[Medium, ...]
+    limits: Limits | None
+    plan: Plan
+    formulas: Formulas
+    shards: int
+    allowed: Float[Array, ""] | None
+    min_transmittance: Float[Array, ""] | None
+    within: Clip | None = None
+
+    @classmethod
+    def begun(
+        cls, seen: Seen, camera: Camera, settings: Settings, plan: Plan, formulas: Formulas, shards: int, run: Executor
+    ) -> Frame:
+        """With the particles ranked, which is done once for all bands."""
+        static: dict[str, Any] = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "tuning": plan.cast.tuning}
+        static["between_samples"] = _between_samples(seen.media, plan)
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
+        limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
+        allowed = None if limits is None else limits.tolerance
+        least = jnp.asarray(least_transmittance(settings), dtype) if ends(settings) else None
+        if limits is not None and plan.quadtree is not None:
+            limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
+        return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least, seen.within)
+
+    def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
+        """The band that begins at a row of pixels."""
+        made = self.grid(first_row, run)
+        grid = made.of(self.ordered)
+        decided, lattice = self.decide(grid, run)
+        rays = self.cast(grid, decided, lattice, run)
+        of_shards = OfShards(tuple(rays), tuple(one.verdict for one in decided))
+        return Band(of_shards, made.lists.faults, made.filled, made.pairs)
+
+    def all_bands(self, run: Executor, kept: Callable[[Band], Any]) -> Drawn:
+        """All of them as part of a trace, see `over_bands`; of each, what is `kept`."""
+
+        def draw(first_row: Int[Array, ""]) -> Drawn:
+            found = self.band(first_row, run)
+            return Drawn(kept(found), found.faults, found.filled, found.pairs)
+
+        return over_bands(self.plan, draw)
+
+    def grid(
+        self, first_row: Int[Array, ""], run: Executor, camera: Camera | None = None, lists: ListPlan | None = None
+    ) -> BandGrid:
+        """Of the band that begins at a row of pixels, or of another camera's nodes."""
+        plan = self.plan
+        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "beside": self._beside}
+        sizes["tuning"] = plan.cast.tuning
+        made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
+        return made
+
+    def cast(
+        self,
+        grid: Grid,
+        decided: list[Decided],
+        lattice: Lattice | None,
+        run: Executor,
+        camera: Camera | None = None,
+    ) -> list[Cast]:
+        """What the rays of all packets of a grid meet, shard by shard."""
+        plan = self.plan
+        each = self._each(run)
+        schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
+        scene = (grid, camera or self.camera, self.transfer, self.media)
+        tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
+        how = lattice, self.min_transmittance, tolerance
+        inputs = [(*scene, schedule, *how, nth, self.within) for schedule, nth in zip(schedules, each, strict=True)]
+        method = {"cast_plan": plan.cast, "integrator": plan.chosen_integrator, "screen": plan.screen, "formulas": self.formulas}
+        rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, tuning=plan.cast.tuning, **method)
+        return rays
+
+    def _each(self, run: Executor) -> list[Int[Array, ""]]:
+        return run.own([jnp.int32(nth) for nth in range(self.shards)])
+
+    @property
+    def _halo(self) -> int:
+        return int(registry.integrator(*self.plan.chosen_integrator).halo)
+
+    @property
+    def _beside(self) -> bool:
+        return bool(self._halo) or _between_samples(self.media, self.plan)
+
+    @property
+    def _cast(self) -> dict[str, Any]:
+        """What most stages are compiled for."""
+        return {"cast": self.plan.cast, "tuning": self.plan.cast.tuning}
+
+    def decide(self, grid: Grid, run: Executor) -> tuple[list[Decided], Lattice | None]:
+        """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
+        if isinstance(self.plan.control, PilotPlan):
+            return self._ask_pilot(grid, self.plan.control, run)
+        controlled = self.limits is not None and self.plan.control is not None
+        return (self._bound(grid, run) if controlled else self.leave(grid, run, with_levels=False)), None
+
+    def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
+        """All slabs at full rate, shard by shard."""
+        inputs = [(grid, camera or self.camera, self.transfer, self.media, nth, self.within) for nth in self._each(run)]
+        static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
+        return run.each("adapt", decide_full_rate, inputs, **static)
+
+    def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
+        view = (grid, self.camera, self.transfer)
+        inputs = [(*view, nth) for nth in self._each(run)]
+        static = {
+            "shards": self.shards,
+            "lists": self.plan.lists,
+            "control": control,
+            "kernel": self.formulas.kernel,
+            **self._cast,
+        }
+        lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
+        several, tuning = self.shards > 1, self.plan.cast.tuning
+        lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
+        # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
+        return [run.one("adapt", decide_by_pilot, (*view, self.limits, lattice, self.within), **self._cast)], lattice
+
+    def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
+        static, each = {"shards": self.shards, **self._cast}, self._each(run)
+        probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in each], **static)
+        pays, wanted = run.one("adapt", wanted_cells, (tuple(run.pooled(probes)),), tuning=self.plan.cast.tuning)
+        if not run.may_hold(pays):
+            return self.leave(grid, run, with_levels=True)
+        view = (grid, self.camera, self.transfer, self.limits)
+        inputs = [(*view, of_shard, nth, self.within) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
+        return run.each("adapt", decide_by_bounds, inputs, control=self.plan.control, **static)
+
+
+def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:
+    """Whether any medium meets spheres between samples."""
+    return registry.between_samples(plan.integrator) or any(medium.between_samples for medium in media)
+
+
+def over_bands(plan: Plan, draw: Callable[[Int[Array, ""]], Drawn]) -> Drawn:
+    """All bands one after the other, given what draws that of a first row; layers lie along a first axis."""
+    rows = jnp.arange(plan.bands, dtype=jnp.int32) * plan.band_height
+    if plan.bands > 1:  # in reverse mode the grid of a band is made again, as bands are there to spare memory
+        policy = jax.checkpoint_policies.save_only_these_names(KEPT)
+        found = lax.map(jax.checkpoint(draw, prevent_cse=False, policy=policy), rows)
+    else:
+        found = jax.tree.map(lambda leaf: leaf[None], draw(rows[0]))
+    word = functools.reduce(lambda a, b: a | b, [found.faults[i] for i in range(plan.bands)])
+    return Drawn(found.layers, word, found.filled.sum(), found.pairs.sum())

@@ -1,0 +1,385 @@
+"""The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
+
+Flow: viewing -> order -> make_grid -> (sum_shard or probe_shard) -> decide_... -> cast_shard -> layers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.extents import slab_extents
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
+from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
+from jaxsph.engine.access.shards import shard, shard_of_grid
+from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders, whole_cells
+from jaxsph.engine.access.view import Viewed
+from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.cast.march import RayResult
+from jaxsph.engine.control.adapt import ControlPlan, adapt, untouched
+from jaxsph.engine.control.interpolation_error import interpolation_error
+from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
+from jaxsph.engine.control.probe import Probe, probe, worthwhile
+from jaxsph.engine.control.ranges import tables_of_parts
+from jaxsph.engine.field.lattice import Lattice, region_of, sum_shards
+from jaxsph.engine.field.nodes import sum_at_nodes
+from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.engine.media.within import over_slabs
+from jaxsph.engine.planning.viewing import half_steps, sphere_depths
+from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.model import registry
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip, Overlap
+from jaxsph.model.medium import Medium
+from jaxsph.model.scene import Formulas
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.fusion import barriers
+
+ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
+
+
+def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Jit a function as a stage, tuned by its keyword `tuning`; `quickly` where it takes longer to compile than to run."""
+
+    def made(function: Callable[..., Any]) -> Any:
+        @functools.wraps(function)
+        def tuned(*arguments: Any, tuning: Tuning, **static: Any) -> Any:
+            with barriers(tuning.fusion_barriers):
+                return function(*arguments, tuning=tuning, **static)
+
+        jitted = jax.jit(tuned, static_argnames=(*static, "tuning"))
+        return compiled_quickly(jitted) if quickly else jitted
+
+    return made
+
+
+class Limits(NamedTuple):
+    """What an error is held against: tolerance and relaxation."""
+
+    tolerance: Float[Array, ""]
+    relax: Float[Array, ""]
+
+
+def limits_of(settings: Settings, dtype: Any) -> Limits | None:
+    """Tolerance and relaxation in the dtype of the particles, the tolerance rounded down; None at full rate."""
+    if settings.tolerance is None:
+        return None
+    tolerance = settings.tolerance
+    if ends(settings):  # which take a part of it
+        tolerance = tolerance - least_transmittance(settings)
+    if not is_traced(tolerance) and not isinstance(tolerance, jax.Array):
+        rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
+        tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
+    return Limits(jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype))
+
+
+def ends(settings: Settings) -> bool:
+    """Whether rays may end before their ends."""
+    least = settings.min_transmittance
+    return settings.is_refined or is_traced(least) or float(least) > 0
+
+
+def least_transmittance(settings: Settings) -> Any:
+    """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
+    least = settings.min_transmittance
+    return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
+
+
+class BandGrid(NamedTuple):
+    """What a `Grid` holds besides the particles, which are the same for all bands; and how much that is.
+
+    Attributes:
+        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
+    """
+
+    lists: BundleLists
+    windows: SlabWindows
+    row: Int[Array, " bundles"]
+    column: Int[Array, " bundles"]
+    half_steps: Float[Array, " two_samples_and_one"]
+    filled: Int[Array, ""]
+    pairs: Int[Array, ""]
+
+    def of(self, ordered: Ordered) -> Grid:
+        """The grid of those particles."""
+        return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
+
+
+class Verdict(NamedTuple):
+    """What an image tells of a decision.
+
+    Attributes:
+        bound: how wrong each bundle's pixels can be.
+        full: evaluations at full rate.
+        levels: what each cell was given; None where there are no levels.
+    """
+
+    bound: Float[Array, " bundles"]
+    full: Float[Array, " bundles"]
+    levels: Int[Array, "cells bundles"] | None
+
+
+class Decided(NamedTuple):
+    """What is to be marched, and what the image tells of it."""
+
+    schedule: SlabSchedule
+    verdict: Verdict
+
+
+@stage("samples", "slab_samples", "between_samples", quickly=True)
+def order(
+    viewed: Viewed,
+    camera: Camera,
+    found: Int[Array, " particles"] | None = None,
+    *,
+    samples: int,
+    slab_samples: int,
+    between_samples: bool,
+    tuning: Tuning,
+) -> Ordered:
+    """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
+    depths = sphere_depths(camera, viewed.x.dtype, samples, between_samples)
+    if found is None:
+        return rank_particles(viewed, camera, depths, slab_samples)
+    return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
+
+
+@stage("lists", "samples", "beside")
+def make_grid(
+    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, beside: bool, tuning: Tuning
+) -> BandGrid:
+    """The grid of the band that begins at a row of pixels; of spheres that lie `beside` samples, too."""
+    still, looking = jax.tree.map(lax.stop_gradient, (ordered, camera))
+    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, beside)
+
+
+def grid_of_lists(
+    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, beside: bool
+) -> BandGrid:
+    """The same, given the lists of its bundles."""
+    depths = half_steps(camera, ordered.x.dtype, samples)
+    windows = (slab_windows_with_borders if beside else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
+    pairs = (made.end - made.start).sum(dtype=jnp.int32)
+    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
+
+
+@stage("shards", "lists", "cast", "control", "kernel")
+def sum_shard(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    lists: ListPlan,
+    cast: CastPlan,
+    control: PilotPlan,
+    kernel: str,
+    tuning: Tuning,
+) -> Lattice:
+    """The lattice of the `nth` of `shards` of a band, for the pilot estimator."""
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
+    slab_samples, room = cast.slab_samples, control.room or lists.bundles
+    wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
+    seen = jnp.argmax(grid.ordered.live)
+    references = _among(transfer, [quantity[seen] for quantity in grid.ordered.quantities], grid.half_steps.dtype)
+    region = region_of(grid, *room, control.nodes)
+    of_shard = shard_of_grid(grid, nth, shards)
+    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, references, tuning.cells_of_nodes, wanted)
+
+
+@stage(quickly=True)
+def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
+    """That of a band, of those of its shards."""
+    return sum_shards(lattices)
+
+
+@stage("shards", "cast", quickly=True)
+def probe_shard(
+    grid: Grid,
+    transfer: TransferFunction,
+    limits: Limits,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    cast: CastPlan,
+    tuning: Tuning,
+) -> Probe:
+    """What may be worth bounding, in the `nth` of `shards` of a band."""
+    grid, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, transfer, limits))
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    tables, own = tables_of_parts(transfer), shard_of_grid(grid, nth, shards)
+    return probe(own, tables, limits.tolerance, cast.slab_samples, tuning.cells_probed)
+
+
+@stage(quickly=True)
+def wanted_cells(
+    probes: tuple[Probe, ...], *, tuning: Tuning
+) -> tuple[Bool[Array, ""], tuple[Bool[Array, "cells bundles"], ...]]:
+    """Whether any cell is to be analysed; and which, of each shard."""
+    pays = worthwhile([(one.held, one.all_held) for one in probes])
+    return pays & jnp.stack([one.promising.any() for one in probes]).any(), tuple(one.promising & pays for one in probes)
+
+
+@stage("shards", "cast", "halo", "with_levels", quickly=True)
+def decide_full_rate(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction | None,
+    media: tuple[Medium, ...],
+    nth: Int[Array, ""],
+    within: Clip | None = None,
+    *,
+    shards: int,
+    cast: CastPlan,
+    halo: int,
+    with_levels: bool,
+    tuning: Tuning,
+) -> Decided:
+    """Every cell of the `nth` of `shards` of a band at full rate: without error control, or where none of it would pay."""
+    given = shard_of_grid(grid, nth, shards), camera, transfer, media, within
+    grid, camera, transfer, media, within = jax.tree.map(lax.stop_gradient, given)
+    schedule, full = _at_full_rate(grid, transfer, cast, halo, _overlap(grid, camera, within, cast))
+    extents = slab_extents(grid, camera, cast.slab_samples) if media else None
+    filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
+    levels = untouched(grid.windows, cast.slab_samples) if with_levels else None
+    nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
+    return Decided(dataclasses.replace(schedule, filled=filled), Verdict(nothing, full, levels))
+
+
+@stage("cast", quickly=True)
+def decide_by_pilot(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    limits: Limits,
+    lattice: Lattice,
+    within: Clip | None = None,
+    *,
+    cast: CastPlan,
+    tuning: Tuning,
+) -> Decided:
+    """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient.
+
+    Slabs that a face of a clip may cross are at full rate.
+    """
+    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
+    lies = _overlap(grid, camera, within, cast)
+    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
+    able = None if lies is None else lies.holds
+    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples, able)
+    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, None))
+
+
+@stage("shards", "cast", "control")
+def decide_by_bounds(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    limits: Limits,
+    wanted: Bool[Array, "cells bundles"],
+    nth: Int[Array, ""],
+    within: Clip | None = None,
+    *,
+    shards: int,
+    cast: CastPlan,
+    control: ControlPlan,
+    tuning: Tuning,
+) -> Decided:
+    """How each cell of the `nth` of `shards` of a band is sampled, if it is `wanted`. Decisions carry no gradient.
+
+    Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
+    """
+    grid, camera, transfer, limits, within = jax.tree.map(lax.stop_gradient, (grid, camera, transfer, limits, within))
+    dtype, grid = grid.half_steps.dtype, shard_of_grid(grid, nth, shards)
+    lies = _overlap(grid, camera, within, cast)
+    schedule, full = _at_full_rate(grid, transfer, cast, 0, lies)
+    wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), transfer)
+    references = schedule.references
+    schedule, bound, levels = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
+    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels))
+
+
+def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) -> Overlap | None:
+    """How a clip lies to the slabs of a band or of a shard of it; None without one."""
+    return None if within is None else over_slabs(within, slab_extents(grid, camera, cast.slab_samples))
+
+
+def _at_full_rate(
+    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0, lies: Overlap | None = None
+) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
+    """The schedule of the reference image, and its evaluations."""
+    references = [reference_quantities(grid.windows, grid.lists.rank, one) for one in grid.ordered.quantities]
+    schedule = clipped(full_rate(grid.windows, _among(transfer, references)), None if lies is None else lies.meets)
+    return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
+
+
+def _among(transfer: TransferFunction | None, references: list[Array], dtype: Any = None) -> tuple[Array, ...]:
+    """References among the control points: one far beyond what is shown would cost the digits of what is."""
+    if transfer is not None:
+        parts = zip(references, transfer.parts(), strict=True)
+        references = [jnp.clip(reference, part.values[0], part.values[-1]) for reference, part in parts]
+    return tuple(reference if dtype is None else reference.astype(dtype) for reference in references)
+
+
+class Cast(NamedTuple):
+    """What the rays of a shard meet, the kernel evaluations of each bundle, a pixel, and whose rays ended before their ends."""
+
+    rays: RayResult
+    evaluations: Float[Array, " bundles"]
+    cut: Bool[Array, " bundles"] | None
+
+
+@stage("shards", "cast_plan", "integrator", "screen", "formulas")
+def cast_shard(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction | None,
+    media: tuple[Medium, ...],
+    schedule: SlabSchedule,
+    lattice: Lattice | None,
+    min_transmittance: Float[Array, ""] | None,
+    tolerance: Float[Array, ""] | None,
+    nth: Int[Array, ""],
+    within: Clip | None = None,
+    *,
+    shards: int,
+    cast_plan: CastPlan,
+    integrator: tuple[Any, ...],
+    screen: str,
+    formulas: Formulas,
+    tuning: Tuning,
+) -> Cast:
+    """The `nth` of `shards` of a band. The grid is of the whole band, and so is the schedule with a lattice."""
+    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
+    of_nodes = None if lattice is None else lattice.evaluations
+    if lattice is not None:
+        schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
+    made = registry.integrator(*integrator)
+    method = CastMethod(formulas.kernel, cast_plan.of_shard(shards), made, registry.screen(screen).packets, formulas.mix)
+    grid = shard_of_grid(grid, nth, shards)
+    rays = cast(grid, schedule, camera, transfer, media, method, lattice, None, min_transmittance, tolerance, within)
+    spent, packets = evaluations(schedule, grid.samples, cast_plan.slab_samples, made.halo), method.packets_of(grid, camera)
+    spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
+    if rays.refined is not None:
+        spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)
+    if rays.left_out is not None:
+        spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
+    cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, spent.shape[0], BUNDLE * BUNDLE) > 0
+    return Cast(rays, spent if of_nodes is None else spent + of_nodes, cut)

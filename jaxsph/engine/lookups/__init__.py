@@ -1,0 +1,1 @@
+"""Transfer functions as tables that are looked up: values, means over ranges, slopes."""

@@ -1,0 +1,272 @@
+r"""Particles as a medium: CSPH sums over them, and the transfer function of what they interpolate.
+
+Flow: grid, schedule -> [particles: methods -> look-up] -> integrator; cotangents -> [particles: look-up -> transposed].
+
+$Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ (Hochstetter et al. 2016, equation 2); where the sum of weights is zero, there is
+nothing. Sums are gathered in loops, and a table is read for each sample: those two have a transpose written by hand.
+
+Of particles with two quantities colour is looked up by the first, extinction by the second; both are sums by the same weights.
+Whatever there is for each quantity is a tuple here, of which the first is that of colours and the last that of extinction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.field.cover import cover_of
+from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.methods import methods_of
+from jaxsph.engine.field.sums import Sums, by_rays, least_weight
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.transposed import COLUMNS, WIDTH, pull_gather
+from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.media.between import SumsBetween, intervals_between, pull_cover, pull_means
+from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
+from jaxsph.numerics.fusion import fusion_barrier
+
+EXTINCTION = slice(3, 4)
+
+
+class Wanted(NamedTuple):
+    """Which cotangents are asked for: by where samples and particles are and what those carry, and by the transfer function."""
+
+    field: bool = True
+    transfer: bool = True
+
+
+class ParticleCotangents(NamedTuple):
+    """Of particles in rank order, `field.transposed.COLUMNS`; and of red, green, blue, extinction and place of control points.
+
+    The latter of each part of a transfer function.
+    """
+
+    table: Float[Array, "particles 8"]
+    transfer: tuple[Float[Array, "5 points"], ...]
+
+    def columns(self) -> dict[str, Float[Array, " particles"]]:
+        """Of particles, by name."""
+        return {name: self.table[:, k] for k, name in enumerate(COLUMNS)}
+
+    def with_transfer(self, more: Iterable[Float[Array, "5 points"]]) -> ParticleCotangents:
+        """With more, of all parts of the transfer function."""
+        return self._replace(transfer=tuple(map(jnp.add, self.transfer, more)))
+
+    def of_transfer(self) -> TransferFunction:
+        """Of the control points."""
+        first, last = self.transfer[0], self.transfer[-1]
+        return TransferFunction(first[4], first[:3].T, last[3], None if len(self.transfer) == 1 else last[4])
+
+
+@dataclasses.dataclass(frozen=True)
+class ParticleMedium(Medium):
+    """Particles of a band, or of a shard of it.
+
+    Attributes:
+        grid: where they are.
+        segments: of the parts of the transfer function.
+        tables: of the same for means between samples; None where none are asked for.
+        lattice: where the sums of interpolated slabs come from, if any do.
+        kernel: name of the smoothing kernel.
+        wanted: cotangents that `pull` is to find.
+    """
+
+    at_points = False  # lists are of slabs
+    in_parts = True
+    grid: Grid
+    segments: tuple[Segments, ...]
+    tables: tuple[MeanTables, ...] | None
+    lattice: Lattice | None
+    kernel: str
+    wanted: Wanted
+
+    def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
+        """Slabs that have any particle."""
+        return self.grid.windows.count > 0
+
+    def gather(self, task: SlabTask) -> Any:
+        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule.
+
+        Of a task between samples, moreover what supports cover of its rays.
+        """
+        if not task.between:
+            return self._sums(task)
+        sums = self._sums(task)
+        return SumsBetween(sums, cover_of(self.grid.ordered, self.grid.lists.rank, task, by_rays(sums)[0] > 0))
+
+    def _sums(self, task: SlabTask) -> Sums:
+        methods = methods_of(self.grid, self.kernel, self.lattice, task.scattered)
+        if len(methods) == 1 or task.entry.method is None:
+            return methods[0](task)
+        # a dummy has any method, and drops what it finds
+        method = jnp.where(task.slab < self.grid.windows.count.shape[0], task.entry.method, 0).max()
+        return lax.switch(method, [functools.partial(one, task) for one in methods])
+
+    def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
+        """Extinction, and places in the transfer function."""
+        weight, *weighted = by_rays(gathered)
+        inside = weight > 0
+        quantities = [
+            reference[:, None, None] + jnp.where(inside, value / jnp.where(inside, weight, 1), 0)
+            for reference, value in zip(task.entry.references, weighted, strict=True)
+        ]
+        place = at_extinction = find(self.segments[-1], quantities[-1])
+        if len(quantities) > 1:
+            place = find(self.segments[0], quantities[0])
+        (extinction,) = self._optics(self.segments[-1], at_extinction, task, EXTINCTION)
+        if task.entry.painted is not None:
+            inside |= task.entry.painted[:, None, None]
+        return jnp.where(inside, extinction, 0), place
+
+    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Colours at places in the transfer function; of super-pixels, what they are painted with."""
+        return self._optics(self.segments[0], samples, task, channels)
+
+    def intervals(self, gathered: SumsBetween, task: SlabTask) -> Intervals | Paired:
+        """Ends of the intervals between samples, in units of the quantity; of two, with extinction."""
+        found = fusion_barrier(task.slab[0] >= 0, intervals_between, gathered, task)
+        if len(found) == 1:
+            return found[0]  # type: ignore[no-any-return]
+        return Paired(found[0], *fusion_barrier(task.slab[0] >= 0, extinction_over, self._tables[-1], found[-1]))
+
+    def means(self, intervals: Intervals | Paired, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """See `Medium.means`: of the transfer function, over the ranges of quantities in each interval."""
+        return means_by(self._tables, intervals, channels)
+
+    @property
+    def _tables(self) -> tuple[MeanTables, ...]:
+        if self.tables is None:
+            raise ValueError("means between samples need `tables`, made with `MeanTables.of`")
+        return self.tables
+
+    def every_other(self, gathered: SumsBetween) -> SumsBetween:
+        """Every other of the sums; borders stay where they are."""
+        return SumsBetween(jax.tree.map(lambda value: value[:, ::2], gathered.sums), gathered.cover)
+
+    def _optics(self, segments: Segments, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
+        optics, entry = read(segments, place, channels), task.entry
+        if entry.paint is None or entry.painted is None:
+            return optics
+        painted, paints = entry.painted[:, None, None], list(entry.paint)[channels]
+        return [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(paints, optics, strict=True)]
+
+    def no_cotangents(self) -> ParticleCotangents:
+        """None yet."""
+        x = self.grid.ordered.x
+        of_parts = tuple(jnp.zeros((5, segments.start.shape[0]), x.dtype) for segments in self.segments)
+        return ParticleCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), of_parts)
+
+    def pull(  # type: ignore[override]
+        self, total: ParticleCotangents, gathered: Any, task: SlabTask, cotangents: list[Array]
+    ) -> tuple[ParticleCotangents, OfPlaces]:
+        """See `Medium.pull`. What is interpolated or painted has none."""
+        if task.between:
+            return self._pull_between(total, gathered, task, cotangents)
+        samples = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
+        if self.wanted.transfer:
+            total = total.with_transfer(map(pull_control_points, samples.looks, self.segments))
+        if not self.wanted.field:
+            return total, OfPlaces.none(task)
+        found = pull_gather(total.table, self.grid.ordered, self.grid.lists.rank, task, tuple(samples.sums), self.kernel)
+        of_depth = found.along
+        if task.perspective:  # lateral coordinates are u s and v s
+            of_depth = of_depth + found.lateral / task.depth.T
+        places = OfPlaces(of_depth.T, jnp.zeros_like(task.border), found.lateral.sum())
+        return total._replace(table=found.table), places
+
+    def _pull_between(
+        self, total: ParticleCotangents, gathered: SumsBetween, task: SlabTask, cotangents: list[Array]
+    ) -> tuple[ParticleCotangents, OfPlaces]:
+        """Through the means of intervals, then through sums and borders."""
+        ordered, rank = self.grid.ordered, self.grid.lists.rank
+        found = fusion_barrier(task.slab[0] >= 0, pull_means, gathered, self.segments, task, cotangents)
+        if self.wanted.transfer:
+            rows = ((part.colors.T, part.extinction[None], part.values[None]) for part in found.transfers)
+            total = total.with_transfer(map(jnp.concatenate, rows))
+        if not self.wanted.field:
+            return total, OfPlaces.none(task)
+        of_sums = pull_gather(total.table, ordered, rank, task, tuple(found.sums), self.kernel)
+        of_depth = of_sums.along + (of_sums.lateral / task.depth.T if task.perspective else 0)
+        table, factor = pull_cover(of_sums.table, ordered, rank, task, gathered, found.cover)
+        places = OfPlaces(of_depth.T + found.depth, jnp.zeros_like(task.border), of_sums.lateral.sum() + factor)
+        return total._replace(table=table), places
+
+
+class LookUpCotangents(NamedTuple):
+    """Of samples that were looked up by one quantity.
+
+    Attributes:
+        optics: of red, green, blue and extinction.
+        quantity: of the field; and `found`, the field itself.
+    """
+
+    optics: list[Float[Array, "tasks samples rays"]]
+    quantity: Float[Array, "tasks samples rays"]
+    found: Float[Array, "tasks samples rays"]
+
+
+class SampleCotangents(NamedTuple):
+    """Of the samples of a chunk: of their sums, that of weights first, and of how each quantity was looked up."""
+
+    sums: list[Float[Array, "tasks samples rays"]]
+    looks: tuple[LookUpCotangents, ...]
+
+
+def pull_look_up(
+    sums: Sums, parts: tuple[Segments, ...], task: SlabTask, cotangents: list[Float[Array, "tasks samples rays"]]
+) -> SampleCotangents:
+    """From cotangents of optics to those of the sums that they were looked up by."""
+    weight, *several = by_rays(sums)
+    inside, solid = weight > 0, weight > least_weight(weight.dtype)
+    inverse = 1 / jnp.where(inside, weight, 1)
+    of_optics = [jnp.where(inside, value, 0) for value in cotangents]
+    of_weight, of_weighted, looks = jnp.zeros_like(weight), [], []
+    for weighted, reference, segments, channels in zip(several, task.entry.references, parts, _channels(parts), strict=True):
+        ratio = jnp.where(inside, weighted * inverse, 0)
+        quantity = reference[:, None, None] + ratio
+        slopes = jax.jvp(functools.partial(look_up, segments), (quantity,), (jnp.ones_like(quantity),))[1]
+        own = [value if k in channels else jnp.zeros_like(value) for k, value in enumerate(of_optics)]
+        of_quantity = functools.reduce(jnp.add, (own[k] * slopes[k] for k in channels))
+        of_weighted.append(jnp.where(solid, of_quantity * inverse, 0))
+        of_weight = of_weight - ratio * of_weighted[-1]
+        looks.append(LookUpCotangents(own, of_quantity, quantity))
+    return SampleCotangents([of_weight, *of_weighted], tuple(looks))
+
+
+def _channels(parts: tuple[Segments, ...]) -> tuple[range, ...]:
+    """Which of red, green, blue and extinction are looked up by each quantity."""
+    return (range(4),) if len(parts) == 1 else (range(3), range(3, 4))
+
+
+def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Float[Array, "5 points"]:
+    """Cotangents of the control points of a transfer function: red, green, blue, extinction, and where the points lie.
+
+    A sample's optics are those of the points at the ends of its segment, in shares that add up to 1. To move an end is to
+    move the field the other way by the same share.
+    """
+    points = segments.start.shape[0]
+    segment, part = locate(segments, samples.found)
+    values = jnp.stack([*samples.optics, -samples.quantity]).reshape(5, -1)
+    segment, part = segment.reshape(-1), part.reshape(-1)
+    if points <= SELECT_ALL:
+        each = jnp.arange(points, dtype=jnp.int32)[:, None]
+        share = jnp.where(each == segment, 1 - part, jnp.where(each == segment + 1, part, 0))
+        return jnp.matmul(values, share.T, precision=lax.Precision.HIGHEST)
+    rows = jnp.concatenate([values * (1 - part), values * part]).T
+    added = jnp.zeros((points, 10), values.dtype).at[segment].add(rows, mode="promise_in_bounds").T
+    return added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
+
+
+jax.tree_util.register_dataclass(
+    ParticleMedium, data_fields=["grid", "segments", "tables", "lattice"], meta_fields=["kernel", "wanted"]
+)

@@ -1,0 +1,160 @@
+"""A volume as a medium: trilinear interpolation, and the transfer function of what it gives.
+
+Flow: volume, camera -> [volume: grid -> look-up] -> integrator.
+
+Between samples the quantity is taken for linear, and where a ray enters and leaves the box is found, with the quantity there: in
+a slab that is one place each. Slabs in which the transfer function shows nothing are not marched, see `access.macrocells`. As a
+medium it shares samples with others, so light from all of them meets in the right order (Kaehler, Abel & Hege 2007).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
+from jaxsph.engine.field.intervals import Intervals, means_of
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.lookups.joined import joined
+from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.media.volume_grid import VolumeGrid
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.model.volume import Volume
+from jaxsph.numerics import faults
+
+COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
+
+
+class AlongSlab(NamedTuple):
+    """The quantity along the rays of slabs, and where they are in the box.
+
+    Attributes:
+        quantity: at samples, those outside of the box moved to it.
+        at_entry, at_exit: where rays enter the box and leave it, or at the ends of the slab.
+        entry, exit: shares of the slab's length that lie before; where a ray misses the box, `exit` is not behind `entry`.
+    """
+
+    quantity: Float[Array, "tasks samples rays"]
+    at_entry: Float[Array, "tasks rays"]
+    at_exit: Float[Array, "tasks rays"]
+    entry: Float[Array, "tasks rays"]
+    exit: Float[Array, "tasks rays"]
+
+
+@dataclasses.dataclass(frozen=True)
+class VolumeMedium(Medium):
+    """A volume in view space.
+
+    Attributes:
+        grid: its values, and where they are.
+        segments: of the transfer function.
+        shown: macrocells that the transfer function shows.
+        fault: fault word: whether any value is no finite number.
+        tables: of the transfer function for means between samples; None where none are asked for.
+    """
+
+    in_parts = True
+    grid: VolumeGrid
+    segments: Segments
+    shown: Occupancy
+    fault: Int[Array, ""]
+    tables: MeanTables | None = None
+
+    @classmethod
+    def seen(cls, volume: Volume, transfer: TransferFunction, camera: Camera) -> VolumeMedium:
+        """As a camera sees it.
+
+        Differentiation:
+            By the values (where they are floats), `lower`, `spacing`, camera and transfer function. Which macrocells are shown is
+            held fixed.
+        """
+        grid, ranges = VolumeGrid.seen(volume, camera), MacrocellRanges.of(volume.values)
+        transfer = joined(jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer))
+        still = jax.tree.map(jax.lax.stop_gradient, transfer)
+        placed = jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all()
+        fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
+        return cls(grid, transfer.segments(), Occupancy.of(ranges.shown_by(still)), fault)
+
+    def without_data(self) -> VolumeMedium:
+        """Without values."""
+        return dataclasses.replace(self, grid=self.grid.holding(None))
+
+    def with_data(self, given: Volume) -> VolumeMedium:
+        """With the values of the volume that it was made of."""
+        return dataclasses.replace(self, grid=self.grid.holding(given.values))
+
+    def for_means(self) -> VolumeMedium:
+        """With tables of the transfer function."""
+        return dataclasses.replace(self, tables=MeanTables.of(self.segments))
+
+    def faults(self) -> Int[Array, ""]:
+        """Whether the values are usable."""
+        return self.fault
+
+    def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
+        """Slabs that may meet a macrocell in which there is any extinction."""
+        return self.grid.touched(self.shown, slabs)
+
+    def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Bool[Array, "tasks samples rays"]] | AlongSlab:
+        """The quantity at samples, and whether they are inside the grid; or what lies between them."""
+        coordinates = self.grid.coordinates(task.positions())
+        if not task.between:
+            return self.grid.interpolate(coordinates), self.grid.inside(coordinates)
+        first, last = ([at[:, k] for at in coordinates] for k in (0, -1))
+        entry, leaving = self.grid.clipped(first, last)
+        ends = [
+            jnp.stack([begin + share * (end - begin) for share in (entry, leaving)], 1)
+            for begin, end in zip(first, last, strict=True)
+        ]
+        places = [jnp.concatenate(pair, 1) for pair in zip(coordinates, ends, strict=True)]
+        quantity = self.grid.interpolate(self.grid.moved_inside(places))
+        return AlongSlab(quantity[:, :-2], quantity[:, -2], quantity[:, -1], entry, leaving)
+
+    def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, tuple[Array, ...]]:
+        """Extinction, and places in the transfer function."""
+        quantity, inside = gathered
+        place = find(self.segments, quantity)
+        (extinction,) = read(self.segments, place, EXTINCTION)
+        return jnp.where(inside, extinction, 0), place
+
+    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Colours at places in the transfer function."""
+        return read(self.segments, samples, channels)
+
+    def every_other(self, gathered: AlongSlab) -> AlongSlab:
+        """See `Medium.every_other`: where rays enter the box and leave it stays."""
+        return gathered._replace(quantity=gathered.quantity[:, ::2])
+
+    def intervals(self, gathered: AlongSlab, task: SlabTask) -> Intervals:
+        """Ends of the intervals between samples, and what share of each is in the box."""
+        begin, end = task.depth[:, :-1, None], task.depth[:, 1:, None]
+        first, slab = task.depth[:, :1, None], (task.depth[:, -1:] - task.depth[:, :1])[:, :, None]
+        inverse = jnp.where(end > begin, 1 / jnp.where(end > begin, end - begin, 1), 0)
+        ahead = jnp.clip((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
+        within = jnp.clip((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
+        near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])
+        far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
+        return Intervals(near, far, jnp.maximum(within - ahead, 0)).narrowed(ahead, task.part)
+
+    def means(self, intervals: Intervals, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """See `Medium.means`: of the transfer function, over the range of the quantity in each interval."""
+        return means_of(MeanTables.of(self.segments) if self.tables is None else self.tables, intervals, channels)
+
+    def no_cotangents(self) -> VolumeMedium:
+        """None yet; of the transfer function, not of tables made of it."""
+        return jax.tree.map(jnp.zeros_like, dataclasses.replace(self, tables=None))
+
+    def pull(  # type: ignore[override]
+        self, total: VolumeMedium, gathered: Any, task: SlabTask, cotangents: list[Array]
+    ) -> tuple[VolumeMedium, OfPlaces]:
+        """See `Medium.pull`: tables are made again, such that the transfer function has their cotangents."""
+        return super(VolumeMedium, dataclasses.replace(self, tables=None)).pull(total, gathered, task, cotangents)
+
+
+jax.tree_util.register_dataclass(VolumeMedium, data_fields=["grid", "segments", "shown", "fault", "tables"], meta_fields=[])

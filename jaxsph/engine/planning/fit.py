@@ -1,0 +1,228 @@
+"""From a scene to a plan: view it, measure it, and take the plan of an earlier frame where that fits (host side).
+
+Flow: scene, camera, settings -> view_scene -> measure -> [planning] -> frame.
+
+Frames of a sequence differ a little in everything. So a plan that is kept is taken again as long as it has room and is at most
+one class too large. Room changes no bit of an image, and all else in a plan follows from the frame alone: so an image does not
+depend on what was rendered before it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsph.engine.access.host_sorting import depth_order
+from jaxsph.engine.planning.measures import Measures, measure
+from jaxsph.engine.planning.plan import FrameShape, Plan, choose, fitted, fitting, next_class
+from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene
+from jaxsph.engine.request import Request, first_samples
+from jaxsph.engine.runtime.executors import Clock, Executor
+from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
+from jaxsph.model import registry
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.periodic import num_ghosts
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.spheres import spheres_of
+from jaxsph.numerics.checks import is_traced
+
+MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
+MAX_KEPT = 64
+
+
+def plan(
+    scene: Scene,
+    camera: Camera,
+    settings: Settings | None = None,
+    *,
+    like: Plan | None = None,
+    slab_samples: int | None = None,
+    tuning: Tuning | None = None,
+    headroom: float = 1.0,
+) -> Plan:
+    """Measure the room that a frame needs (host side; values must be concrete).
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`.
+        like: a plan to grow: returned as it is where it has room for this frame, else with more; so that one plan, and
+            what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
+        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
+            support is in samples.
+        tuning: of another kind of machine than holds the particles (`jaxsph.engine.runtime.tuning`), to compile for it or to compare.
+        headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
+            There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
+
+    Raises:
+        ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
+            `settings.memory_limit`; where `like` is for another image or kind of error control.
+    """
+    if is_traced(scene, camera):
+        raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    if not headroom >= 1:
+        raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
+    asked = Request.of(scene, camera, Settings() if settings is None else settings)
+    settings, shape = asked.along, dataclasses.replace(shape_of(asked), headroom=1.0)
+    if tuning is not None:
+        shape = dataclasses.replace(shape, tuning=tuning)
+    if like is not None:
+        like.check_image(camera, settings)
+        capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
+        shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
+    measures = measured(see(asked.scene, camera, shape, Clock()), asked, shape)
+    choices = choose(measures, settings, slab_samples) if like is None else like.choices
+    made = fitted(measures, shape, settings, choices)
+    if headroom > 1 and (like is None or not like.serves(made)):
+        outgrown = like is not None and shape.num_particles > like.num_particles
+        roomy = _with_headroom(shape, headroom, outgrown)
+        made = fitting(measures, roomy, settings, choices, settings.memory_limit or shape.memory) or made
+    return made if like is None else like.grown(made)
+
+
+def _with_headroom(shape: FrameShape, headroom: float, more_particles: bool) -> FrameShape:
+    """A frame with room for more pairs, for one more class of support and, where those were outgrown, for more particles."""
+    capacity = capacity_class(math.ceil(headroom * shape.num_particles)) if more_particles else shape.num_particles
+    classes = min(shape.num_classes + 1, MAX_CLASSES)
+    return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
+
+
+def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -> Seen:
+    """Have the scene viewed, with its particles padded to the capacity of a frame."""
+    capacity = sizes.num_particles
+    if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
+        scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particle_set,), capacity=capacity))
+    between = _between(scene, sizes.integrator)
+    static = {"samples": sizes.samples, "num_classes": sizes.num_classes, "between_samples": between}
+    seen: Seen = run.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
+    return seen.with_data(scene)
+
+
+def _between(scene: Scene, integrator: str) -> bool:
+    """Whether any sphere is met between samples."""
+    return bool(scene.point_sets) or registry.between_samples(integrator)
+
+
+@compiled_quickly
+@functools.partial(jax.jit, static_argnames="capacity")
+def pad(particles: Particles, *, capacity: int) -> Particles:
+    """`Particles.padded` as a stage."""
+    return particles.padded(capacity)
+
+
+def measured(seen: Seen, asked: Request, shape: FrameShape) -> Measures:
+    """What there is to be marched, counted."""
+    return measure(seen.viewed, asked.camera, shape.samples, _stride_of(asked.along))
+
+
+def sorted_and_measured(seen: Seen, asked: Request, shape: FrameShape) -> tuple[Seen, Measures]:
+    """What is seen, measured; and beside that sorted, if the host is to."""
+    if not shape.tuning.sorts_on_host:
+        return seen, measured(seen, asked, shape)
+    with ThreadPoolExecutor(1) as thread:
+        order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
+        measures = measured(seen, asked, shape)
+        return seen._replace(order=order.result()), measures
+
+
+class Plans:
+    """The plans of a process's frames, the least recently used of which goes when there are too many."""
+
+    def __init__(self) -> None:
+        self._kept: list[Plan] = []
+        self._lock = threading.Lock()
+
+    def for_frame(self, asked: Request, run: Clock) -> tuple[Plan, Seen]:
+        """A plan for this frame, kept or new, and the frame as seen with its capacity."""
+        settings, own = asked.along, shape_of(asked)
+        limit = settings.memory_limit or own.memory
+        for shape in dict.fromkeys((self._similar(own), own)):  # the room of a kept plan may be more than there is memory for
+            run.mark("plan")
+            seen, measures = sorted_and_measured(see(asked.scene, asked.camera, shape, run), asked, shape)
+            choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0)
+            needed = fitting(measures, tight, settings, choices, limit)
+            if needed is not None:
+                break
+        needed = needed or fitted(measures, tight, settings, choices)  # which says how much memory would do
+        made = self._recalled(needed, shape, settings) or fitting(measures, shape, settings, choices, limit) or needed
+        self._keep(made)
+        run.mark("plan")
+        return made, seen
+
+    def clear(self) -> None:
+        """Forget all."""
+        with self._lock:
+            self._kept.clear()
+
+    def _similar(self, shape: FrameShape) -> FrameShape:
+        """The same frame with the capacity and the classes of the smallest kept plan that has room for it."""
+        image = shape.width, shape.height, shape.samples
+        capacities = [
+            (kept.num_particles, kept.num_classes)
+            for kept in self._kept
+            if (kept.width, kept.height, kept.samples) == image
+            and shape.num_particles <= kept.num_particles <= next_class(shape.num_particles)
+            and shape.num_classes <= kept.num_classes <= shape.num_classes + 1
+        ]
+        if not capacities:
+            return shape
+        capacity, classes = min(capacities)
+        headroom = shape.headroom * capacity / shape.num_particles
+        return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
+
+    def _recalled(self, needed: Plan, shape: FrameShape, settings: Settings) -> Plan | None:
+        """The smallest kept plan that has room for what is needed, and not much more."""
+        fits = [
+            kept
+            for kept in self._kept
+            if kept.control == needed.control
+            and kept.serves(needed)
+            and kept.is_near(needed)
+            and kept.bytes <= (settings.memory_limit or shape.memory)
+        ]
+        return min(fits, key=lambda kept: kept.lists.list_capacity, default=None)
+
+    def _keep(self, plan: Plan) -> None:
+        with self._lock:
+            self._kept = [*(kept for kept in self._kept if kept != plan), plan][-MAX_KEPT:]
+
+
+PLANS = Plans()
+
+
+def _stride_of(settings: Settings) -> int:
+    """Pixels between the rays of the first lattice; 1 where every pixel has its own."""
+    return settings.leaf_pixels // 2 if settings.screen == "quadtree" else 1
+
+
+def shape_of(asked: Request) -> FrameShape:
+    """What is known of a frame before it is measured, ghosts of periodic sets included."""
+    scene, camera, settings = asked.scene, asked.camera, asked.along
+    spheres, samples = spheres_of(scene), first_samples(settings)
+    capacity, valid = spheres.capacity, np.asarray(spheres.valid)
+    headroom = capacity / max(int(valid.sum()), 1)
+    headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
+    number = np.dtype(spheres.dtype).itemsize
+    classes = _num_classes(np.asarray(spheres.support)[valid])
+    machine = tuning_for(spheres.support), memory_for(spheres.support)
+    if scene.particles is not None and scene.particles.box is not None:
+        margin = longest_interval(camera, samples) if _between(scene, settings.integrator) else 0.0
+        capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
+    size = camera.width, camera.height, samples
+    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)
+
+
+def _num_classes(support: Any) -> int:
+    support = support[np.isfinite(support) & (support > 0)]
+    if support.size == 0:
+        return 1
+    octaves = math.log2(float(support.max()) / float(support.min()))
+    return min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)

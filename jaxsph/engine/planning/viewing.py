@@ -1,0 +1,138 @@
+"""The first stage of a frame: all that is in the scene as the camera sees it, in the units of all later stages.
+
+Flow: scene, camera -> [viewing] -> plan, stages.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.quantities import in_units_of, too_small
+from jaxsph.engine.access.resolution import too_fine
+from jaxsph.engine.access.view import Viewed, view_particles
+from jaxsph.engine.media.points import PointsMedium
+from jaxsph.engine.media.volume import VolumeMedium
+from jaxsph.engine.media.within import Within
+from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.in_range import scene_in_range
+from jaxsph.model.medium import Medium
+from jaxsph.model.periodic import unfolded
+from jaxsph.model.scene import Scene
+from jaxsph.model.spheres import first_spheres, num_spheres, spheres_of
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics import faults
+
+
+class Seen(NamedTuple):
+    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
+
+    A scene without particles has no transfer function, and particles in name only.
+    `order` is that of the particles' keys, where the host has found it; `within` is where particles are shown, None everywhere.
+    """
+
+    viewed: Viewed
+    transfer: TransferFunction | None
+    media: tuple[Medium, ...]
+    order: Int[Array, " particles"] | None = None
+    within: Clip | None = None
+
+    def with_data(self, scene: Scene) -> Seen:
+        """With the arrays of the scene that media read, which no stage is to copy."""
+        given = (*(volume for volume, _ in scene.volumes), *scene.point_sets, *scene.media)
+        return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
+
+
+@compiled_quickly
+@functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes", "between_samples"))
+def view_scene(
+    scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool = False
+) -> Seen:
+    """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
+    dtype, within = jnp.promote_types(scene.dtype, camera.dtype), scene.particles_within
+    margin = longest_interval(camera, samples) if between_samples else 0.0
+    scene, clipped = scene_in_range(scene)
+    scene, folded = _unfolded(scene, capacity, margin)
+    particles = spheres_of(scene).padded(capacity)
+    transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
+    if transfer is not None:
+        particles, transfer = in_units_of(particles, transfer)
+    depths = sphere_depths(camera, dtype, samples, between_samples)
+    viewed = view_particles(particles, camera, depths, num_classes)
+    media = _media(scene, camera, dtype)
+    word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
+    media = tuple(medium.without_data() for medium in media)
+    viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
+    return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
+
+
+def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Array, ""]]:
+    """The scene with as many ghosts of a periodic set as there is room for; and a fault word."""
+    if scene.particles is None or scene.particles.box is None:
+        return scene, jnp.int32(faults.NONE)
+    particles, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+    return dataclasses.replace(scene, particles=particles), word
+
+
+def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:
+    return None if clip is None else jax.tree.map(lambda leaf: leaf.astype(dtype), clip.seen_by(camera))  # type: ignore[no-any-return]
+
+
+def _media(scene: Scene, camera: Camera, dtype: Any) -> tuple[Medium, ...]:
+    """All media but particles, in view space."""
+    clip = _clip(scene.within, camera, dtype)
+    volumes = (VolumeMedium.seen(volume, transfer, camera) for volume, transfer in scene.volumes)
+    first = first_spheres(scene)
+    sets = (PointsMedium.seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
+    return tuple(Within.of(one, clip) for one in (*volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)))
+
+
+def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
+    """View depths s(0), s(1/2), ... s(N): fine samples sit at the odd entries, between borders at the even ones."""
+    return camera.depth(jnp.arange(2 * samples + 1, dtype=dtype) / 2, samples).astype(dtype)
+
+
+def longest_interval(camera: Camera, samples: int) -> Float[Array, ""]:
+    """Path length between neighbouring samples on borders, where they are farthest apart."""
+    depth = half_steps(camera, camera.dtype, samples)[::2]
+    step = (depth[1:] - depth[:-1]).max()
+    if not camera.is_perspective:
+        return step
+    return step * jnp.sqrt(1 + camera.half_height**2 * (1 + (camera.width / camera.height) ** 2))
+
+
+def sphere_depths(camera: Camera, dtype: Any, samples: int, between_samples: bool) -> Float[Array, " samples"]:
+    """Depths of the fine samples, by which spheres are ordered; out to the borders of the first and the last where they count."""
+    steps = half_steps(camera, dtype, samples)
+    depths = steps[1::2]
+    if not between_samples:
+        return depths
+    return depths.at[0].set(steps[0]).at[-1].set(steps[-1]) if samples > 1 else steps[::2]
+
+
+def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
+    numbers = jnp.concatenate([camera.eye, camera.axes.ravel(), jnp.stack([camera.half_height, camera.near, camera.far])])
+    usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
+    if camera.is_perspective:
+        usable &= camera.near > 0
+    word = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~usable)
+    for transfer in (scene.transfer, *(look for _, look in scene.volumes)):
+        if transfer is not None:
+            word |= faults.raised(faults.BAD_TRANSFER, ~_shows(transfer))
+    return word
+
+
+def _shows(transfer: TransferFunction) -> Bool[Array, ""]:
+    """Whether a transfer function is usable, once it is in range."""
+    shown = jnp.isfinite(transfer.colors).all() & jnp.isfinite(transfer.extinction).all()
+    for part in transfer.parts():
+        shown &= jnp.isfinite(part.values).all() & ~too_small(part.values)
+    return shown

@@ -1,0 +1,149 @@
+"""The verb: particles in, image out.
+
+Flow: view_scene -> plan -> frame, band by band -> layers -> Image.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+
+from jaxsph.engine.frame.bands import Progress, Work
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.images import image_of, traced_image_of
+from jaxsph.engine.frame.layers import Drawn, crop, of_band
+from jaxsph.engine.frame.over_mesh import drawn_over_mesh
+from jaxsph.engine.frame.refinement import refined
+from jaxsph.engine.planning.fit import PLANS, see
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.request import Request, along_rays
+from jaxsph.engine.runtime.device_executors import OnDevices
+from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
+from jaxsph.engine.runtime.executors import Clock, Traced
+from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
+from jaxsph.model.asked import require_asked
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import is_traced
+
+MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    settings: Settings | None = None,
+    *,
+    plan: Plan | None = None,
+    progress: Progress | None = None,
+    devices: Any = None,
+) -> Image:
+    """Render a scene.
+
+    Eagerly, capacities are planned for the frame (or those of an earlier, similar frame taken), stages are timed apart, and
+    faults raise. Under `jax.jit` or `jax.vmap` the
+    function is pure, needs a `plan`, and reports faults in `image.faults`.
+
+    Args:
+        scene: particles and transfer function.
+        camera: where from, and how large the image is.
+        settings: samples, memory limit; default `Settings()`.
+        plan: capacities from `jaxsph.plan`, for this scene or a similar one; particles are padded to it.
+        progress: eager only; called as `progress(done, total)` after every band.
+        devices: what the work is shared among: `"all"`, a number, a sequence of `jax.Device`, or a `jax.sharding.Mesh`. Eagerly
+            the image is the same bit for bit (with segments for a tolerance, and where rays end, within the estimate); under a
+            trace a mesh of any axes, automatic or explicit, makes the same image to rounding. Each device holds all particles.
+            None is where the particles are.
+
+    Returns:
+        Image with dtype of the particles.
+
+    Differentiation:
+        `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
+        camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
+        grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
+        memory does not grow with samples or particles in a cell. Images with super-pixels or of the pilot estimator have no
+        derivatives and raise `NotImplementedError`, as do second derivatives.
+
+    Raises:
+        ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,
+            more devices than there are.
+        CapacityError: eager, when a given `plan` is too small for this frame.
+
+    Warns:
+        UserWarning: eager, where segments cannot keep a tolerance everywhere; `error_bound` says where.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
+    """
+    settings = Settings() if settings is None else settings
+    if plan is not None and not isinstance(plan, Plan):
+        raise ValueError(f"`plan` must be a `jaxsph.Plan`, got {type(plan).__name__}; make one with `jaxsph.plan`")
+    if is_traced(scene, camera, settings):
+        require_asked(scene, camera, settings)
+        if plan is None:
+            raise ValueError(
+                "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`"
+            )
+        plan.check(scene, camera, along_rays(scene, settings))
+        PROGRAMS.make_room()
+        return _render_traced(scene, camera, settings, plan, devices)
+    return _render_eager(scene, camera, settings, plan, progress, devices)
+
+
+def _render_eager(
+    scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, progress: Progress | None, devices: Any
+) -> Image:
+    clock = Clock() if devices is None else OnDevices(chosen_devices(devices))
+    planned, asked = plan is None, Request.of(scene, camera, settings)
+    if plan is None:
+        plan, seen = PLANS.for_frame(asked, clock)
+    else:
+        plan.check(asked.scene, camera, asked.along)
+        clock.mark("plan")
+        seen = see(asked.scene, camera, plan, clock)
+    drawn = Work(seen, camera, settings, plan, asked.scene.formulas).drawn(clock, progress)
+    return image_of(drawn, camera, settings, plan, clock, planned=planned)
+
+
+def _render_traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan, devices: Any) -> Image:
+    """As one program of all that is traced: numbers of settings that are known stay so."""
+    if plan.quadtree is not None and devices is not None:
+        raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
+    numbers, structure = jax.tree.flatten(settings)
+    known = tuple(None if is_traced(number) else number for number in numbers)
+    program = _program(plan, structure, known, None if devices is None else mesh_of(devices))
+    image: Image = program(scene, camera, [number for number in numbers if is_traced(number)])
+    return image
+
+
+@kept_while_there_is_room
+@functools.lru_cache(maxsize=MAX_TRACED)
+def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> Any:
+    """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
+
+    Within one, it is no call of its own.
+    """
+
+    def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
+        given = iter(numbers)
+        settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
+        drawn = _traced(scene, camera, settings, plan) if mesh is None else drawn_over_mesh(scene, camera, settings, plan, mesh)
+        return traced_image_of(drawn, settings, plan)
+
+    return jax.jit(image, inline=True)
+
+
+def _traced(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
+    """All bands, as parts of a trace."""
+    run = Traced()
+    seen = see(scene, camera, plan, run)
+    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
+    if plan.quadtree is not None:
+        return refined(frame, run, seen.viewed.faults)
+    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
+    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)

@@ -1,0 +1,93 @@
+"""What is asked for: a scene that can be marched, a camera, and settings that it can keep; what cannot be is refused here.
+
+Flow: scene, camera, settings -> [request] -> planning, render.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+from jaxsph.engine.media.in_octree import reachable
+from jaxsph.model.asked import require_asked
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.registry import AT_POINTS, ESTIMATING
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+
+FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
+
+
+class Request(NamedTuple):
+    """A picture that is asked for.
+
+    Attributes:
+        scene: with particles and points in octrees, where the integrator chooses for itself where it asks them.
+        camera: in whose view.
+        settings: as they were given.
+        along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
+    """
+
+    scene: Scene
+    camera: Camera
+    settings: Settings
+    along: Settings
+
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
+        """Of concrete arrays.
+
+        Raises:
+            ValueError: arguments of other kinds, or a combination that nothing can render.
+        """
+        require_asked(scene, camera, settings)
+        scene = reachable(scene, settings)
+        return cls(scene, camera, settings, along_rays(scene, settings))
+
+
+def first_samples(settings: Settings) -> int:
+    """Samples that rays are cut by before any are doubled."""
+    return -(-settings.samples // FIRST) if settings.is_refined else settings.samples
+
+
+def along_rays(scene: Scene, settings: Settings) -> Settings:
+    """Settings of error control along rays: without a tolerance where only the screen can keep it.
+
+    Raises:
+        ValueError: where a scene lacks a part, holds a medium that its integrator cannot ask for points, or a tolerance is asked
+            for that nothing can keep.
+    """
+    scene.check()
+    if settings.integrator in AT_POINTS:
+        _require_points(scene, settings.integrator)
+    if settings.tolerance is None:
+        return settings
+    beyond = {
+        f"`integrator={settings.integrator!r}`": settings.integrator not in ("samples", *ESTIMATING),
+        f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
+        "`Scene(media=...)`": bool(scene.media),
+        "`Scene(volume=...)`": scene.volume is not None,
+        "`Scene(points=...)`": bool(scene.point_sets),
+    }
+    if settings.screen == "quadtree":
+        pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
+        pays = pays and settings.integrator == "samples"
+        return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
+    if settings.is_refined:
+        return settings
+    for what, asked in beyond.items():
+        if asked:
+            raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
+    return settings
+
+
+def _require_points(scene: Scene, integrator: str) -> None:
+    """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
+    given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
+    refused = [(what, "put it into an octree by `jaxsph.in_octree`") for what, there in given.items() if there]
+    refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
+    for what, remedy in refused:
+        raise ValueError(
+            f"`integrator={integrator!r}` asks media for points of its own choosing, which `{what}` cannot answer; "
+            f"{remedy}, or give `integrator='samples'`"
+        )

@@ -1,0 +1,1 @@
+"""What programs are run by: compiled programs, executors, devices, memory, tuning."""

@@ -1,0 +1,206 @@
+"""Compiled programs: made once for the shapes that they are given, several at a time, kept while they are used, truly let go.
+
+A program is traced where it is asked for and compiled beside that, on threads of its own; who calls it waits for it. JAX keeps
+what it compiled for as long as the compiled function lives: so each program is a function of its own, and goes with it.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import functools
+import gc
+import os
+import threading
+import warnings
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from jaxsph.engine.runtime import free_memory, memory_maps
+
+QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+"""What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
+of its two emitters. Of the stages so compiled none runs for longer; the march would take four times as long."""
+MAX_PROGRAMS = 128  # those of about fourteen frames of different shapes: some 20,000 memory maps of 65,530, and 600 MB
+
+FLAGS = (
+    "jax_enable_x64",
+    "jax_default_device",
+    "jax_default_matmul_precision",
+    "jax_debug_nans",
+    "jax_debug_infs",
+    "jax_numpy_dtype_promotion",
+)
+"""Settings of JAX's that a program is compiled under."""
+
+Function = TypeVar("Function")
+Cached = TypeVar("Cached")
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A function of fixed shapes, compiled or on the way.
+
+    Attributes:
+        result: shapes of what it returns.
+        compiled: where it is to be found.
+    """
+
+    result: Any
+    compiled: Future[Callable[..., Any]]
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run it, once it is compiled."""
+        return self.compiled.result()(*arguments)
+
+
+class Programs:
+    """The programs of a process, the least recently used of which goes when there are too many."""
+
+    def __init__(self, most: int = MAX_PROGRAMS) -> None:
+        self._most = most
+        self._kept: collections.OrderedDict[Hashable, Program] = collections.OrderedDict()
+        self._lock = threading.RLock()
+        self._counting = threading.Lock()  # of its own, as who has compiled a program is not to wait for who traces the next
+        self._compiling = 0
+        self._let_go = False
+        self._warned = False
+        self._told: Callable[[], None] | None = None
+
+    def on_compile(self, told: Callable[[], None] | None) -> None:
+        """Have `told` called whenever a program is not at hand and begins to be compiled."""
+        self._told = told
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __contains__(self, wanted: tuple[Any, tuple[Any, ...], dict[str, Hashable]]) -> bool:
+        return _key(*wanted)[0] in self._kept
+
+    def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+        """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
+        key, shapes = _key(function, arguments, static)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            while len(self._kept) >= self._most:
+                self._kept.popitem(last=False)
+                self._let_go = True
+            self.make_room()
+            if self._told is not None:
+                self._told()
+            program = self._kept[key] = _made(function, shapes, static)
+            with self._counting:
+                self._compiling += 1
+        program.compiled.add_done_callback(functools.partial(self._compiled, key))
+        return program
+
+    def make_room(self) -> None:
+        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
+        with self._lock:
+            while self._kept and memory_maps.crowded():
+                for _ in range(-(-len(self._kept) // 2)):
+                    self._kept.popitem(last=False)
+                gc.collect()
+            if not memory_maps.crowded():
+                return
+            for let_go in _LET_GO:
+                let_go()
+            gc.collect()
+            if memory_maps.crowded() and not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"this process holds over {memory_maps.CROWDED:.0%} of the {memory_maps.limit()} memory maps that it may "
+                    "have, in programs that are not jaxsph's own, and ends without a word when it needs more: call "
+                    "`jax.clear_caches()`, and jit functions once instead of anew",
+                    stacklevel=3,
+                )
+
+    def clear(self) -> None:
+        """Let go of all."""
+        with self._lock:
+            self._kept.clear()
+        gc.collect()
+
+    def _compiled(self, key: Hashable, compiled: Future[Any]) -> None:
+        if compiled.cancelled() or compiled.exception() is not None:
+            with self._lock:
+                self._kept.pop(key, None)
+        with self._counting:
+            self._compiling -= 1
+            tidy = self._let_go and self._compiling == 0
+            self._let_go &= not tidy
+        if tidy:  # it takes a tenth of a second, which the first frames of a process need not wait for
+            free_memory.give_back()
+
+
+PROGRAMS = Programs()
+
+
+def shapes_of(tree: Any) -> Any:
+    """Arrays as shapes and dtypes, with where they are if that was chosen for them."""
+    return jax.tree.map(_shape_of, tree)
+
+
+def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return leaf
+    sharding = leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None
+    weak = bool(getattr(leaf, "weak_type", False))
+    return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
+
+
+def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
+    shapes = shapes_of(arguments)
+    leaves, structure = jax.tree.flatten(shapes)
+    flags = tuple(getattr(jax.config, name) for name in FLAGS)
+    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags), shapes
+
+
+def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+    def program(*arguments: Any) -> Any:
+        return function.__wrapped__(*arguments, **static)
+
+    program.__name__ = function.__name__
+    traced = jax.jit(program).trace(*shapes)
+    places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
+    place = places.pop() if len(places) == 1 else None
+    result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
+    return Program(result, _threads().submit(_compile, traced.lower(), function in _QUICKLY))
+
+
+_QUICKLY: set[Any] = set()
+_LET_GO: list[Callable[[], None]] = []
+
+
+def kept_while_there_is_room(cached: Cached) -> Cached:
+    """Mark a cache of functions that hold programs of their own as one to empty where memory maps are short."""
+    _LET_GO.append(cached.cache_clear)  # type: ignore[attr-defined]
+    return cached
+
+
+def compiled_quickly(function: Function) -> Function:
+    """Mark a jitted function as one that takes longer to compile than to run."""
+    _QUICKLY.add(function)
+    return function
+
+
+def _compile(lowered: jax.stages.Lowered, quickly: bool) -> Callable[..., Any]:
+    if not quickly or jax.default_backend() != "cpu":
+        return lowered.compile()
+    try:
+        return lowered.compile(compiler_options=QUICKLY)
+    except jax.errors.JaxRuntimeError:  # options are XLA's own affair, and come and go with its versions
+        return lowered.compile()
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Threads that compile: XLA holds no lock of Python's meanwhile, and uses little more than one core for a program."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(min(max(cores, 2), 8), "jaxsph-compile")

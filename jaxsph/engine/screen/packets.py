@@ -1,0 +1,120 @@
+"""From wanted pixels to packets of rays: scattered rays of a bundle, or all of it.
+
+Flow: quadtree -> [packets] -> cast.
+
+A bundle of which few rays are wanted is cast as one packet of scattered rays; one of which more than `SCATTERED` are wanted is
+cast whole, as a tensor product, which takes less than to cast them apart (and tells all of its pixels).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.lists import BUNDLE, ListPlan
+from jaxsph.engine.field.tasks import RayPackets
+from jaxsph.model.camera.camera import Camera
+
+SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
+
+
+@dataclasses.dataclass(frozen=True)
+class Chosen:
+    """Some bundles, of which some rays are cast.
+
+    Attributes:
+        bundle: which they are.
+        place: of each ray, its pixel in the bundle, row by row.
+        real: rays that are cast, others are room; a packet of which none is real is room.
+    """
+
+    bundle: Int[Array, " packets"]
+    place: Int[Array, "rays packets"]
+    real: Bool[Array, "rays packets"]
+
+    def pixels(self, grid: Grid, shape: tuple[int, int]) -> Int[Array, "packets rays"]:
+        """Where rays are in an image of that shape, row by row; past the last pixel where there is no such ray."""
+        row = grid.row[self.bundle] + self.place // BUNDLE
+        column = grid.column[self.bundle] + self.place % BUNDLE
+        inside = self.real & (row < shape[0]) & (column < shape[1])
+        return jnp.where(inside, row * shape[1] + column, shape[0] * shape[1]).T
+
+
+@dataclasses.dataclass(frozen=True)
+class Queue:
+    """Bundles of which rays are wanted, one after the other.
+
+    Attributes:
+        wanted: of each bundle, which of its pixels.
+        bundle: the bundles that are to be cast, and past `number` any.
+    """
+
+    wanted: Bool[Array, "bundles 64"]
+    bundle: Int[Array, " bundles"]
+    number: Int[Array, ""]
+
+
+def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"]) -> Bool[Array, "bundles 64"]:
+    """The pixels of a band, at least as large as its image, bundle by bundle; the opposite of `ListPlan.as_image`."""
+    rows, columns = lists.bundles
+    image = jnp.pad(image, ((0, max(rows * BUNDLE - image.shape[0], 0)), (0, max(columns * BUNDLE - image.shape[1], 0))))
+    parts = image[: rows * BUNDLE, : columns * BUNDLE].reshape(lists.tile_rows, 2, BUNDLE, lists.tile_columns, 2, BUNDLE)
+    return parts.transpose(0, 3, 1, 4, 2, 5).reshape(lists.num_bundles, BUNDLE * BUNDLE)
+
+
+def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
+    """What is cast as scattered rays, and what as whole bundles."""
+    count = wanted.sum(1)
+    scattered, whole = (count > 0) & (count <= SCATTERED), count > SCATTERED
+    everything = jnp.ones_like(wanted)
+    return _queue(wanted, scattered), _queue(everything, whole)
+
+
+def _queue(wanted: Array, some: Bool[Array, " bundles"]) -> Queue:
+    (bundle,) = jnp.nonzero(some, size=some.shape[0], fill_value=0)
+    return Queue(wanted, bundle.astype(jnp.int32), some.sum(dtype=jnp.int32))
+
+
+def scattered(queue: Queue, first: Int[Array, ""], packets: int) -> Chosen:
+    """The wanted rays of so many bundles of a queue."""
+    bundle, inside = _next(queue, first, packets)
+    wanted = queue.wanted[bundle].T & inside
+    nth = jnp.cumsum(wanted, 0, dtype=jnp.int32) - 1
+    slot, pixel = jnp.arange(SCATTERED, dtype=jnp.int32)[:, None, None], jnp.arange(wanted.shape[0], dtype=jnp.int32)[:, None]
+    mine = wanted & (nth == slot)
+    place = jnp.where(mine, pixel, 0).sum(1)
+    real = mine.any(1)
+    return Chosen(bundle, jnp.where(real, place, place[0]), real)
+
+
+def whole(queue: Queue, first: Int[Array, ""], packets: int) -> Chosen:
+    """All rays of so many bundles of a queue."""
+    bundle, inside = _next(queue, first, packets)
+    place = jnp.arange(queue.wanted.shape[1], dtype=jnp.int32)[:, None]
+    return Chosen(bundle, jnp.broadcast_to(place, (place.shape[0], packets)), jnp.broadcast_to(inside, (place.shape[0], packets)))
+
+
+def _next(queue: Queue, first: Int[Array, ""], packets: int) -> tuple[Int[Array, " packets"], Bool[Array, " packets"]]:
+    nth = first + jnp.arange(packets, dtype=jnp.int32)
+    return queue.bundle[jnp.minimum(nth, queue.bundle.shape[0] - 1)], nth < queue.number
+
+
+def scattered_packets(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
+    """Their rays; those that are room go where the first one does. Differentiable by the camera."""
+    dtype = grid.half_steps.dtype
+    u = camera.column((grid.column[chosen.bundle] + chosen.place % BUNDLE).astype(dtype) + 0.5)
+    v = camera.row((grid.row[chosen.bundle] + chosen.place // BUNDLE).astype(dtype) + 0.5)
+    return RayPackets(u, v, chosen.bundle, chosen.real.any(0), scattered=True)
+
+
+def whole_packets(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
+    """Their rays, as tensor products. Differentiable by the camera."""
+    return RayPackets(*grid.rays(camera, chosen.bundle), chosen.bundle, chosen.real.any(0))
+
+
+for _kind in (Chosen, Queue):
+    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

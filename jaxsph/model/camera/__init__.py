@@ -1,0 +1,1 @@
+"""Cameras, the paths they move along, and how they frame what there is."""

@@ -1,0 +1,1 @@
+"""Parts of space, in which alone a medium is shown."""

@@ -1,0 +1,325 @@
+"""Shapes of clips: a plane, a box and a sphere.
+
+Flow: user -> [clip_shapes] -> clips -> scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common, fill, made, register
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.given import plain
+
+ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class Plane(Clip):
+    """What lies on the side of a plane that its normal points to; `~plane` is the other side.
+
+    Attributes:
+        point: any of the plane, length units.
+        normal: of length 1.
+        rest: what rounding a float64 point has left, length units.
+    """
+
+    point: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    rest: Float[Array, "3"] = dataclasses.field(init=False)
+
+    def __init__(self, point: Any, normal: Any):
+        """Check and pack.
+
+        Args:
+            point: (3,) on the plane, length units.
+            normal: (3,), of any length but 0.
+
+        Raises:
+            ValueError: other shapes, numbers that are not finite, a normal of zeros.
+        """
+        near, rest = _vector("point", point)
+        if is_traced(normal):
+            along = normal / jnp.linalg.norm(normal)
+        else:
+            along, _ = _exact("normal", normal)
+            if not along.any():
+                raise ValueError("`normal` must not be (0, 0, 0): it tells which side of the plane is shown; give a direction")
+            along = along / np.abs(along).max()
+            along = along / np.linalg.norm(along)
+        fill(self, point=near, normal=jnp.asarray(along, near.dtype), rest=rest)
+
+    def seen_by(self, camera: Camera) -> Plane:
+        """See `Clip`."""
+        point = camera.to_view(self.point, self.rest)
+        normal = camera.rotate(self.normal).astype(point.dtype)
+        return made(Plane, point=point, normal=normal, rest=jnp.zeros_like(point))
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        return self._height(place) >= 0
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`."""
+        return _halves(self._height(begin), self._height(end))
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        low, high = _heights(self.point, self.normal, lower, upper)
+        return Overlap(high >= 0, low >= 0)
+
+    def _height(self, place: Place) -> Array:
+        return _along(self.normal, place, self.point)
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class Box(Clip):
+    """A box along the axes; `~box` is all but it.
+
+    Attributes:
+        lower, upper: corners, length units.
+        rest: what rounding float64 corners has left, a row each, length units.
+    """
+
+    lower: Float[Array, "3"]
+    upper: Float[Array, "3"]
+    rest: Float[Array, "2 3"] = dataclasses.field(init=False)
+
+    def __init__(self, lower: Any, upper: Any):
+        """Check and pack.
+
+        Args:
+            lower, upper: (3,) corners, length units; lower < upper.
+
+        Raises:
+            ValueError: other shapes, numbers that are not finite, corners that do not ascend.
+        """
+        lower, upper = plain("lower", lower), plain("upper", upper)
+        (low, low_rest), (high, high_rest) = _vector("lower", lower), _vector("upper", upper)
+        dtype = jnp.promote_types(low.dtype, high.dtype)
+        if not is_traced(lower, upper):
+            ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+            if not (ends[0] < ends[1]).all():
+                raise ValueError(f"`lower` must be below `upper` along each axis, got {ends[0].tolist()} and {ends[1].tolist()}")
+        rest = jnp.stack([low_rest.astype(dtype), high_rest.astype(dtype)])
+        fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=rest)
+
+    @property
+    def sides(self) -> Float[Array, "3"]:
+        """Lengths along x, y and z."""
+        return (self.upper - self.lower) + (self.rest[1] - self.rest[0])
+
+    def seen_by(self, camera: Camera) -> TurnedBox:
+        """See `Clip`."""
+        origin = camera.to_view(self.lower, self.rest[0])
+        return TurnedBox(origin, camera.axes.T.astype(origin.dtype), self.sides.astype(origin.dtype))
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        return self._turned().contains(place)
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`."""
+        return self._turned().spans(begin, end)
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        return self._turned().over(lower, upper)
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner in float64 (host side)."""
+        rest = np.asarray(self.rest, np.float64)
+        return np.asarray(self.lower, np.float64) + rest[0], np.asarray(self.upper, np.float64) + rest[1]
+
+    def of_dtype(self, dtype: Any) -> Box:
+        """The same in float32 or float64 (host side)."""
+        return Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in self.corners()))
+
+    def _turned(self) -> TurnedBox:
+        return TurnedBox(self.lower, jnp.eye(3, dtype=self.lower.dtype), self.sides)
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnedBox(Clip):
+    """A box along axes of its own.
+
+    Attributes:
+        origin: its lower corner, length units.
+        axes: rows, orthonormal.
+        sides: lengths along those.
+    """
+
+    origin: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+    sides: Float[Array, "3"]
+
+    def seen_by(self, camera: Camera) -> TurnedBox:
+        """See `Clip`."""
+        turned = jnp.stack([camera.rotate(axis) for axis in self.axes])
+        return TurnedBox(camera.to_view(self.origin), turned, self.sides)
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(self._coordinates(place), self.sides, strict=True))
+        return x & y & z
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`."""
+        spans = None
+        for first, last, side in zip(self._coordinates(begin), self._coordinates(end), self.sides, strict=True):
+            between = common(_halves(first, last), _halves(side - first, side - last))
+            spans = between if spans is None else common(spans, between)
+        assert spans is not None
+        return spans
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        meets: Any = True
+        holds: Any = True
+        for axis, side in zip(self.axes, self.sides, strict=True):
+            low, high = _heights(self.origin, axis, lower, upper, jnp.abs(side))
+            meets, holds = meets & (high >= 0) & (low <= side), holds & (low >= 0) & (high <= side)
+        return Overlap(meets, holds)
+
+    def _coordinates(self, place: Place) -> list[Array]:
+        return [_along(axis, place, self.origin) for axis in self.axes]
+
+
+@dataclasses.dataclass(frozen=True, init=False)
+class Sphere(Clip):
+    """A ball; `~sphere` is all but it.
+
+    Attributes:
+        center, radius: length units.
+        rest: what rounding a float64 centre has left, length units.
+    """
+
+    center: Float[Array, "3"]
+    radius: Float[Array, ""]
+    rest: Float[Array, "3"] = dataclasses.field(init=False)
+
+    def __init__(self, center: Any, radius: Any):
+        """Check and pack.
+
+        Args:
+            center: (3,), length units.
+            radius: > 0, length units.
+
+        Raises:
+            ValueError: other shapes, numbers that are not finite, a radius that is not > 0.
+        """
+        radius = plain("radius", radius)
+        near, rest = _vector("center", center)
+        if not is_traced(radius):
+            require_shape("radius", radius, (), "give one number")
+            require_finite("radius", radius, "give a length")
+            require_positive("radius", radius, "give a length")
+        fill(self, center=near, radius=jnp.asarray(radius, near.dtype), rest=rest)
+
+    def seen_by(self, camera: Camera) -> Sphere:
+        """See `Clip`."""
+        center = camera.to_view(self.center, self.rest)
+        return made(Sphere, center=center, radius=self.radius.astype(center.dtype), rest=jnp.zeros_like(center))
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        return _square(self._from_center(place)) <= self.radius * self.radius
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`; a chord so short that rounding hides it is none."""
+        first = self._from_center(begin)
+        way = [last - own for last, own in zip(end, begin, strict=True)]
+        length = _square(way)
+        moves = length > 0
+        inverse = 1 / jnp.where(moves, length, 1)
+        foot = -sum(own * step for own, step in zip(first, way, strict=True)) * inverse
+        nearest = _square([own + foot * step for own, step in zip(first, way, strict=True)])
+        inner = (self.radius * self.radius - nearest) * inverse
+        met = moves & (inner > jnp.finfo(inner.dtype).tiny)
+        half = jnp.sqrt(jnp.where(met, inner, 1))
+        within = ~moves & (_square(first) <= self.radius * self.radius)
+        return _span(jnp.where(met, foot - half, 0), jnp.where(met, foot + half, jnp.where(within, 1, 0)))
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        near, far = [], []
+        slack: Any = 0
+        for low, high, own in zip(lower, upper, self.center, strict=True):
+            near.append(jnp.maximum(jnp.maximum(low - own, own - high), 0))
+            far.append(jnp.maximum(high - own, own - low))
+            slack = slack + jnp.maximum(jnp.abs(low), jnp.abs(high)) + jnp.abs(own)
+        slack = ROUNDING * jnp.finfo(self.radius.dtype).eps * (slack + jnp.abs(self.radius))
+        return Overlap(jnp.sqrt(_square(near)) <= self.radius + slack, jnp.sqrt(_square(far)) <= self.radius - slack)
+
+    def _from_center(self, place: Place) -> list[Array]:
+        return [at - own for at, own in zip(place, self.center, strict=True)]
+
+
+def _exact(name: str, value: Any) -> tuple[np.ndarray, Any]:
+    """A vector in float64, and the dtype that it is to have."""
+    value = plain(name, value)
+    given = np.asarray(value)
+    if given.shape != (3,):
+        raise ValueError(f"`{name}` must have shape (3,), got {given.shape}; give x, y and z")
+    exact = given.astype(np.float64)
+    require_finite(name, exact, "give x, y and z")
+    wide = hasattr(value, "dtype") and jax.dtypes.canonicalize_dtype(given.dtype) == jnp.float64
+    return exact, jnp.float64 if wide else jnp.float32
+
+
+def _vector(name: str, value: Any) -> tuple[Array, Array]:
+    """A vector as rounded, and what that has left."""
+    if is_traced(value):
+        given = jnp.asarray(value)
+        return given, jnp.zeros_like(given)
+    exact, dtype = _exact(name, value)
+    near = exact.astype(dtype)
+    return jnp.asarray(near), jnp.asarray(exact - near, dtype)
+
+
+def _along(axis: Array, place: Place, origin: Array) -> Array:
+    """Coordinates of points along an axis, from an origin on."""
+    x, y, z = (at - own for at, own in zip(place, origin, strict=True))
+    return axis[0] * x + axis[1] * y + axis[2] * z
+
+
+def _heights(origin: Array, axis: Array, lower: Place, upper: Place, further: Any = 0.0) -> tuple[Array, Array]:
+    """The least and the greatest coordinate of boxes along an axis, rounded outwards; `further` is what they are held against."""
+    low: Any = 0
+    high: Any = 0
+    off: Any = further
+    for least, most, own, scale in zip(lower, upper, origin, axis, strict=True):
+        ends = scale * (least - own), scale * (most - own)
+        low, high = low + jnp.minimum(*ends), high + jnp.maximum(*ends)
+        off = off + jnp.abs(scale) * (jnp.maximum(jnp.abs(least), jnp.abs(most)) + jnp.abs(own))
+    slack = ROUNDING * jnp.finfo(origin.dtype).eps * off
+    return low - slack, high + slack
+
+
+def _square(vector: list[Array]) -> Array:
+    return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
+
+
+def _halves(first: Array, last: Array) -> Spans:
+    """Where a number that changes evenly from `first` to `last` is at least 0."""
+    above, after = first >= 0, last >= 0
+    crosses = above != after
+    change = jnp.where(crosses, last - first, 1)
+    place = jnp.clip(-first / change, 0, 1)
+    begin = jnp.where(above, 0, jnp.where(after, place, 1))
+    return _span(begin, jnp.where(after, 1, jnp.where(above, place, 1)))
+
+
+def _span(begin: Array, end: Array) -> Spans:
+    return ascending(jnp.clip(begin, 0, 1)[None], jnp.clip(end, 0, 1)[None])
+
+
+for _kind in (Plane, Box, TurnedBox, Sphere):
+    register(_kind)

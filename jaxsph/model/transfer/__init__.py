@@ -1,0 +1,1 @@
+"""Transfer functions: from values to colours and extinction."""

@@ -1,0 +1,308 @@
+"""Transfer function: what a quantity looks like.
+
+Flow: [transfer] -> cast -> image.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.model.transfer.ways import TransferWays
+from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.given import plain
+
+
+@dataclasses.dataclass(frozen=True)
+class TransferFunction(TransferWays):
+    """Piecewise linear map of a quantity Q to colour and extinction, clamped at its ends.
+
+    Two equal neighbours in `values` make a jump; the later point holds at the jump itself.
+
+    Attributes:
+        values: ascending control points, in units of the quantity.
+        colors: RGB in [0, 1] at the control points.
+        extinction: >= 0 at the control points, per length unit.
+        extinction_values: ascending control points of extinction, where those are others; None where both have the same. Of
+            particles that carry two quantities, these are in units of the second.
+    """
+
+    values: Float[Array, " points"]
+    colors: Float[Array, "points 3"]
+    extinction: Float[Array, " points_of_extinction"]
+    extinction_values: Float[Array, " points_of_extinction"] | None = None
+
+    @classmethod
+    def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
+        """Check and pack control points.
+
+        All are numbers: which unit a scene's quantities and lengths have is not known here, so arrays that carry units are
+        refused.
+
+        Args:
+            values: (K,) ascending (equal neighbours allowed), K >= 1, units of the quantity.
+            colors: (K, 3) in [0, 1].
+            extinction: (K,) >= 0, per length unit; (M,) where `extinction_values` are given.
+            extinction_values: (M,) ascending, M >= 1: control points of extinction alone. Of particles with two quantities
+                (`Particles.from_arrays(..., quantity=(A, B))`) colour is then a function of A, extinction one of B; of what
+                carries one quantity, both are functions of that, each with its own control points.
+
+        Raises:
+            ValueError: wrong shapes, non-finite values, values that descend, colours outside [0, 1], extinction < 0 (by
+                more than rounding, which is taken back), values that the dtype cannot hold apart.
+        """
+        given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
+        given = {name: numbers(name, value) for name, value in given.items() if value is not None}
+        given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
+        for name, value in given.items():
+            require_real(name, value)
+        control = [name for name in ("values", "extinction_values") if name in given]
+        for name in control:
+            require_shape(name, given[name], (None,), "one number a control point")
+            if given[name].shape[0] < 1:
+                raise ValueError(f"`{name}` must hold at least one control point, got none")
+        points, of_extinction = (given[name].shape[0] for name in (control[0], control[-1]))
+        require_shape("colors", given["colors"], (points, 3), f"one RGB row for each of the {points} values")
+        require_shape(
+            "extinction", given["extinction"], (of_extinction,), f"one number for each of the {of_extinction} {control[-1]}"
+        )
+        if not is_traced(*given.values()):
+            for name, value in given.items():
+                require_finite(name, value)
+            given["colors"] = rounded_into("colors", given["colors"], (0, 1), "colours lie in [0, 1]")
+            darkest = "extinction is a loss of light, never a gain"
+            given["extinction"] = rounded_into("extinction", given["extinction"], (0, np.inf), darkest)
+            for name in control:
+                _require_ascending(name, given[name])
+        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
+        packed = {name: jnp.asarray(value, dtype) for name, value in given.items()}
+        if not is_traced(*given.values()):
+            for name, value in packed.items():
+                require_finite(name, value, f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
+            for name in control:
+                _require_apart(name, np.asarray(given[name], np.float64), packed[name])
+        return cls(**packed)
+
+    def __call__(
+        self, quantity: Float[Array, "..."], extinction_quantity: Float[Array, "..."] | None = None
+    ) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
+        """Colour and extinction of `quantity` (any shape): `colour(Q)` (..., 3), `extinction(Q)` (...) per length unit.
+
+        Args:
+            quantity: that of colours.
+            extinction_quantity: that of extinction; by default, the same.
+        """
+        other = quantity if extinction_quantity is None else extinction_quantity
+        parts, quantities = self.parts(), [jnp.asarray(value, self.values.dtype) for value in (quantity, other)]
+        channels = look_up(parts[0].segments(), quantities[0])
+        of_other = channels if len(parts) == 1 and other is quantity else look_up(parts[-1].segments(), quantities[1])
+        return jnp.stack(channels[:3], -1), of_other[3]
+
+    def parts(self) -> tuple[TransferFunction, ...]:
+        """By the quantities that they are looked up by: itself; or colours, where extinction is 1, and extinction in black."""
+        if self.extinction_values is None:
+            return (self,)
+        black = jnp.zeros((*self.extinction.shape, 3), self.colors.dtype)
+        return (
+            TransferFunction(self.values, self.colors, jnp.ones_like(self.values)),
+            TransferFunction(self.extinction_values, black, self.extinction),
+        )
+
+    def segments(self) -> Segments:
+        """The tables that `look_up` reads, of what has no `extinction_values`: made once, outside of loops."""
+        table = jnp.concatenate([self.colors, self.extinction[:, None]], 1).T
+        change = jnp.append(table[:, 1:] - table[:, :-1], jnp.zeros((4, 1), table.dtype), 1)
+        width = jnp.append(self.values[1:] - self.values[:-1], 0)
+        largest = jnp.finfo(width.dtype).max
+        inverse = jnp.where(width > 0, jnp.minimum(1 / jnp.where(width > 0, width, 1), largest), 0)
+        buckets = BUCKETS_PER_POINT * self.values.shape[0]
+        extent = self.values[-1] - self.values[0]
+        rate = jnp.where(extent > 0, jnp.minimum(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
+        inside = _bucket(self.values, self.values[0], rate, buckets)
+        below = jnp.searchsorted(inside, jnp.arange(buckets + 1, dtype=jnp.int32)).astype(jnp.int32)
+        fullest = (below[1:] - below[:-1]).max()
+        even = jnp.linspace(self.values[0], self.values[-1], self.values.shape[0])
+        off = jnp.abs(self.values - even) <= EVEN * jnp.finfo(width.dtype).eps * jnp.maximum(jnp.abs(even[0]), jnp.abs(even[-1]))
+        return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
+
+
+def numbers(name: str, value: Any) -> Any:
+    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
+    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
+    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
+
+
+def _require_ascending(name: str, given: Any) -> None:
+    descents = np.flatnonzero(np.diff(np.asarray(given)) < 0)
+    if descents.size:
+        i = int(descents[0])
+        raise ValueError(
+            f"`{name}` must ascend, but {name}[{i}] = {given[i]} > {name}[{i + 1}] = {given[i + 1]}; sort the control points"
+        )
+
+
+def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:
+    """Refuse values that rounding moves by a share of what they span, or takes for (nearly) nothing."""
+    span, largest = given[-1] - given[0], np.abs(given).max()
+    moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), MIN_NORMALS * np.finfo(packed.dtype).tiny
+    if moved > MOVED * span:
+        raise ValueError(
+            f"`{name}` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
+            "subtract an offset from values and quantity, or use float64 under jax.enable_x64"
+        )
+    if 0 < largest < smallest:
+        raise ValueError(
+            f"`{name}` must reach at least {smallest:.3g} in {packed.dtype} unless all are 0, but the largest is {largest:.3g}; "
+            "multiply values and quantity by the same number"
+        )
+
+
+MOVED = 2.0**-12  # of the span of its values that a transfer function's values may be moved by rounding
+MIN_NORMALS = 2.0**16  # smallest normal numbers that values must reach: quantities among them are then not taken for zero
+
+
+@dataclasses.dataclass(frozen=True)
+class Segments:
+    """A transfer function cut into segments; the last reaches to infinity and is constant.
+
+    Attributes:
+        start: where each segment begins.
+        inverse: 1 / its width, 0 for jumps and for the last.
+        base, change: red, green, blue and extinction at its beginning, and how much they change over it.
+        below: number of control points before each of a number of uniform buckets; `rate` is buckets a unit.
+        fullest: most control points in a bucket.
+        even: whether the points are evenly spaced but for rounding.
+    """
+
+    start: Float[Array, " points"]
+    inverse: Float[Array, " points"]
+    base: Float[Array, "4 points"]
+    change: Float[Array, "4 points"]
+    below: Int[Array, " buckets_and_one"]
+    rate: Float[Array, ""]
+    fullest: Int[Array, ""]
+    even: Bool[Array, ""]
+
+
+EVEN = 4  # eps of the largest value that evenly spaced points may be off, as rounded tables are
+BUCKETS_PER_POINT = 2
+SELECT_ALL = 16  # up to this many control points a chain of selects vectorises, and beats any gather
+
+
+def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Array, "..."]]:
+    """`[red, green, blue, extinction]` of `quantity`, each of its shape; or what else the tables' channels are.
+
+    A segment is evaluated as base + part * change from its own beginning, so control points are met exactly (evenly spaced
+    ones to a few eps of the whole range).
+    """
+    return read(segments, find(segments, quantity))
+
+
+def find(segments: Segments, quantity: Float[Array, "..."]) -> tuple[Array, ...]:
+    """Where `quantity` lies in the tables, for `read`: found once, read for one channel or another.
+
+    Segment and place within it; or just the quantity, if control points are so few that comparing it again costs nothing.
+    """
+    return (quantity,) if segments.start.shape[0] <= SELECT_ALL else locate(segments, quantity)
+
+
+def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(None)) -> list[Float[Array, "..."]]:
+    """Some of the channels at a `place` that was found."""
+    bases, changes = (list(table)[channels] for table in (segments.base, segments.change))
+    if len(place) == 2:
+        i, part = place
+        return [_at(base, i) + part * _at(change, i) for base, change in zip(bases, changes, strict=True)]
+    rows = [segments.start, segments.inverse, *bases, *changes]
+    start, inverse, *found = _selected(rows, segments.start, place[0])
+    part = jnp.clip((place[0] - start) * inverse, 0, 1)
+    return [base + part * change for base, change in zip(found[: len(bases)], found[len(bases) :], strict=True)]
+
+
+def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Array, "*any"], Float[Array, "*any"]]:
+    """Segment that holds `quantity`, and the share of it that lies before: what `look_up` interpolates by."""
+    if segments.start.shape[0] > SELECT_ALL:
+        return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
+    each = jnp.arange(segments.start.shape[0], dtype=jnp.int32)
+    segment, start, inverse = _selected([each, segments.start, segments.inverse], segments.start, quantity)
+    return segment, jnp.clip((quantity - start) * inverse, 0, 1)
+
+
+def slope_in_middle(
+    segments: Segments, near: Float[Array, "*any"], far: Float[Array, "*any"], channel: int
+) -> Float[Array, "*any"]:
+    """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
+    middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
+    slopes, place = jnp.clip(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
+    slope = _at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
+    return jnp.where(middle >= segments.start[0], slope, 0)
+
+
+def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
+    """Of each of `rows`, the entry of the segment that holds `quantity`."""
+    found = [row[0] for row in rows]
+    for k in range(1, start.shape[0]):
+        past = quantity >= start[k]
+        found = [jnp.where(past, row[k], value) for row, value in zip(rows, found, strict=True)]
+    return found
+
+
+def _at(row: Array, i: Array) -> Array:
+    """`row[i]` for indices known to be in range: a clamped gather is a third slower."""
+    return row.at[i].get(mode="promise_in_bounds")
+
+
+def _bucket(value: Array, lowest: Array, rate: Array, buckets: int) -> Array:
+    """Uniform bucket of a value; monotone in floating point, as every step is. In range even for NaN."""
+    return jnp.clip(jnp.clip((value - lowest) * rate, 0, buckets - 1).astype(jnp.int32), 0, buckets - 1)
+
+
+def _segment(segments: Segments, quantity: Array) -> Array:
+    """Segment that holds `quantity`: its bucket says which control points are to be looked at, bisection finds the last <= it."""
+    count, buckets = segments.start.shape[0], segments.below.shape[0] - 1
+    bucket = _bucket(quantity, segments.start[0], segments.rate, buckets)
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low + high) // 2
+        past = (low < high) & (quantity >= _at(segments.start, jnp.minimum(middle, count - 1)))
+        return jnp.where(past, middle + 1, low), jnp.where(past | (low >= high), high, middle)
+
+    steps = 32 - lax.clz(segments.fullest)
+    not_above = lax.fori_loop(0, steps, halve, (_at(segments.below, bucket), _at(segments.below, bucket + 1)))[0]
+    return jnp.maximum(not_above - 1, 0)
+
+
+def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """Segment and place within it, for any control points."""
+    i = _segment(segments, quantity)
+    return i, jnp.clip((quantity - _at(segments.start, i)) * _at(segments.inverse, i), 0, 1)
+
+
+@jax.custom_jvp
+def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """The same for control points that are evenly spaced but for rounding: no tables, no search."""
+    last = segments.start.shape[0] - 1
+    place = jnp.clip((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
+    i = jnp.clip(place.astype(jnp.int32), 0, last)
+    return i, place - i.astype(place.dtype)
+
+
+@_evenly.defjvp
+def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) -> tuple[Any, Any]:
+    """Control points that move one by one are evenly spaced no more, so the place within a segment changes as in any other."""
+    (segments, quantity), (segments_dot, quantity_dot) = primals, tangents
+    i, part = _evenly(segments, quantity)
+    start, inverse = _at(segments.start, i), _at(segments.inverse, i)
+    change = (quantity_dot - _at(segments_dot.start, i)) * inverse + (quantity - start) * _at(segments_dot.inverse, i)
+    inside = (quantity >= segments.start[0]) & (quantity < segments.start[-1])
+    return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
+
+
+for _kind in (Segments, TransferFunction):
+    jax.tree_util.register_dataclass(_kind, data_fields=[f.name for f in dataclasses.fields(_kind)], meta_fields=[])

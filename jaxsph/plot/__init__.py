@@ -1,0 +1,1 @@
+"""Figures: pictures with a key, transfer functions, sweeps."""

@@ -1,0 +1,306 @@
+"""Figures of a sweep: error over tolerance, time over error, and both along a sequence of frames.
+
+Flow: measurements -> [figures] -> error.png, pareto.png, integral.png, frames.png.
+
+Drawn with matplotlib, which is optional. Where a sweep has several frames, errors are the largest and times the means of them.
+Times are shares of what full rate took in the same turns, as a busy machine is slow for both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.optional import require
+from jaxsph.io.replace import written_whole
+from jaxsph.model.registry import ESTIMATING
+from jaxsph.trade.contenders import ESTIMATORS, FULL_RATE
+from jaxsph.trade.measurement import Measurement
+
+COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00", "#cc79a7"), strict=True))
+"""Of the estimators: Okabe and Ito's, which all can tell apart."""
+
+MARKERS = dict(zip(ESTIMATORS, "osDp", strict=True))
+MARKER_SIZES = dict(zip(ESTIMATORS, (11, 8, 5.5, 3.5), strict=True))
+"""What is drawn later is smaller, so that equal results of two estimators are both seen."""
+LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4), (-6, 4)), strict=True))
+BASELINE_COLORS = {"samples": "#8a8a8a", "segments": "#7f5a9e", "size": "#a6761d"}
+BASELINE_MARKERS = "v^<>PX*h"
+DASHES = ("-", "--", ":", "-.")
+MIN_SHOWN = 1e-7
+"""Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
+
+MAX_TICKS = 12
+SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A setting over all of its frames: largest errors to full rate, to a converged image and to the light integral."""
+
+    method: str
+    tolerance: float | None
+    error: float
+    away: float
+    bound: float | None
+    time: float
+    integral: float | None = None
+    mean_integral: float | None = None
+
+    @property
+    def kept(self) -> float | None:
+        """The error that its tolerance is held against; None where it was not measured."""
+        return self.integral if self.method in ESTIMATING else self.error
+
+
+def require_matplotlib() -> None:
+    """Know before the work that it can be drawn.
+
+    Raises:
+        ImportError: matplotlib is not installed; the message says how to.
+    """
+    require("matplotlib", "the figures of a sweep", "color")
+
+
+def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
+    """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames, `integral.png`
+    only where the light integral was taken.
+
+    Returns:
+        The paths of what was written.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: nothing to draw, or measurements of several scenes.
+    """
+    require_matplotlib()
+    rows = list(measurements)
+    if len({row.scene for row in rows}) != 1:
+        found = ", ".join(sorted({row.scene for row in rows})) or "nothing"
+        raise ValueError(f"`measurements` must be of one scene, got {found}; draw each on its own")
+    points = summary(rows)
+    figures = {"error.png": _error, "pareto.png": _pareto}
+    written = [_saved(draw_one(points, _title(rows)), Path(folder) / name) for name, draw_one in figures.items()]
+    if any(point.integral is not None for point in points):
+        written.append(_saved(_integral(points, _title(rows)), Path(folder) / "integral.png"))
+    if len({row.frame for row in rows}) > 1:
+        written.append(_saved(_frames(rows, _title(rows, summed=False)), Path(folder) / "frames.png"))
+    return written
+
+
+def summary(rows: Sequence[Measurement]) -> list[Point]:
+    """Of every setting, in order: largest errors and bound, and time over that of full rate, over its frames."""
+    groups: dict[tuple[str, float | None], list[Measurement]] = {}
+    for row in rows:
+        groups.setdefault((row.method, row.tolerance), []).append(row)
+    points = []
+    for (method, tolerance), group in groups.items():
+        bounds = [row.max_bound for row in group if row.max_bound is not None]
+        errors = (max(row.max_error for row in group), max(row.max_error_converged for row in group))
+        share = sum(row.total for row in group) / sum(row.full_total for row in group)
+        largest, means = (
+            [value for value in (getattr(row, name) for row in group) if value is not None]
+            for name in ("integral_max", "integral_mean")
+        )
+        integral = max(largest, default=None), sum(means) / len(means) if means else None
+        points.append(Point(method, tolerance, *errors, max(bounds, default=None), share, *integral))
+    return points
+
+
+def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
+    """Indices, by error, of what is faster than all that is at most as wrong."""
+    front: list[int] = []
+    for index in sorted(range(len(errors)), key=lambda i: (errors[i], times[i])):
+        if not front or times[index] < times[front[-1]]:
+            front.append(index)
+    return front
+
+
+def _title(rows: Sequence[Measurement], summed: bool = True) -> str:
+    first, frames = rows[0], len({row.frame for row in rows})
+    several = f"{frames} frames, largest error and mean time, " if frames > 1 and summed else ""
+    full = float(np.median([row.full_total for row in rows]))
+    size = f"{first.width} x {first.height} pixels, {first.samples} samples"
+    machine = f"on {first.device} ({first.cores} cores), where full rate takes {full:.3g} s a frame"
+    return f"{first.scene}: {first.particles:,} particles, {size}\n{several}{machine}"
+
+
+def _canvas(title: str, panels: int, **shared: Any) -> tuple[Any, Any]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
+    axes = np.atleast_1d(figure.subplots(*((panels, 1) if "sharex" in shared else (1, panels)), **shared))
+    figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+    for axis in axes:
+        axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _saved(figure: Any, path: Path) -> Path:
+    with written_whole(path) as temporary:
+        figure.savefig(temporary)
+    return path
+
+
+def _legend(figure: Any, axis: Any, **options: Any) -> None:
+    """Outside of the axes, so that it hides nothing."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize="small", **options)
+
+
+def _shown(error: float) -> float:
+    return max(error, MIN_SHOWN)
+
+
+def _label_zero(axis: Any, errors: Iterable[float], which: str) -> None:
+    """Name the place where errors that are too small for the scale are drawn."""
+    if min(errors, default=1.0) < MIN_SHOWN:
+        getattr(axis, f"set_{which}lim")(MIN_SHOWN / 2)
+        line = axis.axhline if which == "y" else axis.axvline
+        line(MIN_SHOWN, color="#999999", linewidth=0.8, zorder=0)
+        place = (1.0, MIN_SHOWN) if which == "y" else (MIN_SHOWN, 0.02)
+        transform = axis.get_yaxis_transform() if which == "y" else axis.get_xaxis_transform()
+        words = {"ha": "right", "va": "bottom"} if which == "y" else {"ha": "right", "va": "bottom", "rotation": 90}
+        axis.text(*place, f" at most {MIN_SHOWN:g}", transform=transform, color="#777777", fontsize="x-small", **words)
+
+
+def _error(points: Sequence[Point], title: str) -> Any:
+    figure, (axis,) = _canvas(title, 1)
+    controlled = [point for point in points if point.tolerance and point.kept is not None]
+    tolerances = sorted({point.tolerance for point in controlled if point.tolerance is not None})
+    axis.set(xscale="log", yscale="log")  # before its limits: of a linear axis they would start below zero
+    if tolerances:
+        ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
+        axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
+        drawn = [_shown(value or 0.0) for point in controlled for value in (point.kept, point.bound)]
+        top = max(4 * tolerances[-1], 2 * max(drawn))
+        axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
+        axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
+    for method, color in COLORS.items():
+        row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
+        if row:
+            x = [point.tolerance for point in row]
+            style: dict[str, Any] = {
+                "color": color,
+                "marker": MARKERS[method],
+                "markersize": MARKER_SIZES[method],
+                "clip_on": False,
+            }
+            style["linewidth"] = MARKER_SIZES[method] / 3
+            axis.plot(x, [_shown(point.kept or 0.0) for point in row], label=f"{method}: error", **style)
+            name = "bound" if method == "interval" else "estimate"
+            bounds = [_shown(point.bound or 0.0) for point in row]
+            axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
+    of_others = "\n(segments: the light integral)" if any(point.method in ESTIMATING for point in controlled) else ""
+    axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
+    axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
+    axis.set_xticks([], minor=True)
+    _label_zero(axis, [value or 0.0 for point in controlled for value in (point.kept, point.bound)], "y")
+    _legend(figure, axis)
+    return figure
+
+
+def _pareto(points: Sequence[Point], title: str) -> Any:
+    others = [point for point in points if point.method != FULL_RATE]
+    ends = "largest error, against full rate", "largest error, against a converged image"
+    return _time_over_error(points, title, (("error", others, ends[0]), ("away", points, ends[1])))
+
+
+def _integral(points: Sequence[Point], title: str) -> Any:
+    known = [point for point in points if point.integral is not None]
+    ends = "mean error, against the light integral", "largest error, against the light integral"
+    return _time_over_error(known, title, (("mean_integral", known, ends[0]), ("integral", known, ends[1])))
+
+
+def _time_over_error(points: Sequence[Point], title: str, panels: Sequence[tuple[str, Sequence[Point], str]]) -> Any:
+    """Two panels: an attribute of points, which points, and what it is."""
+    figure, axes = _canvas(title, 2, sharey=True)
+    for axis, (name, shown, against) in zip(axes, panels, strict=True):
+        errors = [_shown(getattr(point, name)) for point in shown]
+        axis.axhline(1, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
+        front = pareto_front(errors, [point.time for point in shown])
+        x, y = [errors[i] for i in front], [shown[i].time for i in front]
+        axis.plot(x, y, color="#009e73", linewidth=5, alpha=0.25, drawstyle="steps-post", label="Pareto front", zorder=1)
+        named: set[str] = set()
+        for point, error in zip(shown, errors, strict=True):
+            label = None if point.method in named else point.method
+            named.add(point.method)
+            axis.plot(error, point.time, linestyle="none", label=label, **_look(point.method, points))
+        axis.margins(x=0.15)  # room for the labels
+        _label_tolerances(axis, shown, errors)
+        axis.set(xscale="log", xlabel=against)
+        _label_zero(axis, [getattr(point, name) for point in shown], "x")
+    axes[0].set_ylabel("time of a frame, over that of full rate")
+    axes[0].set_ylim(0, 1.1 * max(1.0, *(point.time for point in points)))
+    _plain_numbers(axes[1].xaxis)
+    _legend(figure, axes[1], title="numbers: tolerance")
+    return figure
+
+
+def _label_tolerances(axis: Any, points: Sequence[Point], errors: Sequence[float]) -> None:
+    """Write tolerances beside the points, those of one estimator that lie together as one."""
+    places: dict[tuple[str, int, int], list[tuple[float, float, str]]] = {}
+    for point, error in zip(points, errors, strict=True):
+        if point.tolerance is not None:
+            near = (point.method, round(4 * np.log10(error)), round(10 * point.time))
+            places.setdefault(near, []).append((error, point.time, f"{point.tolerance:g}"))
+    for (method, *_), found in places.items():
+        error, time, _ = found[0]
+        right, up = LABEL_PLACES[method]
+        style: dict[str, Any] = {"fontsize": "x-small", "color": COLORS[method], "ha": "left" if right > 0 else "center"}
+        text = ", ".join(tolerance for *_, tolerance in found)
+        axis.annotate(text, (error, time), textcoords="offset points", xytext=(right, up), **style)
+
+
+def _look(method: str, points: Sequence[Point]) -> dict[str, Any]:
+    if method in COLORS:
+        return {"color": COLORS[method], "marker": MARKERS[method], "markersize": MARKER_SIZES[method]}
+    if method == FULL_RATE:
+        return {"color": "black", "marker": "o", "markersize": 8}
+    baselines = list(dict.fromkeys(p.method for p in points if p.method not in COLORS and p.method != FULL_RATE))
+    color = BASELINE_COLORS[method.partition("/")[0]]
+    return {"color": color, "markersize": 7, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
+
+
+def _plain_numbers(axis: Any) -> None:
+    """Numbers as they are said, not as powers of ten, and enough of them where the range is short."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    if high < 100 * low:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 5 * low else (1, 1.5, 2, 3, 4, 5, 7)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _frames(rows: Sequence[Measurement], title: str) -> Any:
+    figure, (errors, times) = _canvas(title, 2, sharex=True)
+    points = summary(rows)
+    tolerances = sorted({row.tolerance for row in rows if row.tolerance is not None})
+    for number, limit in enumerate(tolerances):
+        errors.axhline(limit, color="#bbbbbb", linewidth=0.8, linestyle=DASHES[number % len(DASHES)])
+    for method, tolerance in dict.fromkeys((row.method, row.tolerance) for row in rows):
+        line = sorted((r for r in rows if (r.method, r.tolerance) == (method, tolerance)), key=lambda row: row.frame or 0.0)
+        moments = [row.frame for row in line]
+        style: dict[str, Any] = {"linewidth": 1.2, **_look(method, points)}
+        style["markersize"] *= 0.7
+        if tolerance is not None:
+            style["linestyle"] = DASHES[tolerances.index(tolerance) % len(DASHES)]
+        label = method if tolerance is None else f"{method}, {tolerance:g}"
+        times.plot(moments, [row.total / row.full_total for row in line], label=label, **style)
+        if method != FULL_RATE:
+            errors.plot(moments, [_shown(row.max_error) for row in line], **style)
+    errors.set(yscale="log", ylabel="largest error")
+    times.set(xlabel="frame", ylabel="time, over full rate")
+    _label_zero(errors, [row.max_error for row in rows if row.method != FULL_RATE], "y")
+    times.set_ylim(bottom=0)
+    shown = sorted({row.frame or 0.0 for row in rows})
+    if len(shown) <= MAX_TICKS:
+        times.set_xticks(shown, [f"{moment:g}" for moment in shown])
+    _legend(figure, times)
+    return figure

@@ -1,0 +1,1 @@
+"""One picture by parts: windows of it, and snapshots that stay on disk."""

@@ -1,0 +1,202 @@
+"""Snapshots whose particles stay on disk: a sample of them, and those that a region can see.
+
+Flow: snapshot, index, region -> [on_disk: OnDisk] -> columns of particles -> from_disk.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph import scenes
+from jaxsph.io.assemble import in_box, kernel_of, opacity_of
+from jaxsph.io.quantities import ROLES, choose_quantity
+from jaxsph.io.snapshot_index import SnapshotIndex, index_of
+from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
+from jaxsph.io.table import ParticleTable
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.frusta import Planes, between_depths
+from jaxsph.model.particles import Particles
+from jaxsph.model.transfer.function import TransferFunction
+
+SAMPLED = 1 << 16
+"""Particles, about, by which colours, plans and parts are chosen."""
+MOST_EXTREMES = 2
+"""Particles that come along wherever they are: the widest and the strongest."""
+Columns = tuple[np.ndarray, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OnDisk:
+    """A snapshot whose particles stay on disk; made by `OnDisk.open`.
+
+    Attributes:
+        snapshot, index: its files, and where in space their particles are.
+        quantities: names of the quantity, and of that of extinction if there is another.
+        kernel: name of the smoothing kernel.
+        sample: some of the particles, evenly taken, with supports so large that they fill as much of space as all of them.
+        ramp: how extinction depends on its quantity by default, see `scenes.default_transfer`.
+    """
+
+    snapshot: Snapshot
+    index: SnapshotIndex
+    quantities: tuple[str, ...]
+    kernel: str
+    sample: Particles
+    ramp: str | None = None
+
+    @classmethod
+    def open(
+        cls,
+        path: str | Path,
+        quantity: str | None = None,
+        *,
+        kernel: str | None = None,
+        part_type: int | None = None,
+        opacity_by: str | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> OnDisk:
+        """Open a snapshot: Gadget-like HDF5 with supports, masses and densities, in one file or several.
+
+        The first time all of it is read once, to index it; the index is kept beside it.
+
+        Args:
+            path: any of its files.
+            quantity, kernel, part_type, opacity_by: as for `jaxsph.io.read_particles`; sums over neighbours cannot be had.
+            progress: called as `progress(done, total)` while it is indexed.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: another format; particles whose supports or volumes need neighbours; an unknown quantity.
+
+        Warns:
+            UserWarning: where the index cannot be kept.
+        """
+        snapshot = Snapshot(path, part_type)
+        index = index_of(snapshot, progress=progress)
+        table = _sampled(snapshot, index)
+        _, name = choose_quantity(table, quantity)
+        _, volume = supports_and_volumes(table)
+        mass = table.named(*ROLES["mass"])
+        _, second = opacity_of(table, name, opacity_by, volume if mass is None else volume / table.columns[mass], None)
+        names = tuple(dict.fromkeys((name, *([] if second is None else [second]))))
+        ramp = "even" if name in ("x", "y", "z") else None
+        nothing = Particles.from_arrays(np.zeros((0, 3)), 1.0, 0.0)
+        opened = cls(snapshot, index, names, kernel_of(table, kernel)[0], nothing, ramp if second is None else "steep")
+        position, support, volume, *values = opened.columns_of(table)
+        thinned = np.cbrt(max(len(index), 1) / max(len(table), 1))
+        sample = opened.particles((position, (support * thinned).astype(support.dtype), volume, *values))
+        return dataclasses.replace(opened, sample=sample)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `Camera.framing`: those of the particles in memory, of a periodic box its own."""
+        if not len(self):
+            return self.index.bounds()
+        corners = np.stack([self.index.lower.min(0), self.index.upper.max(0)])
+        boxed, _ = in_box(dataclasses.replace(self.snapshot.first, position=corners, columns={}, support=None), "file")
+        return self.index.bounds() if boxed.box_size is None else (np.zeros(3), np.asarray(boxed.box_size, np.float64))
+
+    def transfer(self, colormap: str = "viridis", values: tuple[float, float] | None = None, **more: Any) -> TransferFunction:
+        """What its particles look like by default, see `scenes.default_transfer`; chosen by the sample."""
+        return scenes.default_transfer(self.sample, colormap, values, **{"ramp": self.ramp, **more})
+
+    @functools.cached_property
+    def needed(self) -> list[str]:
+        """Columns of the files that are read."""
+        return needed_columns(self.snapshot.first, *self.quantities)
+
+    def columns_of(self, table: ParticleTable) -> Columns:
+        """Positions, supports, volumes and quantities of rows that were read, as particles have them."""
+        support, volume = supports_and_volumes(table)
+        values = [choose_quantity(table, name)[0] for name in self.quantities]
+        dtype = table.position.dtype
+        with np.errstate(over="ignore"):
+            return table.position, *(column.astype(dtype) for column in (support, volume / self._volume_unit, *values))
+
+    @functools.cached_property
+    def _volume_unit(self) -> float:
+        """What volumes are divided by where float32 could not hold them: only their ratios matter."""
+        limits, volumes = np.finfo(np.float32), self.index.volume
+        if not volumes.size or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny)):
+            return 1.0
+        return float(2.0 ** np.round((np.log2(volumes.min()) + np.log2(volumes.max())) / 2))
+
+    def particles(self, columns: Columns, capacity: int | None = None) -> Particles:
+        """Of columns."""
+        position, support, volume, *values = columns
+        quantity: Any = values[0] if len(values) == 1 else tuple(values)
+        return Particles.from_arrays(position, support, quantity, volume, self.kernel, capacity=capacity)
+
+    def seen_by(
+        self, planes: Planes, always: frozenset[tuple[int, int]] = frozenset(), most: int | None = None
+    ) -> Columns | None:
+        """The particles whose supports reach into a region, and some others, in the order of the files.
+
+        None where there are more than `most`: so many are never held.
+        """
+        index, parts, found = self.index, [self.columns_of(self._nothing)], 0
+        held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
+        for file, row in always:
+            held |= (index.file == file) & (index.begin <= row) & (row < index.end)
+        for file, begin, columns in self._read(held):
+            kept = planes.meet(columns[0].astype(np.float64), columns[1].astype(np.float64))
+            kept[[row - begin for which, row in always if which == file and begin <= row < begin + len(kept)]] = True
+            parts.append(tuple(column[kept] for column in columns))
+            found += len(parts[-1][0])
+            if most is not None and found > most:
+                return None
+        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+
+    def all_seen_by(self, planes: Planes) -> Iterator[Columns]:
+        """The particles of all runs that reach into a region, some at a time."""
+        held = planes.meet_boxes(self.index.lower, self.index.upper, self.index.support) if len(self) else np.zeros(0, bool)
+        return (columns for _, _, columns in self._read(held))
+
+    def _read(self, held: np.ndarray) -> Iterator[tuple[int, int, Columns]]:
+        """File, first row and columns of some runs."""
+        index = self.index
+        runs = zip(index.file[held].tolist(), index.begin[held].tolist(), index.end[held].tolist(), strict=True)
+        for file, rows in together(runs):
+            begin, end = rows[0][0], rows[-1][1]
+            yield file, begin, self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
+
+    @functools.cached_property
+    def _nothing(self) -> ParticleTable:
+        file = int(self.index.file[0]) if len(self.index.file) else 0
+        return self.snapshot.read(file, slice(0, 0), self.needed)
+
+    def extremes(self, camera: Camera) -> frozenset[tuple[int, int]]:
+        """File and row of the widest and of the strongest particle between near and far."""
+        index, planes = self.index, between_depths(camera)
+        runs = np.flatnonzero(planes.meet_boxes(index.lower, index.upper, index.support)) if len(index.file) else np.zeros(0, int)
+        found = set()
+        for rows, values in ((index.widest, index.support), (index.strongest, index.strength)):
+            for run in sorted(runs, key=lambda run: -values[run]):
+                place = int(index.file[run]), int(rows[run])
+                position, support, *_ = self.columns_of(self.snapshot.read(place[0], slice(place[1], place[1] + 1), self.needed))
+                if planes.meet(position.astype(np.float64), support.astype(np.float64))[0]:
+                    found.add(place)
+                    break
+        return frozenset(found)
+
+
+def _sampled(snapshot: Snapshot, index: SnapshotIndex) -> ParticleTable:
+    """Rows at the beginning of every run."""
+    each = max(SAMPLED // max(len(index.file), 1), 1)
+    rows = zip(index.file, index.begin, index.end, strict=True)
+    tables = [snapshot.read(int(file), slice(int(begin), min(int(begin) + each, int(end)))) for file, begin, end in rows]
+    if not tables:
+        return snapshot.read(0, slice(0, 0))
+    names = set.intersection(*(set(table.columns) for table in tables))
+    columns = {name: np.concatenate([table.columns[name] for table in tables]) for name in tables[0].columns if name in names}
+    supports = [table.support for table in tables if table.support is not None]
+    position = np.concatenate([table.position for table in tables])
+    return dataclasses.replace(tables[0], position=position, columns=columns, support=np.concatenate(supports))

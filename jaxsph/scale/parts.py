@@ -1,0 +1,252 @@
+"""One picture by several processes: each renders some rows of it, and all of these make the picture.
+
+Flow: scene, camera, settings -> measures of the whole -> rows of each part -> [tiles: render_tile] -> parts -> [merge] -> Image.
+
+Rays of one bundle know nothing of those of another, and all that is chosen by how large supports appear is chosen by the whole
+picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.engine.access.lists import BUNDLE, TILE
+from jaxsph.engine.frame.bands import Progress, Work
+from jaxsph.engine.frame.images import image_of
+from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
+from jaxsph.engine.planning.measures import Measures
+from jaxsph.engine.planning.plan import choose, fitted, fitting
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.executors import Clock
+from jaxsph.io.exr import FIRST_ROW, ROWS
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.digest import digest_of, fingerprint
+from jaxsph.numerics.version import __version__
+
+PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
+"""Names of the metadata that say of which picture an image is a part, which (from 0 on), and of how many."""
+OF_PARTS = (PICTURE, PART, PARTS, FIRST_ROW, ROWS)
+OF_FILES = ("certified", "faults")
+"""Names of the metadata that files add, each of its own part."""
+
+
+def render_tile(
+    scene: Scene, camera: Camera, settings: Settings | None, index: int, count: int, *, progress: Progress | None = None
+) -> Image:
+    """Render one of `count` parts of a picture, each some of its rows; `jaxsph.merge` makes the picture of them.
+
+    Parts are cut between tiles of 16 x 16 pixels so that all have about as many pairs of particles and bundles of rays. A part is
+    the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently.
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`: those of the whole picture, the same for all parts.
+        index: which part, from 0 (the topmost rows) to `count - 1`.
+        count: at least 1, at most the rows of tiles that the picture has.
+        progress: as for `jaxsph.render`.
+
+    Returns:
+        Image of those rows alone, whose metadata say where they belong and of which picture they are.
+
+    Raises:
+        ValueError: an index or a count outside those ranges; a screen that is a quadtree, whose leaves are not cut; traced
+            arguments; as `jaxsph.render`.
+    """
+    settings = settings or Settings()
+    _require_parts(scene, camera, settings, index, count)
+    mark = picture_of(scene, camera, settings)
+    clock, asked = Clock(), Request.of(scene, camera, settings)
+    scene, along, shape = asked.scene, asked.along, shape_of(asked)
+    seen, measures = sorted_and_measured(see(scene, camera, shape, clock), asked, shape)
+    rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
+    first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
+    of_part = dataclasses.replace(shape, height=last - first)
+    given = of_rows(measures, *rows), of_part, along, choose(measures, along)
+    plan = fitting(*given, along.memory_limit or shape.memory)
+    if plan is None:  # no room for more than this part needs
+        plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
+    clock.mark("plan")
+    drawn = Work(seen, camera, settings, plan, scene.formulas, first).drawn(clock, progress)
+    image = image_of(drawn, camera, settings, plan, clock)
+    place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
+    return dataclasses.replace(image, metadata=(*image.metadata, *place))
+
+
+def picture_of(scene: Scene, camera: Camera, settings: Settings) -> str:
+    """A digest of all that a picture depends on; not of the memory that it may take."""
+    x64 = jax.config.read("jax_enable_x64")
+    parts = digest_of((scene, camera)), dataclasses.replace(settings, memory_limit=None)
+    return fingerprint("p", __version__, x64, *parts)
+
+
+def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
+    """The rows of tiles at which parts begin, and the end of the last: as evenly as whole rows allow, at least one each.
+
+    A row weighs as its (particle, bundle) pairs, and one more for each bundle.
+    """
+    weights = measures.bundle_pairs + 4 * tile_columns
+    sums, total = np.cumsum(weights), int(weights.sum())
+    ends = [0]
+    for part in range(1, count):
+        near = int(np.searchsorted(sums, total * part / count))
+        before, after = (sums[near - 1] if near else 0), sums[near]
+        row = int(near + (after + before < 2 * total * part / count))
+        ends.append(min(max(row, ends[-1] + 1), len(weights) - count + part))
+    return [*ends, len(weights)]
+
+
+def of_rows(measures: Measures, first: int, last: int) -> Measures:
+    """Of some rows of tiles alone."""
+    return dataclasses.replace(
+        measures, tile_pairs=measures.tile_pairs[first:last], bundle_pairs=measures.bundle_pairs[first:last]
+    )
+
+
+def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int, count: int) -> None:
+    if is_traced(scene, camera, settings):
+        raise ValueError("`render_tile` counts pairs and needs concrete arrays; call it outside jit")
+    if settings.screen == "quadtree":
+        raise ValueError(
+            "`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges; "
+            "render it as a whole, or without the quadtree"
+        )
+    most = -(-camera.height // TILE)
+    for name, value in (("index", index), ("count", count)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise ValueError(f"`{name}` must be an integer, got {value!r}")
+    if not 1 <= count <= most:
+        raise ValueError(
+            f"`count` must lie in [1, {most}], as {camera.height} rows of pixels are {most} of tiles, got {count}; "
+            "take fewer parts"
+        )
+    if not 0 <= index < count:
+        raise ValueError(f"`index` must lie in [0, {count - 1}] for {count} parts, got {index}")
+
+
+def merge(parts: Iterable[Image], *, names: Sequence[str] | None = None) -> Image:
+    """The picture that parts of `render_tile` make, in whatever order they are given.
+
+    Args:
+        parts: all of them, rendered here or read from EXR files.
+        names: what to call them in messages, one a part; by default their places.
+
+    Returns:
+        Image, the same as `jaxsph.render` gives: layers and metadata, and `stats` summed over the parts where all have them.
+
+    Raises:
+        ValueError: none at all; an image that is no part, parts of different pictures, one that is missing or there twice. The
+            message names it.
+    """
+    given = list(parts)
+    called = list(names) if names is not None else [f"image {place}" for place in range(len(given))]
+    if not given or len(called) != len(given):
+        raise ValueError(f"`parts` must be at least one, each with a name, got {len(given)} and {len(called)} names")
+    told = [_told(image, name) for image, name in zip(given, called, strict=True)]
+    _require_one_picture(told, called)
+    _require_all(told, called)
+    order = sorted(range(len(given)), key=lambda place: told[place][PART])
+    _require_rows([given[place] for place in order], [told[place] for place in order], [called[place] for place in order])
+    return joined([given[place] for place in order])
+
+
+def _told(image: Image, name: str) -> dict[str, Any]:
+    told = dict(image.metadata)
+    if any(key not in told for key in OF_PARTS):
+        raise ValueError(
+            f"{name} is not a part of a picture; parts are made by `jaxsph render --tile I/N` or `jaxsph.render_tile`"
+        )
+    return told
+
+
+def _require_one_picture(told: list[dict[str, Any]], names: list[str]) -> None:
+    """Compare with what most parts say, so that the one that differs is named."""
+    of = [(str(each[PICTURE]), int(each[PARTS])) for each in told]
+    common = max(of, key=of.count)
+    strange = [(name, each) for name, each in zip(names, of, strict=True) if each != common]
+    if not strange:
+        return
+    name, (picture, count) = strange[0]
+    other = names[of.index(common)]
+    if picture == common[0]:
+        raise ValueError(f"{name} is one of {count} parts, but {other} is one of {common[1]}; render all with the same count")
+    raise ValueError(
+        f"{name} is part of another picture than {other}: scene, camera, settings or version differ; render that part again"
+    )
+
+
+def _require_all(told: list[dict[str, Any]], names: list[str]) -> None:
+    places = [int(each[PART]) for each in told]
+    for place in places:
+        twice = [name for at, name in zip(places, names, strict=True) if at == place]
+        if len(twice) > 1:
+            raise ValueError(f"{' and '.join(twice)} are both part {place} of the picture; give one of them")
+    count = int(told[0][PARTS])
+    missing = [place for place in range(count) if place not in places]
+    if missing:
+        numbers = ", ".join(f"{place}/{count}" for place in missing)
+        raise ValueError(f"{len(missing)} of {count} parts of the picture are missing: --tile {numbers}")
+
+
+def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[str]) -> None:
+    """That rows follow on one another: measures may differ between machines that round differently, and cuts with them."""
+    ends = [int(each[FIRST_ROW]) + image.shape[0] for each, image in zip(told, images, strict=True)]
+    begins = [*(int(each[FIRST_ROW]) for each in told), int(told[0][ROWS])]
+    for name, end, begin, image in zip(names, ends, begins[1:], images, strict=True):
+        if end != begin or image.shape[1] != images[0].shape[1]:
+            raise ValueError(
+                f"{name} ends at row {end} and the next part begins at {begin}, {image.shape[1]} pixels wide: these parts "
+                "were cut differently; render all of them with one version, on machines of one kind"
+            )
+    if begins[0] != 0:
+        raise ValueError(f"{names[0]} begins at row {begins[0]}, not 0; render it again")
+
+
+LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
+
+
+def of_columns(image: Image, left: int, right: int) -> Image:
+    """Some columns alone, from the border of a tile to that of another or of the image; on the host.
+
+    There because a device would compile a program for every width.
+    """
+    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in LAYERS}
+    layers["levels"] = (
+        None if image.levels is None else np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
+    )
+    return dataclasses.replace(image, **layers)
+
+
+def joined(parts: list[Image], axis: int = 0) -> Image:
+    """The image of rows that follow on one another, or of columns."""
+    whole = {name: jnp.asarray(np.concatenate([getattr(part, name) for part in parts], axis)) for name in LAYERS}
+    of_cells = [part.levels for part in parts if part.levels is not None]
+    levels = jnp.asarray(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
+    return dataclasses.replace(
+        parts[0],
+        **whole,
+        certified=all(bool(part.certified) for part in parts),
+        faults=int(np.bitwise_or.reduce([int(part.faults) for part in parts])),
+        stats=_summed([part.stats for part in parts]),
+        metadata=tuple((name, value) for name, value in parts[0].metadata if name not in OF_PARTS + OF_FILES),
+        levels=levels,
+    )
+
+
+def _summed(stats: list[dict[str, Any]]) -> dict[str, Any]:
+    """Sums of what all parts counted, stage by stage for seconds."""
+    if not all(stats):
+        return {}
+    summed: dict[str, Any] = {}
+    for name, value in stats[0].items():
+        values = [each[name] for each in stats]
+        summed[name] = _summed(values) if isinstance(value, dict) else sum(values)
+    return summed

@@ -1,0 +1,1 @@
+"""Many frames: snapshots over time, and frames on one machine or many."""

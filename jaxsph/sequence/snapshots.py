@@ -1,0 +1,288 @@
+"""A sequence of particle files as one thing that changes in time: one look for all of it, and particles at any moment.
+
+Flow: files -> survey -> [snapshots] -> Scene at a time -> frames.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph import io, scenes
+from jaxsph.io.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
+from jaxsph.model import Particles, Scene, TransferFunction
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.particles import capacity_class
+from jaxsph.sequence.survey import Reading, Survey, surveyed
+
+ROUNDING = 1e-9
+"""Share of the way between two snapshots by which a time may miss one of them, and mean it."""
+
+
+class Loaded(NamedTuple):
+    """The particles of one snapshot, and what is known of who they are."""
+
+    columns: dict[str, np.ndarray]
+    kernel: str
+    ids: np.ndarray | str
+    velocity: np.ndarray | None
+
+
+class Way(NamedTuple):
+    """From one snapshot to the next: who is who, and velocities times the time between where they tell how particles move."""
+
+    matched: Matched
+    run: tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Snapshots:
+    """Particles that change from file to file; make it with `from_files`.
+
+    Attributes:
+        survey: the files in the order of time, and what they hold.
+        transfer: what they look like, all of them.
+        center: middle of the periodic box that all files have, where it is not their own.
+        within: where they are shown; None is everywhere.
+    """
+
+    survey: Survey
+    transfer: TransferFunction
+    center: tuple[float, float, float] | None = None
+    within: Clip | None = None
+    _loaded: dict[int, Loaded] = dataclasses.field(default_factory=dict, repr=False)
+    _ways: dict[int, Way | str] = dataclasses.field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_files(
+        cls,
+        paths: Iterable[str | os.PathLike[str]],
+        quantity: str | None = None,
+        *,
+        support: float | None = None,
+        kernel: str | None = None,
+        part_type: int | None = None,
+        box: Any = "file",
+        where: str | None = None,
+        share: float | None = None,
+        center: Any = None,
+        within: Clip | None = None,
+        opacity_by: str | None = None,
+        transfer: TransferFunction | None = None,
+        colormap: str = "viridis",
+        gaps: bool = False,
+        strict: bool = True,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Snapshots:
+        """Read all files once, for their times and the range of the quantity over all of them.
+
+        Args:
+            paths: of particle files, in any order: times in the files order them, else numbers in their names.
+            quantity, support, kernel, part_type: as for `jaxsph.io.read_particles`; a quantity that is chosen is chosen by the
+                file in the middle, and taken of all.
+            box, where, share: as for `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids.
+            center: (3,) middle of the periodic box, or "densest" for the densest point of the file in the middle.
+            within: where particles are shown; default everywhere.
+            opacity_by: as for `jaxsph.io.read_particles`; `"auto"` by the file in the middle.
+            transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
+                that suits the file in the middle.
+            colormap: name of a colour map.
+            gaps: whether numbers may be missing in the names of the files.
+            strict: whether files that cannot be read are refused. Else the sequence is that of all others, and times between
+                the two beside such a file have no scene.
+            progress: called as `progress(done, total)` after every file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
+        """
+        reading = Reading(quantity, support, kernel, part_type, box, where, share, opacity_by)
+        survey = surveyed(paths, reading, gaps=gaps, strict=strict, progress=progress)
+        if transfer is None:
+            ramp = None if survey.report.opacity_by is None else "steep"
+            transfer = scenes.default_transfer(survey.middle, colormap, survey.span, ramp=ramp)
+        return cls(survey, transfer, center_of(survey, center), within)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Of the snapshots, ascending."""
+        return self.survey.order.times
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all particles of all snapshots: something to frame."""
+        lower, upper = self.survey.bounds()
+        if self.center is None:
+            return lower, upper
+        return np.array(self.center) - (upper - lower) / 2, np.array(self.center) + (upper - lower) / 2
+
+    def at(self, time: float) -> Scene:
+        """Particles at a time: those of a file, or between two.
+
+        Where ids match, particles move from one file to the next on the shortest way in a periodic box: on the cubic that has
+        their velocities at its ends where files have velocities that lead to where particles are, else straight and evenly.
+        Supports and volumes change geometrically, the quantity linearly. Particles that are in one of the two alone are there
+        for the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file.
+        """
+        particles = self._particles(*self.place(time))
+        return Scene(particles=particles, transfer=self.transfer, within=self.within)
+
+    def moments(self, times: Sequence[float]) -> list[Moment]:
+        """Sources of frames at such times, each read when it is its turn."""
+        return [Moment(self, float(time)) for time in times]
+
+    def each(self) -> list[Moment | Unreadable]:
+        """One source a file, in the order of time; of files that cannot be read, too."""
+        sources: list[Moment | Unreadable] = [*self.moments(self.times)]
+        for unread in reversed(self.survey.unread):
+            sources.insert(unread.before + 1, Unreadable(unread.why))
+        return sources
+
+    def place(self, time: float) -> tuple[int, float]:
+        """Which snapshot is before a time, and the share of the way to the next, in [0, 1)."""
+        times = self.times
+        if not times[0] <= time <= times[-1]:
+            raise ValueError(f"`time` must lie in [{times[0]:g}, {times[-1]:g}], where there are snapshots, got {time:g}")
+        before = bisect.bisect_right(times, time) - 1
+        if before == len(times) - 1:
+            return before, 0.0
+        share = (time - times[before]) / (times[before + 1] - times[before])
+        if share > 1 - ROUNDING:
+            return before + 1, 0.0
+        if share <= ROUNDING:
+            return before, 0.0
+        unread = [file.why for file in self.survey.unread if file.before == before]
+        if unread:
+            raise ValueError(f"there is no scene between times {times[before]:g} and {times[before + 1]:g}: {'; '.join(unread)}")
+        return before, share
+
+    def fingerprint(self, time: float) -> str:
+        """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
+        before, share = self.place(time)
+        files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
+        look = self.transfer, self.within
+        told = files, share, self.survey.reading, self.survey.quantity, self.center, jax.tree.structure(look)
+        digest = hashlib.sha256(repr(told).encode())
+        for leaf in jax.tree.leaves(look):
+            digest.update(np.ascontiguousarray(leaf).tobytes())
+        return digest.hexdigest()
+
+    def _particles(self, before: int, share: float) -> Particles:
+        first = self._load(before)
+        if share == 0:
+            return self._packed(first.columns, first.kernel)
+        second = self._load(before + 1)
+        if before not in self._ways:
+            self._ways.clear()
+            self._ways[before] = self._way(first, second, self.times[before + 1] - self.times[before])
+        way = self._ways[before]
+        if isinstance(way, str):
+            nearer = first if share < 0.5 else second
+            return self._packed(nearer.columns, nearer.kernel)
+        columns = between(first.columns, second.columns, way.matched, share, self.survey.box, way.run)
+        return self._packed(columns, first.kernel)
+
+    def _way(self, first: Loaded, second: Loaded, step: float) -> Way | str:
+        matched = match(first.ids, second.ids)
+        if isinstance(matched, str):
+            return matched
+        run = runs(first.velocity, second.velocity, step if self.survey.order.by_files else None)
+        if run is not None:
+            places = first.columns["position"][matched.first], second.columns["position"][matched.second]
+            way = way_of(*places, self.survey.box)
+            run = run if agree(way, (run[0][matched.first], run[1][matched.second])) else None
+        return Way(matched, run)
+
+    def _load(self, number: int) -> Loaded:
+        """A snapshot's particles; those of two files are kept."""
+        if number not in self._loaded:
+            for other in [other for other in self._loaded if abs(other - number) > 1]:
+                del self._loaded[other]
+            while len(self._loaded) > 1:
+                del self._loaded[min(self._loaded)]
+            file = self.survey.files[number]
+            table = self.survey.reading.table(file.path)
+            quantity, by = self.survey.quantity, self.survey.report.opacity_by
+            particles, _ = io.particles_from_table(table, quantity, *self.survey.reading.how, opacity_by=by)
+            exact = particles.exact_position()[np.asarray(particles.valid)]
+            self._loaded[number] = Loaded(
+                {**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table), velocity_of(table)
+            )
+        return self._loaded[number]
+
+    def _packed(self, columns: dict[str, np.ndarray], kernel: str) -> Particles:
+        """Particles with room for those of the largest file, and of one structure, so that all frames share programs."""
+        wide = self.survey.wide
+        position = columns["position"] if wide else columns["position"].astype(np.float32)
+        others: dict[str, Any] = {name: column.astype(position.dtype) for name, column in columns.items() if name != "position"}
+        if "extinction_quantity" in others:
+            others["quantity"] = others["quantity"], others.pop("extinction_quantity")
+        made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity, box=self.survey.box)
+        if wide and made.dtype == jnp.float32 and made.position_rest is None:
+            made = dataclasses.replace(made, position_rest=jnp.asarray(np.zeros(made.position.shape, np.float32)))
+        return made if self.center is None else made.centered(self.center)
+
+    @property
+    def capacity(self) -> int:
+        """Entries of the particle arrays at any time."""
+        return capacity_class(max(file.num_particles for file in self.survey.files))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what was read, so that a source can be sent to where its frame is rendered, which may be in another folder."""
+        files = tuple(dataclasses.replace(file, path=file.path.absolute()) for file in self.survey.files)
+        survey = dataclasses.replace(self.survey, files=files)
+        return {**self.__dict__, "survey": survey, "_loaded": {}, "_ways": {}}
+
+
+@dataclasses.dataclass(frozen=True)
+class Unreadable:
+    """A file that cannot be read, as the source of a frame that cannot be made."""
+
+    why: str
+
+    def __call__(self) -> Scene:
+        """There is none.
+
+        Raises:
+            ValueError: why.
+        """
+        raise ValueError(self.why)
+
+
+def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
+    """Middle of the period that is asked for; of "densest" that of the file in the middle.
+
+    Raises:
+        ValueError: files without a period, or no three numbers.
+    """
+    if at is None:
+        return None
+    if survey.box is None:
+        raise ValueError("`center` is for periodic boxes, and these files do not have one; give `box=(Lx, Ly, Lz)`")
+    lower, upper = survey.middle.centered(at).bounds()
+    x, y, z = (float(value) for value in (lower + upper) / 2)
+    return x, y, z
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """A sequence at a time, as the source of a frame."""
+
+    snapshots: Snapshots
+    time: float
+
+    def __call__(self) -> Scene:
+        """The scene, read now."""
+        return self.snapshots.at(self.time)
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest of all that its picture depends on, known without reading particles."""
+        return self.snapshots.fingerprint(self.time)

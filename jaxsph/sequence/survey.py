@@ -1,0 +1,296 @@
+"""What the files of a sequence hold, found by reading each once before anything is rendered.
+
+Flow: paths -> [survey] -> Snapshots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph import io
+from jaxsph.io.matching import agree, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.quantities import choose_quantity
+from jaxsph.io.selection import chosen
+from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
+from jaxsph.model import Particles
+from jaxsph.model.transfer.colormaps import value_range
+
+MAX_VALUES = 1 << 16
+"""Values of a file that the range over all files is taken from, evenly spread over its particles."""
+FAR = 4.0
+"""Supports that particles may move between snapshots before it is said that straight ways are a guess."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How files are read: as for `jaxsph.io.read_particles`."""
+
+    quantity: str | None = None
+    support: float | None = None
+    kernel: str | None = None
+    part_type: int | None = None
+    box: Any = "file"
+    where: str | None = None
+    share: float | None = None
+    opacity_by: str | None = None
+
+    @property
+    def how(self) -> tuple[float | None, str | None]:
+        """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
+        return self.support, self.kernel
+
+    def table(self, path: Path) -> io.ParticleTable:
+        """What a file holds of what is asked for."""
+        table, which = io.read_table(path, part_type=self.part_type), {"box": self.box, "where": self.where, "share": self.share}
+        try:
+            return chosen(table, self.quantity, *self.how, **which)
+        except io.DataError as error:
+            raise type(error)(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class SnapshotFile:
+    """One file of a sequence.
+
+    Attributes:
+        path: the file.
+        identity: its name, size in bytes, and time of change in nanoseconds.
+        num_particles: in it.
+        time: as the file says it, or None.
+        lower, upper: corners of the box around its particles, with their supports where the file has them.
+    """
+
+    path: Path
+    identity: tuple[str, int, int]
+    num_particles: int
+    time: float | None
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class UnreadFile:
+    """A file of a sequence that cannot be read.
+
+    Attributes:
+        path: the file.
+        why: what is wrong with it, and its name.
+        before: which of the files that can be read is before it in the order of time; -1 where none is.
+    """
+
+    path: Path
+    why: str
+    before: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """From one file to the next.
+
+    Attributes:
+        matched: particles that are in both, by their ids.
+        vanish, appear: particles that are in one alone.
+        moved: median way of a particle over the median support; None where supports are not in the file.
+        curved: whether velocities tell how particles move.
+        why: why ids could not be matched; None where they could.
+    """
+
+    matched: int = 0
+    vanish: int = 0
+    appear: int = 0
+    moved: float | None = None
+    curved: bool = False
+    why: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Survey:
+    """What the files of a sequence hold.
+
+    Attributes:
+        files: in the order of time.
+        order: when they are.
+        reading: how they were read.
+        quantity: full name of what is shown, of all of them.
+        middle: particles of the file in the middle.
+        report: what was settled for those.
+        span: range of nearly all values of all files.
+        box: edges of the periodic box that all files have, or None.
+        wide: whether positions are float64 in any file.
+        steps: from each file to the next, as they were read; none where times have another order than names.
+        unread: files that cannot be read, by their names in the sequence, as they do not say when they are.
+    """
+
+    files: tuple[SnapshotFile, ...]
+    order: Order
+    reading: Reading
+    quantity: str
+    middle: Particles
+    report: io.Report
+    span: tuple[float, float]
+    box: tuple[float, float, float] | None
+    wide: bool
+    steps: tuple[Step, ...]
+    unread: tuple[UnreadFile, ...] = ()
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all particles of all files, or of their period."""
+        if self.box is not None:
+            return np.zeros(3), np.array(self.box)
+        filled = [file for file in self.files if file.num_particles]
+        if not filled:
+            return np.zeros(3), np.zeros(3)
+        return np.min([file.lower for file in filled], 0), np.max([file.upper for file in filled], 0)
+
+    def told(self) -> list[str]:
+        """Sentences on what is between the files."""
+        together = [step for step in self.steps if step.why is None]
+        said = []
+        for why in dict.fromkeys(step.why for step in self.steps if step.why is not None):
+            number = sum(step.why == why for step in self.steps)
+            said.append(f"{number} of {len(self.steps)} intervals show the nearer snapshot, as {why}")
+        if together:
+            counts = [f"{sum(getattr(step, name) for step in together):,} {name}" for name in ("matched", "vanish", "appear")]
+            where = f"in {len(together)} of {len(self.steps)} intervals: {', '.join(counts)}"
+            said.insert(0, f"particles move from file to file by their ids, {where}")
+            curved = sum(step.curved for step in together)
+            said.insert(1, f"by their velocities in {curved} of these, straight and evenly in {len(together) - curved}")
+        far = max((step.moved for step in together if step.moved is not None), default=0.0)
+        if far > FAR:
+            said.append(f"the median particle moves by up to {far:.2g} supports from file to file: what is between is a guess")
+        return said
+
+
+def surveyed(
+    paths: Iterable[str | os.PathLike[str]],
+    reading: Reading,
+    *,
+    gaps: bool = False,
+    strict: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Survey:
+    """Read all files once; see `Snapshots.from_files`."""
+    named = _by_name([Path(path) for path in paths])
+    if not named:
+        raise ValueError("`paths` must be at least one particle file, got none")
+    for path in named:
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: there is no such file")
+    if not gaps:
+        require_no_gap(named)
+    middle, report = _middle(named, reading)
+    looking = _Looking(reading, report.quantity, float(np.asarray(middle.support).max(initial=0)))
+    for number, path in enumerate(named, 1):
+        looking.look(path)
+        if progress is not None:
+            progress(number, len(named))
+    if strict:
+        looking.refuse_unread(len(named))
+    order = in_order([file.path for file in looking.files], [file.time for file in looking.files])
+    as_read = order.indices == tuple(range(len(looking.files)))
+    return Survey(
+        files=tuple(looking.files[place] for place in order.indices),
+        order=order,
+        reading=reading,
+        quantity=report.quantity,
+        middle=middle,
+        report=report,
+        span=value_range(np.concatenate(looking.values)),
+        box=looking.boxes[0] if len(set(looking.boxes)) == 1 else None,
+        wide=looking.wide,
+        steps=tuple(looking.steps) if as_read else (),
+        unread=tuple(UnreadFile(path, why, order.indices.index(read - 1) if read else -1) for path, why, read in looking.unread),
+    )
+
+
+def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
+    """The file in the middle, or the next to it that can be read: those that cannot are told of later, all at once."""
+    nearest = sorted(paths, key=lambda path: abs(paths.index(path) - len(paths) // 2))
+    for path in nearest:
+        try:
+            table = reading.table(path)
+        except io.ConditionError:
+            raise
+        except (ValueError, OSError) as error:
+            if path == nearest[-1]:
+                raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error
+            continue
+        return io.particles_from_table(table, reading.quantity, *reading.how, opacity_by=reading.opacity_by)
+    raise AssertionError("there is a last path")
+
+
+def _by_name(paths: list[Path]) -> list[Path]:
+    numbers = numbers_of(paths)
+    return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths, strict=True))]
+
+
+class _Looking:
+    """What is found in one file after the other, of which two at a time are in memory."""
+
+    def __init__(self, reading: Reading, quantity: str, support: float) -> None:
+        self._reading, self._quantity, self._support = reading, quantity, support
+        self._last: io.ParticleTable | None = None
+        self.unread: list[tuple[Path, str, int]] = []  # with the number of those that were read before it
+        self.files: list[SnapshotFile] = []
+        self.values: list[np.ndarray] = []
+        self.boxes: list[Any] = []
+        self.steps: list[Step] = []
+        self.wide = False
+
+    def look(self, path: Path) -> None:
+        """Read a file; what cannot be read is kept in `unread`."""
+        try:
+            table = self._reading.table(path)
+            values = self._values(table)
+        except (ValueError, OSError) as error:
+            why = str(error) if str(path) in str(error) else f"{path}: {error}"
+            self.unread.append((path, why, len(self.files)))
+            self._last = None
+            return
+        reach = self._reach(table)
+        position, known = table.position.astype(np.float64) if len(table) else np.zeros((1, 3)), path.stat()
+        identity = path.name, known.st_size, known.st_mtime_ns
+        box = position.min(0) - reach, position.max(0) + reach
+        self.files.append(SnapshotFile(path, identity, len(table), table.time, *box))
+        self.values.append(values[:: max(len(values) // MAX_VALUES, 1)])
+        self.boxes.append(table.box_size)
+        self.wide |= table.position.dtype == np.float64
+        if self._last is not None:
+            self.steps.append(_step(self._last, table, table.box_size))
+        self._last = table
+
+    def refuse_unread(self, number: int) -> None:
+        """Raise `ValueError` that names every file that could not be read."""
+        if self.unread:
+            told = "; ".join(why for _, why, _ in self.unread)
+            raise ValueError(f"{len(self.unread)} of {number} snapshots cannot be read, so nothing is rendered: {told}")
+
+    def _values(self, table: io.ParticleTable) -> np.ndarray:
+        try:
+            return choose_quantity(table, self._quantity)[0]
+        except io.DataError:  # a density that is summed over neighbours is not in the file
+            return io.particles_from_table(table, self._quantity, *self._reading.how)[0].to_numpy()["quantity"]
+
+    def _reach(self, table: io.ParticleTable) -> float:
+        if self._reading.support is not None:
+            return self._reading.support
+        return self._support if table.support is None else float(table.support.max(initial=0))
+
+
+def _step(first: io.ParticleTable, second: io.ParticleTable, box: tuple[float, ...] | None) -> Step:
+    found = match(ids_of(first), ids_of(second))
+    if isinstance(found, str):
+        return Step(why=found)
+    way = way_of(first.position[found.first], second.position[found.second], box)
+    length = float(np.median(np.linalg.norm(way, axis=1)))
+    moved = None if first.support is None else length / float(np.median(first.support))
+    step = None if first.time is None or second.time is None else second.time - first.time
+    run = runs(velocity_of(first), velocity_of(second), step)
+    curved = run is not None and agree(way, (run[0][found.first], run[1][found.second]))
+    return Step(len(found.first), len(found.only_first), len(found.only_second), moved, curved)

@@ -1,0 +1,312 @@
+"""Error against tolerance against time: one table of what every setting of a scene costs, and how wrong it is.
+
+Flow: scene, camera -> plan, render -> [sweep] -> measurements -> files, figures.
+
+Settings are timed in turns with full rate of the same frame, so that a busy machine is slow for all of them; compile time
+and plans are apart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import statistics
+import time
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.engine.planning.fit import plan as make_plan
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.render import render
+from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.trade.contenders import BASELINES, FULL_RATE, TOLERANCES, Contender, contenders, scaled_up
+from jaxsph.trade.integral_error import IntegralAt, layers_of
+from jaxsph.trade.measurement import JOURNAL, KEY, TABLE, Measurement, append, read_journal, write_table
+from jaxsph.trade.provenance import of_frame, of_this_run
+
+STAGES = ("grid", "adapt", "cast", "image")
+
+Progress = Callable[[int, int], None]
+Plans = dict[Hashable, Plan]
+"""By kind of contender: frames of a sequence share them, so that little is compiled for the later ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Frame:
+    """A frame, and what its measurements have in common."""
+
+    scene: Scene
+    camera: Camera
+    shared: dict[str, Any]
+
+    def key(self, setting: Contender) -> tuple[Any, ...]:
+        found = self.shared | {"method": setting.method, "tolerance": setting.tolerance}
+        return tuple(found[name] for name in KEY)
+
+
+def sweep(
+    scene: Scene | Sequence[Scene],
+    camera: Camera | Sequence[Camera],
+    settings: Settings | None = None,
+    *,
+    tolerances: Sequence[float] = TOLERANCES,
+    estimators: Sequence[str] | None = None,
+    baselines: Sequence[str] = BASELINES,
+    repeats: int = 3,
+    converged: int = 8,
+    integral: int = 1000,
+    name: str = "scene",
+    frames: Sequence[float] | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> list[Measurement]:
+    """Measure error and time of every estimator at every tolerance, and of coarser sampling and smaller images.
+
+    The error of a pixel is the largest difference of any colour channel or alpha: to the same frame at full rate, to an image
+    of `converged` times the samples and, at `integral` random pixels, to the light integral. Times are medians over `repeats`
+    turns; each group of settings (the baselines, an estimator) takes turns with full rate.
+
+    Args:
+        scene, camera: what to render, and from where; or as many of both as the sequence has frames.
+        settings: of full rate, without tolerance, estimator and `relax`; default `Settings(integrator="samples")`.
+        tolerances: each >= 0.
+        estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, kept
+            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
+        baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
+            `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
+        repeats, converged: at least 1.
+        integral: at how many pixels to take the light integral (`jaxsph.reference.integral`, which knows no `media`); 0: none.
+        name: of the scene, for the table.
+        frames: a number for each frame; default 0, 1, ... of a sequence.
+        folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
+            be. What it holds already is not measured again. `None` keeps nothing.
+        progress: called as `progress(done, total)` after every image.
+
+    Returns:
+        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it.
+
+    Raises:
+        ValueError: arguments out of range, scenes and cameras that do not pair, a folder that holds something else.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, section 7, tables 2 and 3, figures 11 and 12.
+    """
+    settings = settings or Settings(integrator="samples")
+    if settings.tolerance is not None:
+        raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
+    _require_count("repeats", repeats)
+    _require_count("converged", converged)
+    _require_count("integral", integral, least=0)
+    groups = contenders(settings, tolerances, estimators, baselines)
+    views = _views(scene, camera, frames)
+    shared = {"scene": name, "repeats": repeats, "converged": converged, "integral": integral} | of_this_run()
+    each = [
+        _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number}) for number, one, view in views
+    ]
+    return _rows(each, groups, repeats, folder, progress)
+
+
+def _rows(
+    frames: list[_Frame],
+    groups: list[list[Contender]],
+    repeats: int,
+    folder: str | os.PathLike[str] | None,
+    progress: Progress | None,
+) -> list[Measurement]:
+    """The table: what the folder holds of it, and what is measured now."""
+    held = {row.key: row for row in read_journal(_journal(folder))} if folder is not None else {}
+    tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
+    truths = 2 + bool(frames[0].shared["integral"])
+    tick = _ticker(progress, sum(_num_renders(missing, truths, repeats) for _, missing in tasks))
+    plans: Plans = {}
+    for frame, missing in tasks:
+        for row in _measure(frame, groups[0][0], missing, plans, tick):
+            held[row.key] = row
+            if folder is not None:
+                append(_journal(folder), row)
+    if folder is not None:
+        write_table(Path(folder) / TABLE, held.values())
+    return [held[frame.key(setting)] for frame, _ in tasks for group in groups for setting in group]
+
+
+def _views(
+    scene: Scene | Sequence[Scene], camera: Camera | Sequence[Camera], frames: Sequence[float] | None
+) -> list[tuple[float | None, Scene, Camera]]:
+    scenes = [scene] if isinstance(scene, Scene) else list(scene)
+    cameras = [camera] if isinstance(camera, Camera) else list(camera)
+    if not scenes or len(scenes) != len(cameras):
+        raise ValueError(f"`scene` and `camera` must pair, got {len(scenes)} and {len(cameras)}; give one camera a scene")
+    if frames is None:
+        if isinstance(scene, Scene):
+            return [(None, scenes[0], cameras[0])]
+        frames = range(len(scenes))
+    if len(set(frames)) != len(scenes) or len(frames) != len(scenes):
+        raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(frames)}")
+    return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
+
+
+def _require_count(name: str, value: int, least: int = 1) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}")
+
+
+def _num_renders(missing: list[list[Contender]], truths: int, repeats: int) -> int:
+    """Images that `_measure` makes: truths, one of each setting, and the turns."""
+    turns = [[setting for setting in group if setting.method != FULL_RATE] for group in missing if group]
+    return truths * bool(turns) + sum(len(turn) + repeats * (1 + len(turn)) for turn in turns)
+
+
+def _ticker(progress: Progress | None, total: int) -> Callable[[], None]:
+    done = 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    return tick
+
+
+def _measure(
+    frame: _Frame, full: Contender, missing: list[list[Contender]], plans: Plans, tick: Callable[[], None]
+) -> Iterable[Measurement]:
+    """Rows of what is missing of a frame, as soon as each group has taken its turns."""
+    if not any(missing):
+        return
+    finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
+    converged = _First.of(frame, Contender("converged", finer), plans).layers
+    tick()
+    of_full = _First.of(frame, full, plans)
+    tick()
+    truths = _Truths(of_full, converged, IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"]))
+    if frame.shared["integral"]:
+        tick()
+    for group in missing:
+        firsts = [of_full]
+        for setting in group:
+            if setting is not full:
+                firsts.append(_First.of(frame, setting, plans))
+                tick()
+        times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
+        for first, turns in zip(firsts, times, strict=False):
+            if first.setting in group:
+                found = _compared(first, truths) | _medians(turns) | {"full_total": _medians(times[0])["total"]}
+                yield Measurement(**frame.shared, **found)
+
+
+@dataclasses.dataclass(frozen=True)
+class _First:
+    """The first image of a setting, and the plan that its later ones use."""
+
+    setting: Contender
+    plan: Plan
+    plan_seconds: float
+    compile_seconds: float
+    image: Image
+    layers: Float[np.ndarray, "height width 4"]
+
+    @classmethod
+    def of(cls, frame: _Frame, setting: Contender, plans: Plans) -> _First:
+        view, image, planned = (frame.scene, setting.camera(frame.camera), setting.settings), None, 0.0
+        if setting.kind in plans:
+            with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
+                image = render(*view, plan=plans[setting.kind])
+        if image is None:
+            started = time.perf_counter()
+            plans[setting.kind] = make_plan(*view)
+            planned = time.perf_counter() - started
+            image = render(*view, plan=plans[setting.kind])
+        compiled, layers = image.stats["seconds"]["compile"], scaled_up(layers_of(image), frame.camera)
+        return cls(setting, plans[setting.kind], planned, compiled, image, layers)
+
+
+def _in_turns(frame: _Frame, firsts: Sequence[_First], repeats: int, tick: Callable[[], None]) -> list[list[dict[str, float]]]:
+    """Seconds by stage of every turn of every setting."""
+    times: list[list[dict[str, float]]] = [[] for _ in firsts]
+    for _ in range(repeats):
+        for first, turns in zip(firsts, times, strict=True):
+            camera = first.setting.camera(frame.camera)
+            image = render(frame.scene, camera, first.setting.settings, plan=first.plan)
+            seconds = {stage: image.stats["seconds"][stage] for stage in STAGES}
+            if first.setting.shrink > 1:
+                started = time.perf_counter()
+                scaled_up(layers_of(image), frame.camera)
+                seconds["image"] += time.perf_counter() - started
+            turns.append(seconds)
+            tick()
+    return times
+
+
+def _medians(turns: list[dict[str, float]]) -> dict[str, float]:
+    sums = [sum(turn.values()) for turn in turns]
+    total = statistics.median(sums)
+    stages = {stage: statistics.median(turn[stage] for turn in turns) for stage in STAGES}
+    return stages | {"total": total, "deviation": statistics.median(abs(one - total) for one in sums)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Truths:
+    """What images of a frame are compared with."""
+
+    full: _First
+    converged: Float[np.ndarray, "height width 4"]
+    integral: IntegralAt | None
+
+
+def _compared(first: _First, truths: _Truths) -> dict[str, Any]:
+    """How wrong an image is, how wrong it was said to be, and the work it took."""
+    error, away = (np.abs(first.layers - other).max(-1) for other in (truths.full.layers, truths.converged))
+    found = {
+        "method": first.setting.method,
+        "tolerance": first.setting.tolerance,
+        "certified": bool(first.image.certified) and first.setting.tolerance is not None,
+        "max_error": float(error.max()),
+        "mean_error": float(error.mean()),
+        "max_error_converged": float(away.max()),
+        "mean_error_converged": float(away.mean()),
+        "evaluations": first.image.stats["evaluations"],
+        "evaluations_full": truths.full.image.stats["evaluations"],
+        "plan": first.plan_seconds,
+        "compile": first.compile_seconds,
+        "bytes": first.plan.bytes,
+    }
+    return found | _kept(first, error, truths.integral) | _to_integral(first, truths.integral)
+
+
+def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: IntegralAt | None) -> dict[str, float | None]:
+    """Whether tolerance and bound hold, against what they are promised against."""
+    tolerance = first.setting.tolerance
+    if tolerance is None:
+        return dict.fromkeys(("over_tolerance", "max_bound", "over_bound"))
+    bound = np.asarray(first.image.error_bound, np.float64)
+    largest = float(bound.max())
+    if first.setting.is_against_integral:
+        if integral is None:
+            return {"over_tolerance": None, "max_bound": largest, "over_bound": None}
+        error, bound = integral.errors(first.layers), integral.at(bound)
+    over, beyond = float((error > tolerance).mean()), float((error > bound).mean())
+    return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
+
+
+def _to_integral(first: _First, integral: IntegralAt | None) -> dict[str, float | None]:
+    """How far an image is from the light integral."""
+    if integral is None:
+        return dict.fromkeys(("integral_mean", "integral_p999", "integral_max"))
+    errors = integral.errors(first.layers)
+    mean, quantile, largest = float(errors.mean()), float(np.quantile(errors, 0.999)), float(errors.max())
+    return {"integral_mean": mean, "integral_p999": quantile, "integral_max": largest}
+
+
+def _journal(folder: str | os.PathLike[str]) -> Path:
+    """Path of the journal; its folder is made."""
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"`folder` {os.fspath(folder)} cannot be made ({error.strerror}); give another one") from error
+    return Path(folder) / JOURNAL

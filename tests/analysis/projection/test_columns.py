@@ -1,0 +1,83 @@
+"""Column integrals of kernels against quadrature of the kernels themselves."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxsph.analysis.projection import columns, shell_integrals
+from jaxsph.model import kernels
+
+NAMES = sorted(kernels.KERNELS)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
+
+
+def quadrature(name, b, start, end):
+    """Integral of the kernel along a ray, split at the foot and where the kernel has kinks."""
+    kernel, total = kernels.by_name(name), 0.0
+    rings = [np.sqrt(max(c * c - b * b, 0)) for c in (0.2, 1 / 3, 0.5, 0.6, 2 / 3, 1)]
+    breaks = sorted({start, end, *(t for t in (0, *rings, *(-r for r in rings)) if start < t < end)})
+    for low, high in itertools.pairwise(breaks):
+        t = (low + high) / 2 + (high - low) / 2 * NODES
+        total += (high - low) / 2 * (WEIGHTS * kernel.norm * kernel.of_square(b * b + t * t, np)).sum()
+    return total
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pieces_add_up_to_the_kernel(name):
+    r = np.linspace(0, 1.2, 400)
+    if name in columns.PIECES:
+        found = sum(np.where(r < piece.radius, np.polyval(piece.coefficients[::-1], r), 0) for piece in columns.PIECES[name])
+    else:
+        edges = ((np.maximum(edge.radius - r, 0), edge.coefficients) for edge in shell_integrals.EDGES[name])
+        found = sum(factor * near**power for near, factors in edges for power, factor in factors.items())
+    np.testing.assert_allclose(found, kernels.by_name(name).of_square(r * r, np), atol=1e-13)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@given(b=st.one_of(st.floats(0, 1.1), st.sampled_from([0.0, 1e-9, 0.5, 1.0])), ends=st.tuples(*[st.floats(-1.5, 1.5)] * 2))
+@settings(max_examples=60)
+def test_integrals_are_those_of_the_kernel_to_1e_10(name, b, ends):
+    start, end = sorted(ends)
+    truth, peak = quadrature(name, b, start, end), columns.whole_column(name, np.float64(0), np)
+    assert abs(columns.column_between(name, np.float64(b * b), start, end, np) - truth) <= 1e-10 * peak
+    assert abs(columns.whole_column(name, np.float64(b * b), np) - quadrature(name, b, -2.0, 2.0)) <= 1e-10 * peak
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_single_precision_is_good_to_1e_5_of_the_peak_and_never_negative(name):
+    square = np.linspace(0, 1.05, 4001, dtype=np.float32) ** 2
+    truth = columns.whole_column(name, square.astype(np.float64), np)
+    for found in (columns.whole_column(name, jnp.asarray(square)), columns.column_between(name, jnp.asarray(square), -2.0, 2.0)):
+        assert np.abs(found - truth).max() <= 1e-5 * truth.max()
+        assert np.min(found) >= 0 and (np.asarray(found)[square >= 1] == 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_column_has_unit_integral_over_the_plane_and_so_have_all_depths(name):
+    b = (NODES + 1) / 2
+    b, weight = np.concatenate([b / 2, (1 + b) / 2]), np.tile(WEIGHTS / 4, 2)
+    assert abs((2 * np.pi * b * columns.whole_column(name, b**2, np) * weight).sum() - 1) < 1e-6
+    assert abs(columns.depth_share(name, -2.0, 2.0, np) - 1) < 1e-12
+    near, far = columns.depth_share(name, -1.0, 0.3, np), columns.depth_share(name, 0.3, 1.0, np)
+    assert abs(near + far - 1) < 1e-12
+    between = (2 * np.pi * b * columns.column_between(name, b**2, -1.0, 0.3, np) * weight).sum()
+    assert abs(between - near) < 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_are_finite_and_those_of_differences(name, x64):
+    for b in (0.0, 0.2, 0.5, 0.9, 1.0, 1.1):
+        slope = jax.grad(lambda b: columns.whole_column(name, b * b))(b)
+        step = 1e-6
+        ends = (columns.whole_column(name, np.float64(b + side) ** 2, np) for side in (step, -step))
+        assert abs(slope - (next(ends) - next(ends)) / (2 * step)) < 1e-5
+    for b in (0.0, 0.3, 0.7):
+        for wanted in (1, 2):
+            found = jax.grad(lambda *at: columns.column_between(name, *at), wanted)(b * b, -0.2, 0.4)
+            at, sign = ((-0.2, -1), (0.4, 1))[wanted - 1]
+            assert abs(found - sign * kernels.by_name(name).norm * kernels.by_name(name).of_square(b * b + at * at, np)) < 1e-9

@@ -1,0 +1,64 @@
+"""Means of columns over pixels against quadrature."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsph.analysis.projection import columns
+from jaxsph.analysis.projection.pixel_shares import pixel_shares
+from jaxsph.model import kernels
+from jaxsph.numerics.fusion import barriers
+
+NAMES = sorted(kernels.KERNELS)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+
+def by_quadrature(name, x, y):
+    """Integrals over pixels, each cut into parts that are small against the support."""
+    parts = int(np.ceil((x[1] - x[0]) / 0.1))
+
+    def points(edges):
+        fine = np.interp(np.arange((len(edges) - 1) * parts + 1) / parts, np.arange(len(edges)), edges)
+        half = np.diff(fine)[:, None] / 2
+        return (fine[:-1, None] + half * (1 + NODES)).ravel(), (half * WEIGHTS).ravel()
+
+    (px, wx), (py, wy) = points(x), points(y)
+    values = columns.whole_column(name, py[:, None] ** 2 + px**2, np) * wy[:, None] * wx
+    return values.reshape(len(y) - 1, -1, len(x) - 1, values.shape[1] // (len(x) - 1)).sum((1, 3))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("pixel", [5.0, 1.0, 0.3, 0.06])
+def test_shares_are_good_to_1e_4_of_the_peak_and_add_up(name, pixel):
+    rng = np.random.default_rng(3)
+    number = int(2.4 / pixel) + 3
+    x, y = ((np.arange(number + 1) - number / 2 + rng.uniform()) * pixel for _ in range(2))
+    found = np.asarray(pixel_shares(name, jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)), np.float64)
+    truth = by_quadrature(name, x, y)
+    assert np.abs(found - truth).max() <= 1e-4 * columns.whole_column(name, 0.0, np) * min(pixel**2, 1)
+    assert abs(found.sum() - 1) < 3e-5 and found.min() >= 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_lies_outside_has_nothing(name):
+    edges = jnp.linspace(0.8, 3.0, 4)
+    assert float(pixel_shares(name, edges, edges).sum()) == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_are_what_crosses_the_edges(name, x64):
+    x, y = jnp.asarray([-3.0, 0.3, 3.0]), jnp.asarray([-3.0, 3.0])
+    slope = jax.grad(lambda shift: pixel_shares(name, x + shift, y)[0, 0])(0.0)
+    at = np.linspace(-1, 1, 4001)
+    crossing = np.trapezoid(columns.whole_column(name, 0.09 + at**2, np), at)
+    assert abs(slope - crossing) < 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shares_are_the_same_with_and_without_barriers(name):
+    edges = jnp.linspace(-1.2, 1.1, 40)
+    found = pixel_shares(name, edges, edges)
+    with barriers(False):
+        other = pixel_shares(name, edges, edges)
+    np.testing.assert_allclose(found, other, atol=2e-5 * float(other.max()))

@@ -1,0 +1,375 @@
+"""Projections against the float64 oracle, against what is known in closed form, and under the transforms of JAX."""
+
+import dataclasses
+import functools
+import itertools
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import QUICKLY
+
+import jaxsph as js
+from jaxsph.engine.access.lists import ListPlan
+from jaxsph.model import kernels
+from jaxsph.numerics import faults
+
+NAMES = sorted(kernels.KERNELS)
+pytestmark = pytest.mark.usefixtures("quick_programs")
+SIZE = {"width": 20, "height": 13}
+
+
+CAPACITY = 256
+LISTS = ListPlan(1, 2, 1024, 4096, 1)  # room for all that is projected here, such that programs are compiled once
+
+
+def plan_of(pixel, capacity):
+    return js.ProjectionPlan(20, 13, capacity, pixel, 1, LISTS, LISTS if pixel == "mean" else None)
+
+
+def project(particles, camera, *what, pixel="mean", **more):
+    return js.project(particles, camera, *what, pixel=pixel, plan=plan_of(pixel, particles.capacity), **more)
+
+
+def particles_of(seed=0, kernel="cubic_spline", count=40, decades=1.2, dtype=np.float32):
+    rng = np.random.default_rng(seed)
+    support = 0.9 * 10 ** -rng.uniform(0, decades, count)
+    columns = (rng.uniform(-1, 1, (count, 3)), support, rng.uniform(-1, 1, count), rng.uniform(0.1, 1, count))
+    return js.Particles.from_arrays(*(column.astype(dtype) for column in columns), kernel, capacity=CAPACITY)
+
+
+def camera_of(projection="orthographic", near=0.5, far=6.0, **more):
+    place = {"eye": (1.0, 0.7, 2.9), "target": (0.05, 0, 0), "near": near, "far": far} | SIZE | more
+    if projection == "orthographic":
+        return js.Camera.orthographic(view_height=3.6, **place)
+    return js.Camera.look_at(fov_degrees=55.0, **place)
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+@pytest.mark.parametrize("kernel", NAMES)
+def test_rays_are_those_of_the_oracle(kernel, projection):
+    particles, camera = particles_of(1, kernel), camera_of(projection)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    found = project(particles, camera, pixel="ray").values
+    np.testing.assert_allclose(found, truth, atol=3e-5 * truth.max())
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
+def test_parts_of_rays_are_those_of_the_oracle_and_add_up(projection):
+    particles, camera = particles_of(2), camera_of(projection, near=1.9, far=3.1)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    part = project(particles, camera, pixel="ray")
+    np.testing.assert_allclose(part.values, truth, atol=3e-5 * truth.max())
+    whole = project(particles, camera, pixel="ray", depth_range=(0.1, 9.0)).values
+    others = [project(particles, camera, pixel="ray", depth_range=ends).values for ends in ((0.1, 1.9), (3.1, 9.0))]
+    np.testing.assert_allclose(part.values + others[0] + others[1], whole, atol=3e-5 * truth.max())
+
+
+@pytest.mark.parametrize(("projection", "near"), [("orthographic", 0.5), ("orthographic", 2.4), ("perspective", 2.4)])
+def test_means_over_pixels_are_those_of_the_oracle(projection, near):
+    particles, camera = particles_of(3, decades=0.15), camera_of(projection, near=near)
+    truth = js.reference.project(particles, camera, subrays=12).values
+    np.testing.assert_allclose(project(particles, camera).values, truth, atol=3e-4 * truth.max())
+
+
+def test_means_of_small_supports_are_those_of_the_oracle_where_rays_hardly_spread():
+    particles = particles_of(3, count=20, decades=0.1)
+    particles = dataclasses.replace(particles, support=0.4 * particles.support)
+    camera = js.Camera.look_at((10, 7, 29), (0.05, 0, 0), fov_degrees=6.5, near=25, far=40, **SIZE)
+    truth = js.reference.project(particles, camera, subrays=24).values
+    np.testing.assert_allclose(project(particles, camera).values, truth, atol=3e-3 * truth.max())
+
+
+def test_double_precision_is_exact(x64):
+    particles, camera = particles_of(4, "wendland_c2", dtype=np.float64), camera_of("perspective", near=np.float64(2.0))
+    camera = jax.tree.map(lambda leaf: leaf.astype(np.float64), camera)
+    truth = js.reference.project(particles, camera, pixel="ray").values
+    found = project(particles, camera, pixel="ray").values
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, truth, atol=1e-9 * truth.max())
+
+
+@pytest.mark.parametrize(
+    "kernel", ["cubic_spline", *(pytest.param(name, marks=pytest.mark.slow) for name in ("poly6", "wendland_c2"))]
+)
+def test_no_mass_is_lost_however_small_supports_are(kernel):
+    rng = np.random.default_rng(5)
+    mass, pixel = rng.uniform(0.5, 2, 200).astype(np.float32), 2.6 / 13
+    camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.6, near=0, far=10, **SIZE)
+    for size in (4.0, 1e-3, 0.3, 1.7):
+        position = rng.uniform(-1, 1, (200, 3)) * (2 - size * pixel, 1.3 - size * pixel, 1)
+        particles = js.Particles.from_arrays(position, size * pixel, 0.0, mass, kernel, capacity=CAPACITY)
+        assert abs(float(project(particles, camera).total()) / mass.sum() - 1) < 1e-4
+
+
+def test_mass_between_two_depths_is_kept_where_they_cut_small_supports():
+    rng = np.random.default_rng(6)
+    position = rng.uniform(-1, 1, (200, 3)) * (1.5, 1, 0)
+    particles = js.Particles.from_arrays(position, 0.05, 0.0, 1.0, "cubic_spline", capacity=CAPACITY)
+    camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.6, near=0, far=5, **SIZE)
+    assert abs(float(project(particles, camera).total()) / 100 - 1) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("kernel", "spacings"), [("cubic_spline", 4.2), pytest.param("wendland_c2", 5.2, marks=pytest.mark.slow)]
+)
+def test_a_uniform_box_has_its_column_density_to_1e_4(kernel, spacings):
+    axis = (np.arange(24) + 0.5) / 12 - 1
+    position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    particles = js.Particles.from_arrays(position, spacings / 12, 0.0, 3.0 * 12.0**-3, kernel)
+    turned = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=0.7, near=1, far=9, **SIZE)
+    plan = js.plan_projection(particles, turned)
+    plan = dataclasses.replace(plan, rays=plan.shares)  # where depths cut
+    np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=1e-4)
+    part = js.project(particles, turned, plan=plan, depth_range=(4.6, 5.3)).values
+    np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("spacings", "ends"), [(4.0, (1, 9)), (4.0, (4.25, 5.75))], ids=["pixels", "depths"])
+def test_a_plan_has_room_however_programs_round(spacings, ends, monkeypatch):
+    """Of a lattice, whole layers lie on borders of pixels and at the ends of depths: a plan without any slack still serves."""
+    monkeypatch.setattr(sys.modules["jaxsph.analysis.projection.plan"], "capacity_class", lambda count: count)
+    axis = (np.arange(12) - 6) / 8
+    position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    view = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=13 / 8, near=ends[0], far=ends[1], **SIZE)
+    particles = js.Particles.from_arrays(position, spacings / 8, 0.0, 1.0)
+    plan = js.plan_projection(particles, view)
+    eps, still = np.finfo(np.float32).eps, js.project(particles, view, plan=plan).values
+    for seed in range(3):
+        off = np.random.default_rng(seed).uniform(-3, 3, (2, len(position), 3)) * eps
+        moved = js.Particles.from_arrays(position + off[0], spacings / 8 * (1 + off[1][:, 0]), 0.0, 1.0)
+        image = js.project(moved, view, plan=plan)
+        np.testing.assert_allclose(image.values, still, rtol=1e-4, atol=1e-4)
+
+
+def periodic(count=60, seed=17, **more):
+    """And its 27 copies, those in the box first; on a grid of 2^-12, so that no copy is rounded."""
+    rng, sides = np.random.default_rng(seed), np.array([1.5, 1.0, 0.75])
+    position = np.floor(rng.uniform(0, 1, (count, 3)) * sides * 4096) / 4096
+    others = rng.uniform(0.05, 0.4, count), rng.uniform(-1, 1, count), rng.uniform(0.1, 1, count)
+    turns = sorted(itertools.product((-1, 0, 1), repeat=3), key=any)
+    copies = np.concatenate([position + sides * turn for turn in turns])
+    one = js.Particles.from_arrays(position, *others, "cubic_spline", box=sides)
+    return one, js.Particles.from_arrays(copies, *(np.tile(column, 27) for column in others), "cubic_spline")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixel", ["mean", "ray"])
+def test_along_an_axis_a_periodic_set_is_its_copies_between_the_faces(pixel):
+    particles, copies = periodic(25)
+    camera = js.along_axis(particles, "z", 18, 12)  # pixels end at the faces
+    truth = js.reference.project(copies, camera, pixel=pixel, depth_range=(0.375, 1.125), subrays=10).values
+    image = js.project(particles, camera, pixel=pixel)
+    np.testing.assert_allclose(image.values, truth, atol=3e-4 * truth.max())
+    if pixel == "mean":
+        assert abs(float(image.total()) / particles.to_numpy()["volume"].sum() - 1) < 1e-4
+        return
+    part = js.project(particles, camera, pixel=pixel, depth_range=(0.2, 0.8))
+    slab = js.reference.project(copies, camera, pixel=pixel, depth_range=(0.375, 0.8)).values
+    np.testing.assert_allclose(part.values, slab, atol=3e-5 * truth.max())
+
+
+@pytest.mark.slow
+def test_pixels_beyond_the_faces_hold_nothing_and_those_across_them_a_part():
+    particles, _ = periodic()
+    wide = js.Camera.orthographic((0.75, 0.5, 3), (0.75, 0.5, 0), view_height=1.3, near=1, far=5, **SIZE)
+    image = js.project(particles, wide)
+    assert abs(float(image.total()) / particles.to_numpy()["volume"].sum() - 1) < 2e-2  # of those a part is as full as the whole
+    values = np.asarray(image.values)
+    assert (values[0] == 0).all() and (values[:, 0] == 0).all() and (values[2:-2, 4:-4] > 0).all()
+    nothing = js.project(particles, wide, depth_range=(1, 2))
+    assert (np.asarray(nothing.values) == 0).all()
+
+
+def test_other_cameras_see_each_particle_of_a_periodic_set_once():
+    particles, _ = periodic()
+    aslant = js.Camera.orthographic((3, 2, 4), (0.75, 0.5, 0.4), view_height=3.5, near=0.5, far=9, **SIZE)
+    image = js.project(particles, aslant)
+    assert js.plan_projection(particles, aslant).images is None
+    assert abs(float(image.total()) / particles.to_numpy()["volume"].sum() - 1) < 1e-4
+    outside = dataclasses.replace(particles, position=particles.position + particles.box.sides)
+    np.testing.assert_allclose(js.project(outside, aslant).values, image.values, atol=1e-3 * float(image.values.max()))
+
+
+@pytest.mark.slow
+def test_a_plan_for_a_periodic_set_grows_and_is_for_periodic_sets():
+    camera = js.along_axis(periodic()[0], "z", 20, 13)
+    few, many = (periodic(count)[0].padded(64) for count in (20, 60))
+    small, large = (js.plan_projection(particles, camera) for particles in (few, many))
+    grown = js.plan_projection(many, camera, like=small)
+    assert grown.images == large.images > small.images and js.plan_projection(few, camera, like=grown) == grown
+    with pytest.raises(ValueError, match="a periodic box, and these have none"):
+        js.project(dataclasses.replace(many, box=None), camera, plan=grown)
+    with pytest.raises(js.CapacityError):
+        js.project(many, camera, plan=dataclasses.replace(large, images=3))
+
+
+def test_small_points_seen_in_perspective_keep_their_mass():
+    rng = np.random.default_rng(7)
+    position = rng.uniform(-0.5, 0.5, (100, 3))
+    particles = js.Particles.from_arrays(position, 1e-3, 0.0, 1.0, "cubic_spline", capacity=CAPACITY)
+    camera = js.Camera.look_at((0, 0.1, 3), (0, 0, 0), near=1, far=5, **SIZE)
+    offset = position - camera.exact_eye()
+    depth = offset @ np.asarray(camera.axes, np.float64)[2]
+    seen = (np.linalg.norm(offset, axis=1) / depth**3).sum()  # of 1 / area at each depth, along slanted rays
+    image = project(particles, camera)
+    assert abs(float(image.values.sum() * image.pixel_area) / seen - 1) < 1e-4
+
+
+def test_a_mean_of_a_constant_is_that_constant_and_nothing_where_nothing_is():
+    particles = dataclasses.replace(particles_of(8, decades=0.2), quantity=jnp.full(CAPACITY, 7.0))
+    image = project(particles, camera_of(), weight="volume")
+    values, weight = np.asarray(image.values), np.asarray(image.weight)
+    np.testing.assert_allclose(values[weight > 0], 7.0, rtol=2e-6)
+    assert np.isnan(values[weight == 0]).all() and (weight == 0).any()
+
+
+def test_means_are_those_of_the_oracle():
+    particles, camera = particles_of(9, decades=0.3), camera_of()
+    mass = np.random.default_rng(0).uniform(1e40, 2e40, particles.num_particles)  # that float32 cannot hold
+    found, truth = (one(particles, camera, weight=mass) for one in (project, js.reference.project))
+    solid = truth.weight > 1e-3 * truth.weight.max()
+    np.testing.assert_allclose(np.asarray(found.values)[solid], truth.values[solid], atol=2e-3)
+
+
+def test_amounts_that_float32_cannot_hold_are_projected():
+    particles, camera = particles_of(10), camera_of()
+    large = dataclasses.replace(particles, position=100 * particles.position, support=100 * particles.support)
+    place = {"near": 50, "far": 600, "view_height": 360} | SIZE
+    camera = js.Camera.orthographic((100, 70, 290), (5, 0, 0), **place)
+    mass = np.full(particles.num_particles, 1e39)
+    truth = js.reference.project(large, camera, mass, pixel="ray").values
+    np.testing.assert_allclose(project(large, camera, mass, pixel="ray").values, truth, atol=3e-5 * truth.max())
+
+
+def test_emission_of_power_one_is_the_column_density_and_others_weigh_by_density():
+    mass, density = np.array([1.0, 2.0]), np.array([3.0, 5.0])
+    np.testing.assert_allclose(js.emission(mass, density, power=1), mass)
+    np.testing.assert_allclose(js.emission(mass, density, 0.5), 0.5 * density * mass)
+    np.testing.assert_allclose(jax.jit(js.emission)(mass, density), density * mass, rtol=1e-6)
+
+
+def test_a_plan_grows_to_what_is_needed():
+    few, many, camera = particles_of(15, count=10), particles_of(16), camera_of()
+    small, large = js.plan_projection(few, camera), js.plan_projection(many, camera)
+    grown = js.plan_projection(many, camera, like=small)
+    assert grown.shares.list_capacity >= large.shares.list_capacity
+    assert js.plan_projection(few, camera, like=grown) == grown
+    np.testing.assert_array_equal(*(js.project(few, camera, plan=plan).values for plan in (small, grown)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixel", ["mean", "ray"])
+def test_bands_change_nothing(pixel):
+    particles = particles_of(11)
+    camera = camera_of(height=40)
+    whole = js.plan_projection(particles, camera, pixel=pixel)
+    cut = dataclasses.replace(whole, bands=3)
+    cut = dataclasses.replace(cut, **{
+        name: dataclasses.replace(getattr(cut, name), tile_rows=1) for name in ("rays", "shares") if getattr(cut, name)
+    })  # fmt: skip
+    images = [js.project(particles, camera, pixel=pixel, plan=plan).values for plan in (whole, cut)]
+    np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6 * np.max(images[0]))
+
+
+@pytest.mark.parametrize(
+    ("pixel", "projection"),
+    [
+        ("mean", "orthographic"),
+        pytest.param("ray", "perspective", marks=pytest.mark.slow),
+        pytest.param("mean", "perspective", marks=pytest.mark.slow),
+        pytest.param("ray", "orthographic", marks=pytest.mark.slow),
+    ],
+)
+def test_gradients_are_those_of_differences(pixel, projection, x64):
+    particles = particles_of(12, "wendland_c2", 12, decades=1.0, dtype=np.float64)
+    camera = jax.tree.map(lambda leaf: leaf.astype(np.float64), camera_of(projection, near=2.2, far=3.4))
+    plan = js.plan_projection(particles, camera, pixel=pixel)
+    pattern = np.random.default_rng(0).normal(size=(13, 20))
+
+    def loss(position, support, mass, eye, far):
+        moved = dataclasses.replace(particles, position=position, support=support)
+        seen = dataclasses.replace(camera, eye=eye, far=far)
+        return (js.project(moved, seen, mass, pixel=pixel, plan=plan).values * pattern).sum()
+
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def looked(inputs, moves):
+        return *jax.jvp(loss, inputs, moves), jax.grad(loss, argnums=(0, 1, 2, 3, 4))(*inputs)
+
+    inputs = particles.position, particles.support, jnp.linspace(1.0, 2.0, CAPACITY), camera.eye, camera.far
+    rng = np.random.default_rng(1)
+    moves = tuple(jnp.asarray(rng.normal(size=np.shape(value))) for value in inputs)
+    _, forward, pulled = looked(inputs, moves)
+    step = 1e-5
+    ends = [
+        looked(tuple(value + side * step * move for value, move in zip(inputs, moves, strict=True)), moves)[0] for side in (1, -1)
+    ]
+    wanted = (ends[0] - ends[1]) / (2 * step)
+    backward = sum((cotangent * move).sum() for cotangent, move in zip(pulled, moves, strict=True))
+    assert abs(forward - wanted) < 2e-4 * abs(wanted) + 1e-4
+    assert abs(backward - forward) < 1e-9 * abs(forward) + 1e-9
+
+
+def test_one_program_serves_moved_particles_and_many_at_once():
+    particles, camera = particles_of(13), camera_of()
+    plan = js.plan_projection(particles, camera)
+
+    def shifted(shift):
+        moved = dataclasses.replace(particles, position=particles.position + shift)
+        return js.project(moved, camera, plan=plan).values
+
+    shifts = jnp.asarray([0.0, 0.02])
+    together = jax.jit(jax.vmap(shifted))(shifts)
+    np.testing.assert_allclose(together[0], js.project(particles, camera).values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_plan_that_is_too_small_is_refused_or_a_fault():
+    particles, camera = particles_of(14), camera_of()
+    plan = js.plan_projection(particles, camera, pixel="ray")
+    small = dataclasses.replace(plan, rays=dataclasses.replace(plan.rays, list_capacity=3))
+    with pytest.raises(js.CapacityError, match="plan_projection"):
+        js.project(particles, camera, pixel="ray", plan=small)
+    with pytest.raises(js.CapacityError):
+        js.project(particles, camera, pixel="ray", plan=dataclasses.replace(plan, rays=None))
+    word = jax.jit(lambda particles: js.project(particles, camera, pixel="ray", plan=small).faults)(particles)
+    assert int(word) & faults.LIST_OVERFLOW
+
+
+def test_nothing_is_nothing():
+    empty = js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)
+    image = js.project(empty, camera_of())
+    assert (np.asarray(image.values) == 0).all() and image.to_uint8().shape == (13, 20, 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"of": "mass"}, "'volume' or 'quantity'"),
+        ({"of": np.ones(7)}, "one number for each particle"),
+        ({"of": np.full(40, np.nan)}, "`of` must be finite"),
+        ({"weight": -np.ones(40)}, "not negative"),
+        ({"pixel": "corner"}, "`pixel` must be"),
+        ({"depth_range": (3, 2)}, "two finite depths"),
+    ],
+)
+def test_bad_input_is_refused_by_name(given, said):
+    with pytest.raises(ValueError, match=said):
+        js.project(particles_of(), camera_of(), **given)
+
+
+def test_bad_particles_and_missing_plans_are_refused():
+    particles, camera = particles_of(), camera_of()
+    broken = dataclasses.replace(particles, position=particles.position.at[3, 1].set(jnp.nan))
+    with pytest.raises(ValueError, match="not finite"):
+        js.project(broken, camera)
+    with pytest.raises(ValueError, match="plan_projection"):
+        jax.jit(lambda particles: js.project(particles, camera).values)(particles)
+    with pytest.raises(ValueError, match=r"camera\.width"):
+        js.project(particles, camera_of(width=21), plan=js.plan_projection(particles, camera))
+    with pytest.raises(ValueError, match="memory_limit"):
+        js.plan_projection(particles, camera, memory_limit=100)

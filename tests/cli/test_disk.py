@@ -1,0 +1,66 @@
+"""Snapshots that stay on disk, on the command line."""
+
+import numpy as np
+import pytest
+from snapshots_made import particles, write
+
+from jaxsph import io
+from jaxsph.cli import main as cli
+
+TINY = ["--size", "24x32", "--samples", "16"]
+
+
+def run(capsys, *arguments):
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return write(tmp_path, particles(800, ordered=False))
+
+
+def test_a_snapshot_is_sorted_and_rendered_from_disk_as_from_memory(file, capsys):
+    code, out, _ = run(capsys, "sort", file, "-o", "sorted.hdf5")
+    assert code == 0 and "800 particles" in out
+    look = ["--range", 0.5, 2.5, "--quantity", "InternalEnergy", *TINY]
+    code, out, err = run(capsys, "render", "sorted.hdf5", "--from-disk", 0.1, "-o", "a.exr", *look)
+    assert (code, err) == (0, []) and "1, of at most 800 particles" in out and "jaxsph-index.npz" in out
+    assert run(capsys, "render", "sorted.hdf5", "-o", "b.exr", *look)[0] == 0
+    a, b = (np.asarray(io.read_image(name).color) for name in ("a.exr", "b.exr"))
+    np.testing.assert_allclose(a, b, atol=2e-2)  # opacity is chosen by a sample here
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--from-disk", "0"], "positive number of GiB"),
+        (["--from-disk", "1", "--where", "Density > 1"], "--where needs all particles"),
+        (["--from-disk", "1", "--annotate"], "leave out --progressive"),
+    ],
+)
+def test_what_needs_all_particles_is_refused(file, capsys, arguments, message):
+    code, _, err = run(capsys, "render", file, *arguments, *TINY)
+    assert code == 2 and message in err[0]
+
+
+def test_too_little_memory_names_the_file_the_option_and_the_least_of_it_that_works(file, capsys):
+    code, _, err = run(capsys, "render", file, "--from-disk", "0.00001", *TINY)
+    assert (code, len(err)) == (1, 1) and f"{file}: --from-disk 1e-05 is too little" in err[0]
+    least = float(err[0].split("give --from-disk ")[1].split()[0])
+    assert run(capsys, "render", file, "--from-disk", least, "-o", "a.png", *TINY)[0] == 0
+
+
+@pytest.mark.parametrize("command", [["sort", "OTHER", "-o", "sorted.hdf5"], ["render", "OTHER", "--from-disk", "1"]])
+@pytest.mark.parametrize("kind", ["a folder", "bytes", "nothing"])
+def test_what_is_not_gadget_like_hdf5_is_refused_in_one_line_that_says_what_can_be_read(file, capsys, command, kind):
+    other = file.parent / "other.dat"
+    if kind == "a folder":
+        (other / "gas").mkdir(parents=True)
+        (other / "gas" / "pos").write_bytes(bytes(40))
+    else:
+        other.write_bytes(b"" if kind == "nothing" else bytes(range(256)))
+    code, _, err = run(capsys, *(str(other) if part == "OTHER" else part for part in command))
+    assert code == 1 and len(err) == 1 and f"{other}: is not a Gadget-like HDF5 snapshot, all that" in err[0]

@@ -1,0 +1,83 @@
+"""`render --tile` and `merge`: parts of a picture make the file that one command makes, and nothing else is taken for them."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.cli import main as cli
+from jaxsph.cli import merge as cli_merge
+
+SCENE = ["scene:radial", "--particles", "300", "--size", "24x40", "--samples", "16"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and the lines of stderr."""
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+@pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])
+def test_a_part_is_called_as_it_was_asked_for(text, index):
+    part = cli_merge.tile(text)
+    assert (part, str(part)) == ((index, 2), text)
+
+
+@pytest.mark.slow
+def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
+    assert run(capsys, "render", *SCENE, "-o", "whole.exr")[0] == 0
+    assert run(capsys, "render", *SCENE, "--tile", "1/2", "-o", "b.exr")[0] == 0
+    code, out, err = run(capsys, "render", *SCENE, "--tile", "2/2")
+    assert (code, err) == (0, []) and "radial_0_of_2.exr" in out and "2/2, rows 0 to" in out and "of 40" in out
+    code, out, err = run(capsys, "merge", "b.exr", "radial_0_of_2.exr", "-o", "merged.exr")
+    assert (code, err) == (0, []) and "merged.exr, 24 x 40, of 2 parts" in out
+    whole, merged = (js.io.read_image(name) for name in ("whole.exr", "merged.exr"))
+    for name in ("color", "transmittance", "depth", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(whole, name), name)
+    assert dict(merged.metadata) == dict(whole.metadata) and float(merged.color.max()) > 0.1
+    assert run(capsys, "merge", "b.exr", "radial_0_of_2.exr", "-o", "merged.png")[0] == 0
+    np.testing.assert_allclose(js.io.read_image("merged.png").color, np.asarray(whole.color).clip(0, 1), atol=0.502 / 255)
+
+    for given, said in (
+        (["b.exr"], "1 of 2 parts of the picture are missing: --tile 0/2"),
+        (["b.exr", "b.exr"], "b.exr and b.exr are both part 1"),
+        (["b.exr", "whole.exr"], "whole.exr is not a part"),
+        (["b.exr", "gone.exr"], "gone.exr: there is no such file"),
+    ):
+        code, _, err = run(capsys, "merge", *given, "-o", "no.exr")
+        assert code == 1 and len(err) == 1 and said in err[0]
+    assert not (tmp_path / "no.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["render", *SCENE, "--tile", "3/2"], "I must lie in [0, N]"),
+        (["render", *SCENE, "--tile", "half"], "write the second of four as 1/4"),
+        (["render", *SCENE, "--tile", "0/0"], "N be at least 1"),
+        (["render", *SCENE, "--tile", "0/2", "-o", "part.png"], "a part must be .exr"),
+        (["render", *SCENE, "--tile", "0/2", "--progressive"], "--progressive and --tile exclude"),
+        (["render", *SCENE, "--tile", "0/2", "--screen", "quadtree", "--tolerance", "0.1"], "quadtree"),
+        (["merge", "a.exr"], "-o"),
+        (["merge", "a.png", "-o", "b.png"], "a.png: parts are .exr"),
+        (["merge", "a.exr", "-o", "b.jpg"], "must be .exr or .png"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line(capsys, arguments, said):
+    code, _, err = run(capsys, *arguments)
+    assert code == 2 and len(err) == 1 and said in err[0]
+
+
+def test_more_parts_than_rows_of_tiles_are_refused(capsys):
+    code, _, err = run(capsys, "render", *SCENE, "--tile", "0/4")
+    assert code == 1 and "`count` must lie in [1, 3]" in err[0]
+
+
+@pytest.mark.parametrize(("first", "count"), [(0, 3), (1, 3)])
+def test_jobs_that_count_from_0_or_from_1_render_all_parts(first, count):
+    assert {cli_merge.tile(f"{number}/{count}") for number in range(first, first + count)} == {(0, 3), (1, 3), (2, 3)}

@@ -1,0 +1,159 @@
+"""The command `project`: what it projects, that it is what the library has, and how it refuses."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph import io
+from jaxsph.cli import main as cli
+
+pytestmark = pytest.mark.usefixtures("quick_programs")
+TINY = ["--size", "18x12"]
+COUNT = 60
+
+
+def columns():
+    rng = np.random.default_rng(0)
+    position = rng.uniform(0, 1, (COUNT, 3))
+    return {"position": position, "mass": rng.uniform(1, 2, COUNT), "temperature": position[:, 0], "density": 1 + position[:, 1]}
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A small particle file in an otherwise empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    np.savez(tmp_path / "gas.npz", support=np.full(COUNT, 0.3), **columns())
+    np.savez(tmp_path / "bare.npz", position=columns()["position"], support=np.full(COUNT, 0.3))
+    return "gas.npz"
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and the lines of stderr."""
+    code = cli.main(["project", *(str(argument) for argument in arguments)])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+def values(capsys, *arguments):
+    """What is in the file that the command writes."""
+    code, out, err = run(capsys, *TINY, *arguments, "-o", "out.npy")
+    assert (code, err) == (0, []), err
+    return np.load("out.npy"), out
+
+
+def gas():
+    given = columns()
+    volume = given["mass"] / given["density"]
+    position = given["position"].astype(np.float32)
+    particles = js.Particles.from_arrays(position, np.float32(0.3), position[:, 0], volume.astype(np.float32), "poly6")
+    return particles, given, volume
+
+
+def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):
+    code, out, err = run(capsys, file, *TINY)
+    assert (code, err) == (0, [])
+    for said in ("60 particles", "0.3", "column density: mass a unit of area", "orthographic", "gas.exr", "total"):
+        assert said in out
+    found = io.read_projection("gas.exr")
+    particles, given, _ = gas()
+    truth = js.reference.project(particles, js.along_axis(particles, "z", 18, 12), given["mass"]).values
+    np.testing.assert_allclose(found.values, truth, atol=1e-3 * truth.max())
+    assert found.name == "column.mass" and abs(float(found.total()) / given["mass"].sum() - 1) < 1e-4
+
+
+def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
+    particles, given, volume = gas()
+    camera = js.along_axis(particles, "x", 18, 12)
+    ray = {"pixel": "ray"}
+    for arguments, of, weight, more in (
+        (["--of", "number"], np.ones(COUNT), None, {}),
+        (["--of", "temperature"], given["temperature"] * volume, None, {}),
+        (["--of", "temperature", "--weight", "mass"], given["temperature"], given["mass"], {}),
+        (["--emission", 2], given["density"] * given["mass"], None, {}),
+        (["--emission", 1.5, "--of", "temperature"], given["temperature"] * given["density"] ** 0.5 * given["mass"], None, {}),
+        (["--depth-range", 0.4, 0.6], given["mass"], None, {"slab": (0.4, 0.6)}),
+    ):
+        found, _ = values(capsys, file, "--axis", "x", "--pixel", "ray", *arguments)
+        view = js.along_axis(particles, "x", 18, 12, **more) if more else camera
+        truth = js.reference.project(particles, view, of, weight, **ray).values
+        there = np.isfinite(truth) & np.isfinite(found)
+        assert (np.isfinite(truth) != np.isfinite(found)).mean() < 0.03  # within rounding of a support's edge
+        np.testing.assert_allclose(found[there], truth[there], atol=1e-3 * truth[there].max(), err_msg=str(arguments))
+
+
+@pytest.mark.slow
+def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file, capsys):
+    whole, some = (values(capsys, "bare.npz", "--of", "density", *more)[0] for more in ([], ["--where", "x < 0.5"]))
+    others, out = values(capsys, "bare.npz", "--of", "density", "--where", "x >= 0.5")
+    assert "left out by x >= 0.5" in out
+    frames = [js.along_axis(io.read_particles("bare.npz", "x", where=one), "z", 18, 12) for one in ("x < 0.5", "x >= 0.5")]
+    sums = [image.sum() * 4 * float(frame.half_height) ** 2 for image, frame in zip((some, others), frames, strict=True)]
+    frame = js.along_axis(io.read_particles("bare.npz", "x"), "z", 18, 12)
+    np.testing.assert_allclose(sum(sums), whole.sum() * 4 * float(frame.half_height) ** 2, rtol=1e-3)
+    image, out = values(capsys, "bare.npz", "--box", 1, 1, 1, "--size", "12x12")
+    assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area
+
+
+def test_from_an_eye_it_is_in_perspective(file, capsys):
+    found, out = values(capsys, file, "--eye", 0.5, 0.5, 4, "--target", 0.5, 0.5, 0.5, "--fov", 30, "--pixel", "ray")
+    particles, given, _ = gas()
+    camera = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), fov_degrees=30, width=18, height=12, near=2, far=6)
+    truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
+    assert "perspective" in out and "total" not in out
+    np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
+
+
+def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys):
+    code, out, err = run(capsys, "bare.npz", *TINY, "-o", "out.png", "--colormap", "heat", "--norm", "log", "--range", 1, 100)
+    assert (code, err) == (0, []) and "particles a unit of area" in out
+    assert np.asarray(io.read_image("out.png").color).max() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "a.jpg"], "a projection must be .exr, .npy, .png"),
+        (["--support", 0], "--support must be > 0"),
+        (["--axis", "w"], "invalid choice"),
+        (["--axis", "x", "--eye", 0, 0, 9], "--axis and --eye exclude each other"),
+        (["--target", 0, 0, 0], "--target needs --eye"),
+        (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
+        (["--depth-range", 2, 1], "--depth-range must ascend"),
+        (["--norm", "log"], "are for a picture"),
+        (["--eye", 0, 0, 9, "--target", 0, 0, 9], "must differ"),
+        (["--size", "0x4"], "at least 1 pixel"),
+        (["--where", "entropy > 1"], "no quantity 'entropy'"),
+        (["--box", 1, 1, 1, "--not-periodic"], "exclude each other"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line(file, capsys, arguments, said):
+    code, _, err = run(capsys, file, *arguments)
+    assert code == 2 and len(err) == 1 and said in err[0], err
+
+
+def test_what_is_not_in_the_file_is_told_in_one_line(file, capsys):
+    for arguments, said in (
+        (["none.npz"], "none.npz"),
+        ([file, "--of", "entropy"], "no quantity 'entropy'; there are mass, temperature"),
+    ):
+        code, _, err = run(capsys, *arguments, *TINY)
+        assert code == 1 and len(err) == 1 and said in err[0], err
+    code, _, err = run(capsys, "bare.npz", "--of", "mass", *TINY)
+    assert code == 2 and "has no masses" in err[0]
+
+
+def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(file, capsys):
+    position = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    position = position[np.linalg.norm(position, axis=1) < 1]
+    same = {"mass": np.full(len(position), 1 / len(position)), "rho": np.ones(len(position))}
+    np.savez("ball.npz", position=position, **same)
+    for more in ([], ["--share", "0.999"]):
+        code, out, err = run(capsys, "ball.npz", *TINY, "--of", "volume", "-o", "out.npy", *more)
+        assert (code, err) == (0, []) and "stored density `rho` is not used" in out
+        total = float(out.partition("in the image, of ")[2].split()[0].rstrip(","))
+        assert total == pytest.approx(4 * np.pi / 3, rel=0.15)
+
+
+def test_compiling_is_told_apart_in_the_time(file, capsys):
+    line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
+    assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))

@@ -1,0 +1,221 @@
+"""Which particles and where, on the command line: what each option shows, and how what is wrong is refused."""
+
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph import io
+from jaxsph.cli import main as cli
+
+TINY = ["--size", "24x16", "--samples", "16"]
+pytestmark = pytest.mark.usefixtures("quick_programs")
+PLACES = np.random.default_rng(1).uniform(-0.3, 1.3, (2000, 3))
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """Particles of a unit box in an otherwise empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / "box.npz"
+    position = np.random.default_rng(0).uniform(0, 1, (80, 3)).astype(np.float32)
+    columns = {"temperature": 10 ** (4 * position[:, 0]), "pressure": position[:, 1], "support": np.full(80, 0.25, np.float32)}
+    np.savez(path, position=position, **columns)
+    return path
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What the command would have rendered; its picture is grey."""
+    found = types.SimpleNamespace()
+
+    def render(scene, camera, settings, progress=None, devices=None):
+        found.scene, found.camera = scene, camera
+        layer = np.zeros((camera.height, camera.width), np.float32)
+        stats = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0, "seconds": {"cast": 0.0}}
+        return js.Image(np.full((*layer.shape, 3), 0.5, np.float32), layer + 0.5, layer, layer, layer, True, 0, stats, ())
+
+    monkeypatch.setattr(js, "render", render)
+    return found
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and the lines of stderr."""
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+def made(capsys, file, *arguments):
+    """What the command said, and the header of its picture."""
+    code, out, err = run(capsys, "render", file, "-o", "out.exr", *TINY, *arguments)
+    assert (code, err) == (0, []), err
+    return out, dict(io.read_image("out.exr").metadata)
+
+
+def test_a_condition_and_a_share_choose_particles_and_are_said_and_kept(file, seen, capsys):
+    out, kept = made(capsys, file, "--where", "temperature > 1e2 and pressure < 0.7", "--quantity", "pressure")
+    with np.load(file) as stored:
+        some = (stored["temperature"] > 1e2) & (stored["pressure"] < 0.7)
+        np.testing.assert_array_equal(seen.scene.particles.to_numpy()["position"], stored["position"][some])
+    assert "left out by temperature > 1e2" in out and "left out by pressure < 0.7" in out
+    assert kept["jaxsph.where"] == "temperature > 1e2 and pressure < 0.7"
+    out, kept = made(capsys, file, "--share", 0.5)
+    assert seen.scene.particles.num_particles == 40
+    assert "40 of 80 particles, for a quick look: their field is another one" in out and kept["jaxsph.share"] == 0.5
+
+
+def box_of(place):
+    return ((place >= (0, 0, 0)) & (place <= (0.6, 0.7, 0.5))).all(-1)
+
+
+def ball_of(place, center=(0.5, 0.5, 0.9), radius=0.4):
+    return np.linalg.norm(place - center, axis=-1) <= radius
+
+
+CLIPPED = {
+    "plane": (["--clip-plane", 0.5, 0.5, 0.5, 1, 0, -1], lambda place: (place - 0.5) @ (1, 0, -1) >= 0),
+    "inside of a box": (["--clip-box", 0, 0, 0, 0.6, 0.7, 0.5], box_of),
+    "outside of a box": (["--cut-box", 0, 0, 0, 0.6, 0.7, 0.5], lambda place: ~box_of(place)),
+    "inside of a sphere": (["--clip-sphere", 0.5, 0.5, 0.9, 0.4], ball_of),
+    "outside of a sphere": (["--cut-sphere", 0.5, 0.5, 0.9, 0.4], lambda place: ~ball_of(place)),
+    "several": (
+        ["--cut-sphere", 0.2, 0.2, 0.9, 0.3, "--cut-sphere", 0.8, 0.8, 0.9, 0.3, "--clip-plane", 0, 0, 0.1, 0, 0, 1],
+        lambda place: (place[:, 2] >= 0.1) & ~ball_of(place, (0.2, 0.2, 0.9), 0.3) & ~ball_of(place, (0.8, 0.8, 0.9), 0.3),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CLIPPED)
+def test_each_clip_shows_its_part_of_space(file, seen, capsys, name):
+    arguments, truth = CLIPPED[name]
+    _, kept = made(capsys, file, *arguments)
+    found = np.asarray(seen.scene.within.contains(tuple(jnp.asarray(PLACES.T, jnp.float32))))
+    np.testing.assert_array_equal(found, truth(PLACES))
+    assert 0.02 < found.mean() < 0.98
+    assert f"jaxsph.{arguments[0][2:].replace('-', '_')}" in kept
+
+
+def test_the_camera_frames_what_boxes_and_spheres_leave(file, seen, capsys):
+    made(capsys, file)
+    whole = seen.camera
+    made(capsys, file, "--clip-box", 0.4, 0.4, 0.4, 0.6, 0.6, 0.6)
+    near, far = (np.linalg.norm(camera.exact_eye() - 0.5) for camera in (seen.camera, whole))
+    assert near < 0.3 * far and abs(np.asarray(seen.camera.axes)[2] @ (0.5 - seen.camera.exact_eye()) / near - 1) < 1e-3
+    made(capsys, file, "--clip-plane", 0.5, 0.5, 0.5, 1, 0, 0)
+    assert seen.camera.describe() == whole.describe()
+
+
+def test_a_box_and_its_middle_are_those_asked_for(file, seen, capsys):
+    out, _ = made(capsys, file, "--box", 1, 1, 1)
+    assert "periodic box of 1 x 1 x 1" in out
+    np.testing.assert_allclose(seen.scene.particles.box.corners(), [(0, 0, 0), (1, 1, 1)])
+    assert made(capsys, file)[0].count("periodic") == 0 and seen.scene.particles.box is None
+    out, _ = made(capsys, file, "--box", 1, 1, 1, "--center", 0.9, 0.25, -0.5)
+    assert "0.9 0.25 -0.5" in out
+    lower, upper = seen.scene.particles.bounds()
+    np.testing.assert_allclose((lower + upper) / 2, (0.9, 0.25, -0.5), atol=1e-6)
+    place = seen.scene.particles.to_numpy()["position"]
+    assert (place >= lower - 1e-6).all() and (place <= upper + 1e-6).all()
+    for middle in ([0.9, 0.25, -0.5], ["densest"]):  # FILE may come after it
+        assert run(capsys, "render", "-o", "out.exr", *TINY, "--box", 1, 1, 1, "--center", *middle, file)[0] == 0
+    densest = js.io.read_particles(file, box=(1, 1, 1)).centered("densest").bounds()
+    np.testing.assert_allclose(seen.scene.particles.bounds(), densest)
+
+
+def test_the_box_of_a_file_can_be_left_aside(tmp_path, monkeypatch, seen, capsys):
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    with h5py.File("a.hdf5", "w") as file:
+        file.create_group("Header").attrs.update({"BoxSize": 1.0, "NumPart_ThisFile": [30, 0, 0, 0, 0, 0]})
+        part = file.create_group("PartType0")
+        part["Coordinates"] = np.random.default_rng(0).uniform(0, 1, (30, 3))
+        part["SmoothingLength"], part["Density"] = np.full(30, 0.3), np.linspace(1, 2, 30)
+    made(capsys, "a.hdf5")
+    assert seen.scene.particles.box is not None
+    made(capsys, "a.hdf5", "--not-periodic")
+    assert seen.scene.particles.box is None
+
+
+def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
+    plane = ["--slice", 0.5, 0.5, 0.5, 0, 0, 1, "--quantity", "pressure", "--size", "24x16"]
+    for name in ("a.npy", "a.exr", "a.png"):
+        code, out, err = run(capsys, "render", file, "-o", name, *plane)
+        assert (code, err) == (0, []) and "of the pixels inside of supports" in out
+    particles = io.read_particles(file, "pressure")
+    expected = js.slice_of(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
+    np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)
+    assert np.asarray(io.read_image("a.png").color).max() > 0.3
+
+
+def test_info_says_what_would_be_left(file, capsys):
+    code, out, err = run(capsys, "info", file, "--where", "pressure < 0.5", "--box", 1, 1, 1)
+    assert (code, err) == (0, []) and "left out by pressure < 0.5" in out and "periodic box of 1 x 1 x 1" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--clip-plane", 0, 0, 0, 0, 0, 0], "--clip-plane: `normal` must not be (0, 0, 0)"),
+        (["--slice", 0, 0, 0, 0, 0, 0], "--slice: `normal` must not be (0, 0, 0)"),
+        (["--clip-box", 0, 0, 0, 1, -1, 1], "--clip-box: `lower` must be below `upper`"),
+        (["--cut-sphere", 0, 0, 0, -1], "--cut-sphere: `radius` must be > 0"),
+        (["--clip-sphere", 0, 0, "nan", 1], "--clip-sphere: `center` must be finite"),
+        (["--clip-box", 5, 5, 5, 6, 6, 6], "nothing is inside of --clip-box and --clip-sphere; there is something from"),
+        (["--where", "entropy > 1"], "no quantity 'entropy'; there are temperature, pressure"),
+        (["--where", "temperature >"], "the condition 'temperature >' is not understood at its end"),
+        (["--where", "temperature > 1 and (pressure"], "at character 21, '(pressure'"),
+        (["--share", 0], "`share` must be above 0 and at most 1, got 0"),
+        (["--share", 2], "`share` must be above 0 and at most 1, got 2"),
+        (["--box", 1, 1, 1, "--not-periodic"], "--box and --not-periodic exclude each other"),
+        (["--box", 1, 0, 1], "--box must be three lengths > 0, got 1 0 1"),
+        (["--center", 0, 0, 0], "--center is for periodic boxes, and this is none"),
+        (["--center", "middle"], "--center must be X Y Z or densest, got middle"),
+        (["--center", 0, 0], "--center must be X Y Z or densest, got 0 0"),
+        (["--box", 1, 1, 1, "--center", "inf", 0, 0], "--center must be"),
+        (["-o", "a.npy"], "an image must be .exr or .png"),
+        (["--slice", 0, 0, 0, 0, 0, 1, "-o", "a.jpg"], "an image must be .npy or .exr or .png"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
+    code, _, err = run(capsys, "render", file, *(TINY[:2] if "--slice" in arguments else TINY), *arguments)
+    assert code == 2 and len(err) == 1 and said in err[0], err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--where", "temperature > 10 and pressure > 2"], "80 left out by pressure > 2"),
+        (["--slice", 0, 0, 9, 0, 0, 1], "no particle reaches the plane of --slice; there are particles from"),
+        (["--box", 0.2, 1, 1], "no side shorter than the largest support, but 0.2 < 0.25"),
+    ],
+)
+def test_work_that_cannot_be_done_is_told_in_one_line(file, capsys, arguments, said):
+    code, _, err = run(capsys, "render", file, *(TINY[:2] if "--slice" in arguments else TINY), *arguments)
+    assert code == 1 and len(err) == 1 and said in err[0], err
+
+
+@pytest.mark.parametrize("option", [["--where", "x > 0"], ["--share", 0.5], ["--box", 1, 1, 1], ["--center", 0, 0, 0]])
+def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monkeypatch, capsys, option):
+    monkeypatch.chdir(tmp_path)
+    np.save("a.npy", np.zeros((4, 4, 4), np.float32))
+    for source in ("scene:radial", "a.npy"):
+        code, _, err = run(capsys, "render", source, *TINY, *option)
+        assert code == 2 and len(err) == 1 and option[0] in err[0]
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        ["--annotate"], ["--eye", 1, 2, 3], ["--target", 1, 2, 3], ["--fov", 30], ["--tolerance", 0.1], ["--progressive"],
+        ["--opacity", 2], ["--opacity-by", "pressure"], ["--relax", 0], ["--screen", "quadtree"], ["--memory", 1],
+        ["--integrator", "samples"], ["--estimator", "pilot"], ["--samples", 64],
+    ],
+    ids=lambda beside: beside[0],
+)  # fmt: skip
+def test_what_does_nothing_to_a_slice_is_refused_beside_it(file, capsys, beside):
+    code, _, err = run(capsys, "render", file, "--slice", 0.5, 0.5, 0.5, 0, 0, 1, *beside, "-o", "s.png")
+    assert code == 2 and len(err) == 1 and f"{beside[0]} and --slice exclude each other" in err[0]

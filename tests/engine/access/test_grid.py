@@ -1,0 +1,181 @@
+"""The promise of the sparse perspective grid: every sample with a positive weight finds its particle in its cell."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.access.lists import build_lists, bundle_origins
+from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.access.slab_windows import find_slab_windows
+from jaxsph.engine.access.view import view_particles
+
+
+def sample_depths(camera, samples, dtype):
+    return camera.depth(jnp.arange(samples, dtype=dtype) + 0.5, samples).astype(dtype)
+
+
+@functools.partial(jax.jit, static_argnames="plan")
+def grid(particles, camera, plan):
+    depths = sample_depths(camera, plan.samples, particles.dtype)
+    viewed = view_particles(particles, camera, depths, plan.num_classes)
+    ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
+    lists = build_lists(ordered, camera, plan.lists, 0)
+    return (
+        ordered,
+        lists,
+        find_slab_windows(ordered, lists),
+        bundle_origins(plan.lists, 0),
+        (ordered.left, ordered.right, ordered.top, ordered.bottom),
+    )
+
+
+def weights(scene, camera, samples, dtype):
+    """Margin of every particle at every sample in the arithmetic of the march: (particles, rows, columns, samples)."""
+    x, y, z = (np.asarray(v) for v in jnp.moveaxis(camera.to_view(scene.particles.position), -1, 0))
+    h = np.asarray(scene.particles.support)
+    s = np.asarray(sample_depths(camera, samples, dtype))
+    spread = s if camera.is_perspective else np.ones_like(s)
+    u = np.asarray(camera.column(jnp.arange(camera.width, dtype=dtype) + 0.5))
+    v = np.asarray(camera.row(jnp.arange(camera.height, dtype=dtype) + 0.5))
+    axes = (slice(None), None, None, None)
+    dx = (spread * u[:, None] - x[axes]) / h[axes]
+    dy = (spread * v[:, None, None] - y[axes]) / h[axes]
+    dz = (s - z[axes]) / h[axes]
+    return 1 - dx * dx - dy * dy - dz * dz
+
+
+def numbered(scene, dtype):
+    import dataclasses
+
+    particles = scene.particles
+    return dataclasses.replace(particles, quantity=jnp.arange(particles.capacity, dtype=dtype))
+
+
+def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
+    particles = numbered(scene, dtype)
+    ordered, lists, windows, (row, column), _ = grid(particles, camera, plan)
+    assert int(lists.faults) == 0
+    number = np.asarray(ordered.quantity).astype(int)[np.asarray(lists.rank)]
+    begin, length = np.asarray(windows.begin), np.asarray(windows.length)
+    members = np.zeros((begin.shape[2], begin.shape[1], particles.capacity), bool)
+    for c, slab, bundle in np.argwhere(np.moveaxis(length, 0, 0) > 0):
+        start = begin[c, slab, bundle]
+        members[bundle, slab, number[start : start + length[c, slab, bundle]]] = True
+    positive = weights(scene, camera, plan.samples, dtype) > 0
+    positive &= np.asarray(particles.valid)[:, None, None, None]
+    corner = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
+    for particle, r, c, k in np.argwhere(positive):
+        bundle = corner[r // 8 * 8, c // 8 * 8]
+        assert members[bundle, k // plan.cast.slab_samples, particle], (
+            f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
+        )
+
+
+scenes = {
+    "seed": st.integers(0, 2**32 - 1),
+    "decades": st.sampled_from([0.0, 1.0, 4.0]),
+    "distance": st.sampled_from([3.0, 0.8, 0.0001]),
+    "projection": st.sampled_from(["perspective", "orthographic"]),
+    "slab_samples": st.sampled_from([4, 16]),
+}
+
+
+@given(**scenes)
+@example(seed=0, decades=4.0, distance=0.0001, projection="perspective", slab_samples=4)
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
+    frames, dtype, seed, decades, distance, projection, slab_samples
+):
+    with jax.enable_x64(dtype == np.float64):
+        rng = np.random.default_rng(seed)
+        scene = frames.scene(rng, decades=decades, dtype=dtype)
+        camera = frames.camera(rng, projection, distance, dtype)
+        check_every_sample_finds_its_particles(scene, camera, frames.plan(slab_samples), dtype)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]),
+)
+def test_particles_in_awkward_places_are_found(frames, seed, where):
+    """Tangent to rays and samples, across the near plane, around the eye, behind it."""
+    rng = np.random.default_rng(seed)
+    camera = js.Camera.look_at((0, 0, 0), (0, 0, 1), fov_degrees=50, width=frames.width, height=frames.height, near=0.4, far=3.0)
+    s = np.asarray(sample_depths(camera, frames.samples, np.float32), np.float64)
+    u = np.asarray(camera.column(np.arange(frames.width + 1)))
+    count = frames.capacity
+    k, c = rng.integers(0, frames.samples, count), rng.integers(0, frames.width, count)
+    support = 10 ** -rng.uniform(0, 3, count)
+    position = np.stack([u[c] * s[k], rng.uniform(-1, 1, count) * 0.3 * s[k], s[k]], 1)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    if where == "near plane":
+        position[:, 2] = 0.4 + support * rng.choice([-1, -0.999999, 0, 1], count)
+    if where == "eye":
+        position *= 1e-3
+    if where == "ray":
+        position[:, 0] = np.asarray(camera.column(c + 0.5)) * s[k] + support * np.cos(angle)
+        position[:, 1] += support * np.sin(angle)
+    if where == "cell border":
+        position[:, 0] = u[(c // 8) * 8] * s[k] + support * rng.choice([-1, 1], count)
+    if where == "sample":
+        position[:, 2] = s[k // 4 * 4] + support * rng.choice([-1, 1], count)
+    if where == "behind":
+        position[:, 2] = -support * rng.uniform(0, 1, count)
+    position[:, 0] *= -1  # x points left when looking along +z with y up
+    particles = js.Particles.from_arrays(position, support, 0.0)
+    transfer = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [1, 1])
+    check_every_sample_finds_its_particles(js.Scene(particles=particles, transfer=transfer), camera, frames.plan(), np.float32)
+
+
+@given(**{name: scenes[name] for name in ("seed", "decades", "distance", "projection")})
+def test_pixel_ranges_hold_every_ray_that_a_sphere_meets(frames, seed, decades, distance, projection):
+    rng = np.random.default_rng(seed)
+    scene, camera = frames.scene(rng, decades=decades), frames.camera(rng, projection, distance)
+    ordered, *_, ranges = grid(numbered(scene, np.float32), camera, frames.plan())
+    left, right, top, bottom = (np.asarray(end) for end in ranges)
+    number = np.asarray(ordered.quantity).astype(int)
+    hit = (weights(scene, camera, frames.samples, np.float32) > 0).any(-1)
+    for rank in np.flatnonzero(np.asarray(ordered.live)):
+        rows, columns = np.nonzero(hit[number[rank]])
+        assert np.all((columns >= left[rank]) & (columns <= right[rank]) & (rows >= top[rank]) & (rows <= bottom[rank]))
+
+
+def test_lists_are_tight_for_particles_smaller_than_a_bundle(frames):
+    """A particle well inside a bundle is listed once, and between the rays of a bundle not at all."""
+    camera = js.Camera.look_at((0, 0, 0), (0, 0, 1), fov_degrees=50, width=frames.width, height=frames.height, near=0.9, far=1.1)
+    pixel = float(camera.column(1.0) - camera.column(0.0))
+    inside = (-float(camera.column(4.5)), float(camera.row(4.5)), 1.0)
+    between = (-float(camera.column(5.0)), float(camera.row(5.0)), 1.0)
+    for place, expected in ((inside, 1), (between, 0)):
+        particles = js.Particles.from_arrays([place], 0.2 * pixel, 0.0, capacity=frames.capacity)
+        _, lists, *_ = grid(particles, camera, frames.plan())
+        assert int(lists.end[-1]) == expected
+
+
+@pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
+def test_a_full_capacity_is_a_fault_and_stays_in_bounds(frames, capacity):
+    import dataclasses
+
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
+    small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 5}))
+    _, lists, windows, *_ = grid(numbered(scene, np.float32), camera, small)
+    assert int(lists.faults) != 0
+    assert np.all(np.asarray(windows.begin + windows.length) <= small.lists.list_capacity)
+
+
+def test_dead_and_padded_particles_are_listed_nowhere(frames):
+    rng = np.random.default_rng(0)
+    camera = frames.camera(rng)
+    particles = js.Particles.from_arrays([[0, 0, 0], [0, 1e3, 0], [50, 0, 0]], 0.5, 0.0, capacity=frames.capacity)
+    ordered, lists, *_ = grid(particles, camera, frames.plan())
+    assert int(ordered.live.sum()) >= 1
+    ranks = set(np.asarray(lists.rank)[: int(lists.end[-1])].tolist())
+    assert {float(ordered.quantity[r]) for r in ranks} == {0.0}
+    assert len(ranks) == 1

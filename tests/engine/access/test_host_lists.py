@@ -1,0 +1,114 @@
+"""What the host sorts and picks is what XLA does: the same particles, in the same order, in every list."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.access.host_sorting import entries_at, sorted_order
+from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.planning.viewing import view_scene
+from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.tuning import CPU
+
+
+@given(st.lists(st.integers(0, 2**32 - 1) | st.sampled_from([7, 1 << 16, (1 << 16) + 7]), max_size=40), st.integers(1, 3))
+def test_keys_are_sorted_stably(keys, threads):
+    key = np.array(keys, np.uint32)
+    np.testing.assert_array_equal(sorted_order(key, threads), np.argsort(key, kind="stable"))
+
+
+def test_threads_share_keys_by_their_size():
+    """Enough of them for three threads, many of them equal, and parts of any size."""
+    rng = np.random.default_rng(0)
+    for key in (rng.integers(0, 2**32, 200_000), rng.integers(0, 3, 200_000), np.full(200_000, 5)):
+        key = key.astype(np.uint32)
+        np.testing.assert_array_equal(sorted_order(key, 3), np.argsort(key, kind="stable"))
+
+
+@given(st.lists(st.tuples(st.integers(0, 80), st.integers(0, 80)), max_size=30), st.integers(1, 75))
+def test_each_place_has_the_entries_whose_interval_holds_it(ends, places):
+    first, last = np.array(ends, np.uint8).reshape(-1, 2).T
+    values = np.arange(len(ends)) + 100
+    found = list(entries_at(values, first, last, 0, places))
+    assert [some.tolist() for some in found] == [values[(first <= p) & (p <= last)].tolist() for p in range(places)]
+
+
+def lists_of(grid):
+    """Lists by bundle, of particles."""
+    rank, start, end = (np.asarray(value) for value in (grid.lists.rank, grid.lists.start, grid.lists.end))
+    return [rank[a:b].tolist() for a, b in zip(start, end, strict=True)]
+
+
+def both(scene, camera, lists, first_row=0, samples=24):
+    """The grid as XLA and as the host makes it."""
+    order = {"samples": samples, "slab_samples": 4, "between_samples": False}
+    grid = {"lists": lists, "samples": samples, "beside": False}
+    seen = view_scene(scene, camera, samples=samples, capacity=scene.particles.capacity, num_classes=3)
+    found = []
+    for tuning in (dataclasses.replace(CPU, sorts_on_host=False), CPU):
+        run = Clock()
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), tuning=tuning, **order)
+        found.append((ordered, run.with_host("grid", MAKE_GRID, (ordered, camera, jnp.int32(first_row)), tuning=tuning, **grid)))
+    return found
+
+
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@given(seed=st.integers(0, 2**32 - 1), distance=st.sampled_from([3.0, 0.8, 0.0001]), first_row=st.sampled_from([0, 16]))
+def test_the_host_makes_the_lists_and_windows_that_xla_makes(frames, dtype, projection, seed, distance, first_row):
+    with jax.enable_x64(dtype == np.float64):
+        rng, capacity = np.random.default_rng(seed), frames.capacity
+        scene, camera = frames.scene(rng, decades=4, dtype=dtype), frames.camera(rng, projection, distance, dtype)
+        (ordered, expected), (same, found) = both(scene, camera, ListPlan(1, 2, 2 * capacity, 8 * capacity), first_row)
+        for name, column in dataclasses.asdict(ordered).items():
+            np.testing.assert_array_equal(getattr(same, name), column)
+        assert int(found.lists.faults) == 0 and int(found.pairs) == int(expected.pairs) == sum(map(len, lists_of(found)))
+        assert lists_of(found) == lists_of(expected)
+        np.testing.assert_array_equal(found.windows.length, expected.windows.length)
+        np.testing.assert_array_equal(found.windows.count, expected.windows.count)
+
+
+def test_places_that_a_byte_cannot_count_are_told_apart():
+    """An image of more than 256 bundles across."""
+    rng = np.random.default_rng(0)
+    particles = js.Particles.from_arrays(rng.uniform(-1, 1, (50, 3)), rng.uniform(0.002, 0.3, 50), 0.0)
+    transfer = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [1, 1])
+    camera = js.Camera.orthographic((0, 0, -3), (0, 0, 0), view_height=0.02, width=2200, height=20, near=1, far=5)
+    expected, found = (
+        grid for _, grid in both(js.Scene(particles=particles, transfer=transfer), camera, ListPlan(2, 138, 10_000, 40_000))
+    )
+    assert lists_of(found) == lists_of(expected) and int(found.pairs) > 0
+
+
+@pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
+def test_a_full_capacity_is_the_same_fault_on_the_host(frames, capacity):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, decades=0), frames.camera(rng)
+    lists = dataclasses.replace(ListPlan(2, 2, 4 * frames.capacity, 16 * frames.capacity), **{capacity: 5})
+    expected, found = (grid for _, grid in both(scene, camera, lists))
+    assert int(found.lists.faults) & int(expected.lists.faults) != 0
+    assert int(found.lists.end.max()) == 0
+
+
+@pytest.mark.slow
+def test_images_are_the_same_bit_for_bit():
+    """In several bands, with particles sorted beside being measured; and given a plan."""
+    scene, camera = js.scenes.load("dam_break", frame=1, width=50, height=60)
+    settings = js.Settings(samples=24)
+    plan = js.plan(scene, camera, settings)
+    slow = dataclasses.replace(plan.cast.tuning, sorts_on_host=False)
+    images = [js.render(scene, camera, settings), js.render(scene, camera, settings, plan=plan)]
+    images.append(js.render(scene, camera, settings, plan=js.plan(scene, camera, settings, tuning=slow)))
+    for image in images[1:]:
+        for name in ("color", "transmittance", "depth"):
+            np.testing.assert_array_equal(getattr(image, name), getattr(images[0], name))
+        assert image.stats["pairs"] == images[0].stats["pairs"] and image.stats["evaluations"] == images[0].stats["evaluations"]

@@ -1,0 +1,58 @@
+"""Shards of a band that are cast side by side make the image that one would."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.access.shards import shard, shard_of_grid, unshard
+from jaxsph.engine.runtime.tuning import MAX_SHARDS
+
+
+@pytest.mark.parametrize("shards", [1, 2, MAX_SHARDS])
+def test_what_is_dealt_out_is_put_back_in_its_place(shards):
+    bundles = {"last": np.arange(24.0).reshape(3, 8), "only": np.arange(8)}
+    dealt = [shard(bundles, nth, shards) for nth in range(shards)]
+    for nth, one in enumerate(dealt):
+        np.testing.assert_array_equal(one["last"], bundles["last"][:, nth::shards])
+    found = unshard(tuple(dealt))
+    for name, value in bundles.items():
+        np.testing.assert_array_equal(found[name], value)
+
+
+@pytest.mark.parametrize("axis", [0, 1, -1])
+def test_shards_are_put_back_along_any_axis(axis):
+    color = np.arange(8.0**3).reshape(8, 8, 8)
+    dealt = [np.moveaxis(np.moveaxis(color, axis, 0)[nth::MAX_SHARDS], 0, axis) for nth in range(MAX_SHARDS)]
+    np.testing.assert_array_equal(unshard(tuple(dealt), axis), color)
+
+
+def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
+    rng = np.random.default_rng(0)
+    grid, _ = stages(frames.scene(rng).particles, frames.camera(rng), plan=frames.plan())
+    for nth in range(2):
+        found = shard_of_grid(grid, nth, 2)
+        for name in ("row", "column"):
+            np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(grid, name))[nth::2])
+        for name in ("start", "end"):
+            np.testing.assert_array_equal(getattr(found.lists, name), np.asarray(getattr(grid.lists, name))[nth::2])
+        for name in ("begin", "length", "count"):
+            np.testing.assert_array_equal(getattr(found.windows, name), np.asarray(getattr(grid.windows, name))[..., nth::2])
+        np.testing.assert_array_equal(found.lists.rank, grid.lists.rank)
+
+
+@pytest.mark.parametrize("estimator", ["interval", *(pytest.param(other, marks=pytest.mark.slow) for other in ("pilot", None))])
+def test_any_number_of_shards_makes_the_same_image(monkeypatch, estimator):
+    scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
+    settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.05, estimator=estimator)
+    plan, images = js.plan(scene, camera, settings), []
+    for shards in (1, MAX_SHARDS):
+        monkeypatch.setattr(importlib.import_module("jaxsph.render"), "shards_at_hand", lambda _, shards=shards: shards)
+        images.append(js.render(scene, camera, settings, plan=plan))
+    if estimator == "pilot":  # slabs are interpolated
+        assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
+    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))

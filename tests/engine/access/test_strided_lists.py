@@ -1,0 +1,72 @@
+"""Lists of a camera whose rays go through every so many pixels: no ray misses a particle, by XLA or on the host."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxsph.engine.access.lists import BUNDLE, ListPlan, nodes_between
+from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.planning.viewing import view_scene
+from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.tuning import CPU
+from jaxsph.engine.screen.pyramid import places
+from jaxsph.model.camera.camera import num_nodes
+
+SIZE, STRIDE, SAMPLES = {"width": 45, "height": 38, "samples": 24}, 4, 24
+
+
+@given(st.integers(1, 80), st.sampled_from([1, 2, 4, 8, 16]), st.integers(0, 80), st.integers(-1, 79))
+def test_nodes_of_a_range_of_pixels_are_those_that_lie_in_it(size, stride, first, last):
+    first, last = min(first, size), min(last, size - 1)
+    begin, end = nodes_between(first, last, size, stride)
+    inside = [node for node, pixel in enumerate(places(size, stride)) if first <= pixel <= last]
+    assert list(range(begin, end + 1)) == inside
+    assert not inside or inside[-1] < num_nodes(size, stride)
+
+
+def members(grid):
+    """Ranks of the particles of each bundle."""
+    lists = (np.asarray(value) for value in (grid.lists.rank, grid.lists.start, grid.lists.end))
+    rank, start, end = lists
+    return [set(rank[a:b].tolist()) for a, b in zip(start, end, strict=True)]
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([1.0, 4.0]), distance=st.sampled_from([3.0, 0.8, 0.0001]))
+def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decades, distance):
+    rng = np.random.default_rng(seed)
+    shape = dataclasses.replace(frames, **SIZE)
+    scene, camera = shape.scene(rng, decades=decades), shape.camera(rng, projection, distance)
+    seen, strided = (
+        view_scene(scene, camera, samples=SAMPLES, capacity=scene.particles.capacity, num_classes=3),
+        camera.strided(STRIDE),
+    )
+    lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Clock(), []
+    for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
+        size = {"samples": SAMPLES, "tuning": tuning}
+        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), slab_samples=4, between_samples=False, **size)
+        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, jnp.int32(0)), lists=lists, beside=False, **size)
+        assert int(grid.lists.faults) == 0
+        found.append(members(grid))
+    assert found[0] == found[1]
+    touched = met(ordered, camera, places(camera.height, STRIDE), places(camera.width, STRIDE))
+    corners = {(int(row), int(column)): nth for nth, (row, column) in enumerate(zip(grid.row, grid.column, strict=True))}
+    for row, column, particle in np.argwhere(touched):
+        assert particle in found[0][corners[row // BUNDLE * BUNDLE, column // BUNDLE * BUNDLE]]
+
+
+def met(ordered, camera, rows, columns):
+    """Whether the ray of a pixel has a sample in a support, in the arithmetic of the march: (rows, columns, particles)."""
+    s = np.asarray(camera.depth(jnp.arange(SAMPLES, dtype=jnp.float32) + 0.5, SAMPLES))[:, None]
+    spread = s if camera.is_perspective else np.ones_like(s)
+    u, v = np.asarray(camera.column(jnp.float32(columns) + 0.5)), np.asarray(camera.row(jnp.float32(rows) + 0.5))
+    x, y, z, scale, size, live = (np.asarray(getattr(ordered, name)) for name in ("x", "y", "z", "scale", "size", "live"))
+    across, down = ((spread * u[:, None, None] - x) * scale) ** 2, ((spread * v[:, None, None] - y) * scale) ** 2
+    margin = size**2 - ((s - z) * scale) ** 2 - down[:, None] - across[None]
+    return ((margin > 0) & live).any(2)

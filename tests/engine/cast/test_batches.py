@@ -1,0 +1,138 @@
+"""Batches: every filled slab is marched once, those of a chunk are about as full, and samples sit where the contract says."""
+
+import dataclasses
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsph.engine.access.slab_windows import MAX_LEVEL
+from jaxsph.engine.cast.batches import CastPlan, batches_of
+from jaxsph.engine.field.gather import BLOCK
+from jaxsph.engine.field.schedule import INTERPOLATED, NUM_METHODS, SlabSchedule
+from jaxsph.engine.field.tasks import RayPackets
+
+SLABS, BUNDLES, PLAN = 11, 13, CastPlan(chunk=8, slab_samples=4, batch_slabs=24)
+
+
+def schedule_of(rng, level=None, painted=None):
+    filled = rng.uniform(size=(SLABS, BUNDLES)) < 0.6
+    count = np.where(filled, rng.integers(1, 200, filled.shape), 0)
+    level = np.zeros_like(count) if level is None else np.full_like(count, level)
+    columns = filled, level, count[None] * 0, count[None], count
+    painted = None if painted is None else jnp.full(filled.shape, painted)
+    paint = None if painted is None else jnp.zeros((4, *filled.shape))
+    reference = jnp.zeros(filled.shape, jnp.float32)
+    return SlabSchedule(*(jnp.asarray(column) for column in columns), (reference,), painted, paint)
+
+
+def batches(schedule, samples=SLABS * 4 - 1, list_id=None, on_borders=False):
+    grid = types.SimpleNamespace(half_steps=jnp.arange(2 * samples + 1, dtype=jnp.float32) / 2, samples=samples)
+    number = BUNDLES if list_id is None else len(list_id)
+    u, v = jnp.arange(3.0 * number).reshape(3, number), -jnp.arange(2.0 * number).reshape(2, number)
+    return batches_of(grid, schedule, RayPackets(u, v, list_id), PLAN, True, on_borders)
+
+
+def chunks_of(found, batch):
+    """Items of the chunks of a batch, without dummies."""
+    chunks = []
+    for nth in range(int(batch.chunks)):
+        items, begin = found.chunk(batch, jnp.int32(nth))
+        assert int(begin) == nth * PLAN.chunk
+        chunks.append(np.asarray(items)[np.asarray(items) < found.schedule.count.size])
+        assert chunks[-1].size, "no chunk is marched for nothing"
+    return chunks
+
+
+def test_every_filled_slab_is_in_one_chunk():
+    schedule = schedule_of(np.random.default_rng(0))
+    found, seen = batches(schedule), []
+    for nth in range(int(found.number)):
+        batch = found.batch(jnp.int32(nth))
+        number, of_batch = int(batch.number), np.concatenate(chunks_of(found, batch))
+        np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
+        blocks = -(-np.asarray(schedule.count).ravel()[of_batch] // BLOCK)
+        assert (np.diff(blocks) <= 0).all()
+        seen += of_batch.tolist()
+    assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)).tolist()
+
+
+def test_chunks_hold_slabs_of_one_method():
+    rng = np.random.default_rng(2)
+    schedule = schedule_of(rng)
+    method = rng.integers(0, NUM_METHODS, schedule.count.shape)
+    level = jnp.asarray(np.maximum(method - INTERPOLATED, 0), jnp.int32)
+    count = jnp.where(method >= INTERPOLATED, 0, schedule.count)
+    found, seen = batches(dataclasses.replace(schedule, count=count, level=level, method=jnp.asarray(method, jnp.int32))), []
+    for nth in range(int(found.number)):
+        batch = found.batch(jnp.int32(nth))
+        number = int(batch.number)
+        np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
+        for items in chunks_of(found, batch):
+            assert len(set(method.ravel()[items])) == 1
+            assert (np.diff(-(-np.asarray(count).ravel()[items] // BLOCK)) <= 0).all()
+            seen += items.tolist()
+    assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)).tolist()
+
+
+def test_packets_keep_the_schedule_of_the_bundle_whose_list_they_read():
+    schedule, list_id = schedule_of(np.random.default_rng(4)), np.array([3, 3, 0, 12, 7])
+    found, seen = batches(schedule, list_id=jnp.asarray(list_id)), []
+    assert found.num_packets == len(list_id)
+    for nth in range(int(found.number)):
+        items = np.concatenate(chunks_of(found, found.batch(jnp.int32(nth))))
+        task = found.task(jnp.asarray(items))
+        np.testing.assert_array_equal(task.slab, items // len(list_id))
+        np.testing.assert_array_equal(task.bundle, list_id[items % len(list_id)])
+        np.testing.assert_array_equal(task.entry.count, np.asarray(schedule.count)[task.slab, task.bundle])
+        np.testing.assert_array_equal(task.u, np.arange(3)[None] * len(list_id) + (items % len(list_id))[:, None])
+        np.testing.assert_array_equal(-task.v, np.arange(2)[None] * len(list_id) + (items % len(list_id))[:, None])
+        seen += items.tolist()
+    assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)[:, list_id]).tolist()
+
+
+@pytest.mark.parametrize("level", range(MAX_LEVEL + 1))
+def test_a_coarse_sample_sits_in_the_middle_of_its_window(level):
+    found = batches(schedule_of(np.random.default_rng(1), level))
+    task = found.task(jnp.arange(BUNDLES))
+    windows = np.arange(PLAN.slab_samples + 1) * 2**level
+    last = SLABS * 4 - 1
+    np.testing.assert_array_equal(task.border[0], np.minimum(windows, last))
+    np.testing.assert_array_equal(task.depth[0], np.minimum(windows[:-1] + 2**level / 2, last))
+    np.testing.assert_array_equal(found.borders(jnp.arange(BUNDLES)), task.border)
+
+
+@pytest.mark.parametrize("level", range(MAX_LEVEL + 1))
+def test_samples_on_borders_hold_both_ends(level):
+    """So that the last of a slab is the first of the next."""
+    task = batches(schedule_of(np.random.default_rng(1), level), on_borders=True).task(jnp.arange(BUNDLES))
+    np.testing.assert_array_equal(task.depth, task.border)
+    np.testing.assert_array_equal(task.depth[0], np.minimum(np.arange(PLAN.slab_samples + 1) * 2**level, SLABS * 4 - 1))
+
+
+def test_a_super_pixel_is_one_sample_as_long_as_a_cell():
+    task = batches(schedule_of(np.random.default_rng(2), MAX_LEVEL, painted=True)).task(jnp.arange(BUNDLES))
+    np.testing.assert_array_equal(task.border[0], [0, *[1 << MAX_LEVEL] * PLAN.slab_samples])
+
+
+def test_what_lies_past_the_last_sample_has_no_length():
+    task = batches(schedule_of(np.random.default_rng(3)), samples=SLABS * 4 - 3).task((SLABS - 1) * BUNDLES + jnp.arange(BUNDLES))
+    np.testing.assert_array_equal(np.diff(np.asarray(task.border), axis=1)[0], [1, 0, 0, 0])
+
+
+def test_a_dummy_has_no_particles_and_no_length():
+    task = batches(schedule_of(np.random.default_rng(3))).task(jnp.full(2, SLABS * BUNDLES))
+    assert not task.entry.length.any() and not task.entry.count.any()
+    assert not np.diff(np.asarray(task.border), axis=1).any()
+
+
+@pytest.mark.parametrize("sizes", [{"chunk": 0}, {"slab_samples": 0}, {"batch_slabs": 0}, {"batch_slabs": 12}])
+def test_sizes_that_do_not_fit_are_refused(sizes):
+    with pytest.raises(ValueError, match="must be"):
+        CastPlan(**({"chunk": 8, "slab_samples": 4, "batch_slabs": 24} | sizes))
+
+
+@pytest.mark.parametrize(("shards", "slabs"), [(1, 24), (2, 8), (4, 8)])
+def test_shards_hold_together_no_more_than_one_would_but_a_chunk_each(shards, slabs):
+    assert PLAN.of_shard(shards) == dataclasses.replace(PLAN, batch_slabs=slabs)

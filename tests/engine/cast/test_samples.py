@@ -1,0 +1,77 @@
+"""Point samples as they are summed up in few passes are those of the plain rule, and that rule is the one of the papers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsph.engine.cast.samples import PointSamples, emitted, transmitted
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.mixture import Mixture
+from jaxsph.model.medium import Medium
+from jaxsph.numerics.fusion import barriers
+
+TASKS, SAMPLES, ROWS, COLUMNS = 5, 4, 3, 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Given(Medium):
+    """Optics at samples as given: red, green, blue and extinction."""
+
+    given: jax.Array
+
+    def occupied(self, slabs):
+        raise NotImplementedError
+
+    def extinction(self, gathered, task):
+        return self.given[3], ()
+
+    def colors(self, samples, task, channels):
+        return list(self.given)[channels]
+
+
+jax.tree_util.register_dataclass(Given, data_fields=["given"], meta_fields=[])
+
+
+def task(rng, perspective):
+    border = np.cumsum(rng.uniform(0.1, 0.4, (TASKS, SAMPLES + 1)), 1)
+    sides = rng.uniform(-1, 1, (TASKS, COLUMNS)), rng.uniform(-1, 1, (TASKS, ROWS))
+    depths = 0.5 * (border[:, 1:] + border[:, :-1]), border
+    return SlabTask(None, jnp.arange(TASKS), jnp.arange(TASKS), *(jnp.asarray(v) for v in (*sides, *depths)), perspective)
+
+
+@pytest.mark.parametrize("perspective", [True, False])
+@pytest.mark.parametrize("media", [1, 2, 3])
+def test_passes_over_memory_change_no_light(media, perspective, x64):
+    rng = np.random.default_rng(media)
+    there = rng.uniform(size=(media, 1, TASKS, SAMPLES, 1)) < 0.7
+    optics = rng.uniform(0, 2, (media, 4, TASKS, SAMPLES, ROWS * COLUMNS)) * there
+    several, where = tuple(Given(jnp.asarray(one)) for one in optics), task(rng, perspective)
+
+    def light(in_few_passes):
+        with barriers(in_few_passes):
+            medium = Mixture.of(several)
+            found = PointSamples()(medium, medium.gather(where), where)
+        return np.stack([*found.color, found.transmittance]), np.broadcast_to(found.thickness, where.shape)
+
+    for few, plain in zip(light(True), light(False), strict=True):
+        np.testing.assert_allclose(few, plain, rtol=1e-12, atol=1e-15)
+    # each sample adds its colour times what it takes away of the light
+    extinction = optics[:, 3].sum(0)
+    left = np.exp(-np.cumsum(extinction * np.asarray(where.path()), 1))
+    taken = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], 1) - left
+    for channel in range(3):
+        color = (optics[:, channel] * optics[:, 3]).sum(0) / np.where(extinction > 0, extinction, 1)
+        np.testing.assert_allclose(light(True)[0][channel], (color * taken).sum(1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(light(True)[0][3], left[:, -1], rtol=1e-12)
+
+
+def test_colours_add_up_to_the_alpha_that_is_lost():
+    """However thin samples are, of a colour that is one."""
+    thickness = jnp.full((3, 1 << 6, 1), 1e-7).at[1].set(0.3).at[2].set(50.0)
+    *color, left = emitted([jnp.ones_like(thickness)], transmitted(thickness))
+    np.testing.assert_allclose(color[0], 1 - np.asarray(left), rtol=1e-6)

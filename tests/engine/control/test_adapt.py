@@ -1,0 +1,68 @@
+"""Error control of a band, on fluids made by hand: what is alike is coarsened, what is not wanted is left alone."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES
+from jaxsph.engine.control.adapt import EMPTY, ControlPlan, adapt, untouched
+from jaxsph.engine.control.errors import SUPER_PIXEL
+from jaxsph.engine.control.merge import uncoarsened
+from jaxsph.engine.field.schedule import evaluations
+from jaxsph.engine.runtime.tuning import CPU
+
+
+@pytest.fixture(scope="module")
+def adapted(frames, stages):
+    """What is decided for particles of given quantities; and the grid and references that it is decided by."""
+    rng = np.random.default_rng(3)
+    frames = frames.deep(4)
+    plan, control = frames.plan(), ControlPlan(super_pixels=True, merge=True, allocation="budget")
+    scene, camera = frames.scene(rng, decades=0.1), frames.camera(rng)
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])
+    run = jax.jit(functools.partial(adapt, slab_samples=4, plan=control, tuning=CPU))
+
+    def decide(quantity, tolerance, wanted=True):
+        particles = js.Particles(**{**vars(scene.particles), "quantity": jnp.asarray(quantity, jnp.float32)})
+        grid, reference = stages(particles, camera, plan=plan)
+        cells = -(-grid.windows.count.shape[0] * 4 // CELL_SAMPLES)
+        wanted = jnp.full((cells, grid.windows.count.shape[1]), wanted)
+        limits = jnp.float32(tolerance), jnp.float32(0.0)
+        return run(grid, camera, transfer, reference, wanted, *limits), grid, reference
+
+    return decide
+
+
+ALIKE, MIXED = np.full(24, 0.5), np.tile([0.0, 1.0], 12)
+
+
+def test_what_is_alike_is_coarsened_within_the_tolerance(adapted):
+    (schedule, bound, levels), grid, reference = adapted(ALIKE, 0.1)
+    full = uncoarsened(grid.windows, reference, True)
+    assert (np.asarray(bound) <= 0.1).all() and (np.asarray(bound) > 0).any()
+    spent, most = (evaluations(one, grid.samples, 4).sum() for one in (schedule, full))
+    assert 0 < float(spent) < 0.9 * float(most)
+    assert set(np.unique(levels)) <= set(range(EMPTY, SUPER_PIXEL + 1)) and (np.asarray(levels) > 0).any()
+
+
+def test_a_smaller_tolerance_never_saves_more(adapted):
+    spent = [float(evaluations(adapted(MIXED, tolerance)[0][0], 131, 4).sum()) for tolerance in (0.0, 0.01, 0.3)]
+    assert spent[0] >= spent[1] >= spent[2] > 0 and spent[0] > spent[2]
+
+
+@pytest.mark.parametrize(("tolerance", "wanted"), [(0.3, False), (0.0, True)])
+def test_what_is_not_wanted_or_not_allowed_is_the_reference_image(adapted, tolerance, wanted):
+    (schedule, bound, levels), grid, reference = adapted(MIXED, tolerance, wanted)
+    full = uncoarsened(grid.windows, reference, True)
+    for name in ("filled", "length", "count"):
+        found, expected = (np.asarray(getattr(one, name)) for one in (schedule, full))
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+    assert not np.asarray(bound).any()
+    at_full_rate = np.asarray(untouched(grid.windows, 4))
+    np.testing.assert_array_equal(np.asarray(levels)[at_full_rate == 0], 0)

@@ -1,0 +1,64 @@
+"""Promise: no quantity of an interval looks up to a colour or an extinction outside the interval's range, which is tight."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.control.ranges import range_tables, transfer_ranges
+
+look = jax.jit(lambda transfer, q: jnp.stack(js.model.transfer.look_up(transfer.segments(), q)))
+bound = jax.jit(lambda transfer, lo, hi: jnp.stack([jnp.stack(side) for side in transfer_ranges(range_tables(transfer), lo, hi)]))
+
+
+def made(rng, points, how, offset, dtype):
+    values = {"even": np.linspace(0, 1, points), "uneven": np.sort(rng.uniform(0, 1, points))}[how]
+    if how == "uneven" and points > 4:
+        values[2] = values[3]
+    narrow = rng.uniform(0, 1, points) < 0.3
+    colors, extinction = rng.uniform(0, 1, (points, 3)), np.where(narrow, 10 ** rng.uniform(-6, 6, points), 0)
+    return js.TransferFunction.from_points((values + offset).astype(dtype), colors.astype(dtype), extinction.astype(dtype))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("how", ["even", "uneven"])
+@pytest.mark.parametrize("points", [1, 2, 7, 64])
+@given(seed=st.integers(0, 2**32 - 1), offset=st.sampled_from([0.0, -0.5, 3e3]), width=st.floats(-7, 1))
+def test_every_value_of_an_interval_lies_in_its_range(points, how, dtype, seed, offset, width):
+    rng = np.random.default_rng(seed)
+    with jax.enable_x64(dtype is np.float64):
+        transfer = made(rng, points, how, offset, dtype)
+        knots = np.asarray(transfer.values)
+        lo = np.where(rng.uniform(size=64) < 0.4, rng.choice(knots, 64), rng.uniform(-0.3, 1.3, 64) + offset).astype(dtype)
+        hi = np.maximum(lo, (lo + 10.0**width * rng.uniform(0, 1, 64)).astype(dtype))
+        between = np.clip((lo + np.linspace(0, 1, 40)[:, None] * (hi - lo)).astype(dtype), lo, hi)
+        on_knots = np.clip(np.broadcast_to(rng.choice(knots, 20)[:, None], (20, 64)), lo, hi)
+        truth = np.asarray(look(transfer, np.concatenate([between, on_knots, np.nextafter(on_knots, lo), [lo, hi]])))
+        least, greatest = np.asarray(bound(transfer, lo, hi))
+    assert (least[:, None] <= truth).all() and (truth <= greatest[:, None]).all()
+    assert (least >= 0).all()
+
+
+def test_ranges_are_tight(x64):
+    transfer = js.TransferFunction.from_points(np.linspace(0, 1, 11), np.eye(11)[:, [2, 5, 8]], np.arange(11.0) ** 2)
+    lo, hi = np.array([0.15, 0.45, -1, 0.31]), np.array([0.25, 0.65, 2, 0.39])
+    least, greatest = np.asarray(bound(transfer, lo, hi))
+    np.testing.assert_allclose(greatest[0], [1, 0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(greatest[1], [0, 1, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(least[3], [2.5, 20.5, 0, 9.7], atol=1e-12)
+    np.testing.assert_allclose(greatest[3], [6.5, 42.5, 100, 15.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_exponentials_err_by_no_more_than_certificates_allow_for(dtype):
+    """`errors.EXPONENTIAL` takes 2 ulp for granted, here counted against long doubles."""
+    depth = np.concatenate([np.linspace(0, 40, 200_001), 10.0 ** np.linspace(-12, 1.5, 50_001)]).astype(dtype)
+    with jax.enable_x64(dtype is np.float64):
+        found = np.asarray(jax.jit(lambda x: jnp.exp(-x))(depth))
+    truth = np.exp(-depth.astype(np.longdouble))
+    ulp = np.spacing(truth.astype(dtype)).astype(np.longdouble)
+    assert (np.abs(found - truth) <= 2 * ulp).all()
+    assert (found <= 1).all()

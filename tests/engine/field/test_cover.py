@@ -1,0 +1,116 @@
+"""What a cover says of rays is what a union of chords says in float64, one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import QUICKLY
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.field.cover import cover_of, outer_pivot
+from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.field.tasks import SlabTask
+
+TASKS, SAMPLES, COLUMNS, ROWS, PARTICLES = 34, 5, 3, 4, 30  # more slabs than are looked at together
+NEAR, FAR = 1.0, 4.0
+FORMS = "perspective", "orthographic", "scattered"
+
+
+def drawn(rng, form):
+    """Particles in two windows a slab, and slabs that tile a depth, their rays all about."""
+    support = 0.7 * 10 ** -rng.uniform(0, 1.7, PARTICLES)
+    x, y = rng.uniform(-0.7, 0.7, (2, PARTICLES))
+    scale = 10 ** rng.uniform(-1, 1, PARTICLES)
+    where = {"x": x, "y": y, "z": rng.uniform(NEAR, FAR, PARTICLES), "scale": scale, "size": scale * support}
+    columns = where | {"quantity": rng.uniform(0, 1, PARTICLES)}
+    unread = dict.fromkeys(field.name for field in dataclasses.fields(Ordered))
+    ordered = Ordered(**unread | {name: jnp.asarray(value) for name, value in columns.items()})
+    begin = np.stack([np.zeros(TASKS), rng.integers(10, 20, TASKS)]).astype(np.int32)
+    length = np.stack([rng.integers(0, 10, TASKS), rng.integers(0, 10, TASKS)]).astype(np.int32)
+    reference = rng.uniform(0, 1, TASKS)
+    zero = jnp.zeros(TASKS, jnp.int32)
+    given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), (jnp.asarray(reference),)
+    entry = SlabSchedule(zero == 0, zero, *given)
+    first = rng.uniform(NEAR, FAR, (TASKS, 1))
+    depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
+    count = COLUMNS if form != "scattered" else ROWS
+    u, v = rng.uniform(-0.4, 0.4, (TASKS, count)), rng.uniform(-0.4, 0.4, (TASKS, ROWS))
+    placed = (jnp.asarray(value) for value in (u, v, depth, depth))
+    task = SlabTask(entry, zero, zero, *placed, form != "orthographic", form == "scattered", between=True)
+    return ordered, jnp.asarray(rng.permutation(PARTICLES).astype(np.int32)), task
+
+
+def chords_of(ordered, rank, task, item):
+    """Of a slab: depths (rays, particles) at which its rays enter and leave particles, and those particles."""
+    begin, length = np.asarray(task.entry.begin), np.asarray(task.entry.length)
+    places = np.concatenate([begin[k, item] + np.arange(length[k, item]) for k in range(2)])
+    some = np.asarray(rank)[places]
+    x, y, z, scale, size = (np.asarray(getattr(ordered, name))[some] for name in ("x", "y", "z", "scale", "size"))
+    u, v = (np.asarray(value)[item][:, None] for value in task.ray_coordinates())
+    slope = np.stack([u, v, np.ones_like(u)], -1) if task.perspective else np.broadcast_to([0.0, 0.0, 1.0], (*u.shape, 3))
+    center = np.stack([x, y, z], -1)[None] - (0 if task.perspective else np.stack([u, v, 0 * u], -1))
+    length = (slope**2).sum(-1)
+    foot = (center * slope).sum(-1) / length
+    inner = (size / scale) ** 2 - ((center - foot[..., None] * slope) ** 2).sum(-1)
+    half = np.sqrt(np.maximum(inner, 0) / length)
+    first, last = float(task.border[item, 0]), float(task.border[item, -1])
+    met = (inner > 0) & (foot + half > first) & (foot - half < last)
+    return np.where(met, foot - half, np.inf), np.where(met, foot + half, -np.inf), some
+
+
+@functools.partial(jax.jit, static_argnames="label", compiler_options=QUICKLY)
+def covered(ordered, rank, task, inside, label):
+    return cover_of(ordered, rank, task, inside, label)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form, seed):
+    with jax.enable_x64(True):
+        ordered, rank, task = drawn(np.random.default_rng(seed), form)
+        found = [chords_of(ordered, rank, task, item) for item in range(TASKS)]
+        depth = np.asarray(task.depth)
+        at = depth[:, :, None, None]
+        inside = np.stack([((begin < at[item]) & (end > at[item])).any(-1) for item, (begin, end, _) in enumerate(found)])
+        cover, by_place = (
+            jax.tree.map(np.asarray, covered(ordered, rank, task, jnp.asarray(inside), label)) for label in ("quantity", "place")
+        )
+        for item, (begin, end, some) in enumerate(found):
+            quantity = np.asarray(ordered.quantity)[some] - float(task.entry.references[0][item])
+            for ray in np.flatnonzero(~inside[item].all(0)) if len(some) else ():
+                pivot = cover.pivot[item, ray]
+                assert pivot in depth[item][~inside[item, :, ray]]
+                for piece, mine in enumerate((end[ray] < pivot, end[ray] >= pivot)):
+                    of_piece = [getattr(cover, name)[piece, item, ray] for name in ("front", "back", "of_front", "of_back")]
+                    mine &= end[ray] > begin[ray]
+                    if not mine.any():
+                        assert of_piece[0] > of_piece[1]
+                        continue
+                    first, last = np.where(mine, begin[ray], np.inf).argmin(), np.where(mine, end[ray], -np.inf).argmax()
+                    wanted = begin[ray, first], end[ray, last], quantity[first], quantity[last]
+                    np.testing.assert_allclose(of_piece, wanted, rtol=1e-9, atol=1e-9)
+                    places = [getattr(by_place, name)[piece, item, ray] for name in ("of_front", "of_back")]
+                    assert places == [first, last]
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_chord_reaches_over_the_pivot(seed):
+    """It is an outer sample where there is one: the first behind an inner one, if any is."""
+    inside = np.random.default_rng(seed).uniform(size=(6, SAMPLES, 7)) < 0.5
+    depth = np.cumsum(np.ones((6, SAMPLES)), 1)
+    pivot = np.asarray(outer_pivot(jnp.asarray(inside), jnp.asarray(depth)))
+    for item in range(6):
+        for ray in range(7):
+            outer = np.flatnonzero(~inside[item, :, ray])
+            behind = [k for k in outer if inside[item, :k, ray].any()]
+            wanted = np.inf if not outer.size else depth[item, behind[0] if behind else outer[-1]]
+            assert pivot[item, ray] == wanted

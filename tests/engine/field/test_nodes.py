@@ -1,0 +1,113 @@
+"""Nodes hold the sums of full rate, and so do the rays at which slabs are subsampled."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.cast.batches import batches_of
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.lattice import FINEST, GAP, REACH, Region, Spacing, region_of
+from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
+from jaxsph.engine.field.schedule import SUBSAMPLE, full_rate
+from jaxsph.engine.field.tasks import RayPackets
+from jaxsph.model import kernels
+
+WIDER = Spacing(8, 4)
+
+
+@pytest.mark.parametrize("spacing", [FINEST, WIDER])
+def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spacing):
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
+    plan = js.plan(scene, camera, frames.settings)
+    grid, _ = stages(scene.particles, camera, plan=plan)
+    ordered = grid.ordered
+    lattice = sum_at_nodes(
+        grid,
+        camera,
+        scene.particles.kernel,
+        plan.cast.slab_samples,
+        Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, spacing),
+        (jnp.float64(0.4),),
+        plan.cast.tuning.cells_of_nodes,
+    )
+
+    kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)
+    deep, down, across = lattice.weight[kept].shape
+    deep = min(deep, -(-plan.samples // spacing.samples))
+    depth = np.asarray(grid.half_steps)[1::2][:: spacing.samples][:, None, None]
+    u = np.asarray(camera.column(spacing.pixels * np.arange(across) + 0.5))
+    v = np.asarray(camera.row(spacing.pixels * np.arange(down) + 0.5))[:, None]
+    spread = depth if camera.is_perspective else np.ones_like(depth)
+    smooth, weight, weighted = kernels.by_name(scene.particles.kernel), 0.0, 0.0
+    x, y, z, scale, size, quantity = (
+        np.asarray(c)[np.asarray(ordered.live)]
+        for c in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, ordered.quantity)
+    )
+    for k in range(len(x)):
+        square = ((u * spread - x[k]) ** 2 + (v * spread - y[k]) ** 2 + (depth - z[k]) ** 2) * scale[k] ** 2
+        w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
+        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.references[0]))
+    # nodes beyond the image lie in bundles that it has no list for
+    rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
+    for found, wanted in ((lattice.weight, weight), (*lattice.weighted, weighted)):
+        assert np.asarray(found != 0).sum() == np.asarray(found[kept] != 0).sum(), "margins are zero"
+        np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
+    assert weight.max() > 0
+
+
+@pytest.mark.slow
+def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
+    """As far as it reaches: from the first row and column of bundles that are touched."""
+    rng = np.random.default_rng(5)
+    scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
+    plan = js.plan(scene, camera, frames.settings)
+    grid, _ = stages(scene.particles, camera, plan=plan)
+    every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
+    kept = slice(None), slice(-GAP), slice(-GAP)
+    sizes = (jnp.float32(0.4),), plan.cast.tuning.cells_of_nodes
+    whole, part = (
+        sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, *sizes).weight[kept]
+        for region in (every, some)
+    )
+    row, column = int(some.row) // FINEST.pixels, int(some.column) // FINEST.pixels
+    np.testing.assert_array_equal(part, whole[:, row : row + part.shape[1], column : column + part.shape[2]])
+    assert part.shape[1:] == (4, 6) and (part > 0).any()
+
+
+EYE, TARGET, SIZE = (1.5, 1.1, -2.2), (0.5, 0.5, 0.5), {"width": 230, "height": 197}
+CAMERAS = {
+    "perspective": lambda: js.Camera.look_at(EYE, TARGET, near=1.0, far=5.0, **SIZE),
+    "orthographic": lambda: js.Camera.orthographic(EYE, TARGET, near=1.0, far=5.0, **SIZE),
+}
+
+
+@pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
+def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x64, stages, projection):
+    rng, camera = np.random.default_rng(4), CAMERAS[projection]()
+    position = rng.uniform(0, 1, (2000, 3))
+    particles = js.Particles.from_arrays(position, 0.2, position[:, 0])
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 1], [1, 0, 0]], [1.0, 1.0])
+    plan = js.plan(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=96))
+    grid, reference = stages(particles, camera, plan=plan)
+    schedule = full_rate(grid.windows, reference)
+    packets = RayPackets(*grid.rays(camera, jnp.arange(plan.lists.num_bundles)))
+    batches = batches_of(grid, schedule, packets, plan.cast, camera.is_perspective)
+    fullest = np.argsort(np.asarray(schedule.count).ravel())[-plan.cast.chunk :]
+    task = batches.task(jnp.asarray(fullest, jnp.int32))
+
+    def sums_by(how):
+        sums = jax.jit(functools.partial(how, kernel=particles.kernel))(grid.ordered, grid.lists.rank, task)
+        return np.asarray(sums.weight) + 1j * np.asarray(*sums.weighted)
+
+    every, few = sums_by(gather), sums_by(gather_subsampled)
+    at = np.ix_(range(len(few)), range(few.shape[1]), SUBSAMPLE, SUBSAMPLE)
+    np.testing.assert_allclose(few[at], every[at], rtol=1e-12, atol=1e-12 * np.abs(every).max())
+    assert np.sqrt((np.abs(few - every) ** 2).mean()) < 0.02 * np.sqrt((np.abs(every) ** 2).mean())
+    assert np.abs(few - every).max() > 0

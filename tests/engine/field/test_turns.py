@@ -1,0 +1,49 @@
+"""Slabs of any fullness are looped over whole, each block once and in order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.field.tasks import SlabTask
+
+TASKS = 256
+
+
+def task_of(length):
+    count = jnp.asarray(length, jnp.int32)
+    entry = SlabSchedule(
+        count > 0, 0 * count, jnp.zeros((2, TASKS), jnp.int32), jnp.stack([count // 3, count - count // 3]), count, (0.0 * count,)
+    )
+    nothing = jnp.zeros((TASKS, 1))
+    return SlabTask(entry, count, count, nothing, nothing, nothing, nothing, True)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_each_block_of_each_slab_is_met_once_and_in_order(seed, sorted_first):
+    rng = np.random.default_rng(seed)
+    length = [
+        int(n) for n in np.where(rng.uniform(size=TASKS) < rng.uniform(), rng.integers(0, 40, TASKS), rng.integers(0, 3, TASKS))
+    ]
+    length = sorted(length, reverse=True) if sorted_first else length
+    met = [[] for _ in range(TASKS)]
+    for turns in task_of(length).turns(4, (4,)):
+        assert turns.task.depth.shape[0] == turns.number
+        for block in range(int(turns.begin), int(turns.end)):
+            for slab in range(turns.number):
+                met[slab].append(block)
+    for slab, blocks in enumerate(met):
+        needed = -(-length[slab] // 4)
+        assert blocks[:needed] == list(range(needed))
+        assert blocks == sorted(set(blocks))
+
+
+def test_one_full_slab_does_not_keep_the_others_waiting():
+    length = [1000] + [1] * (TASKS - 1)
+    looped = sum(turns.number * int(turns.end - turns.begin) for turns in task_of(length).turns(4, (4,)))
+    assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
+    assert jax.tree.leaves(task_of(length).first(3))[0].shape == (3,)
+    np.testing.assert_array_equal(task_of(length).first(2).entry.count, [1000, 1])

@@ -1,0 +1,193 @@
+"""A volume is what its grid says: interpolated, placed, shown, mixed, skipped where it is empty, and differentiated."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.access.extents import SlabExtents
+from jaxsph.engine.access.macrocells import MACROCELL, MacrocellRanges, Occupancy
+from jaxsph.engine.media.volume import VolumeMedium
+from jaxsph.engine.media.volume_grid import VolumeGrid
+from jaxsph.numerics import faults
+
+SETTINGS = js.Settings(samples=32)
+FIELD = np.random.default_rng(4).uniform(0, 1, (9, 7, 12)).astype(np.float32)
+LOWER, SPACING = (-1.1, -0.8, -0.9), (0.27, 0.25, 0.16)
+
+
+def transfer(values=(0.2, 0.5, 0.8), extinction=(0.0, 2.0, 0.5)):
+    return js.TransferFunction.from_points(values, [[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]], extinction)
+
+
+def camera(projection="perspective", width=19, height=14):
+    where = {"eye": (1.4, 1.1, -2.6), "target": (0.0, 0.0, 0.0), "width": width, "height": height, "near": 1.2, "far": 5.0}
+    if projection == "orthographic":
+        return js.Camera.orthographic(**where, view_height=2.8)
+    return js.Camera.look_at(**where, fov_degrees=50.0)
+
+
+def scene(values=FIELD, **parts):
+    return js.Scene(volume=js.Volume.from_array(values, LOWER, SPACING), volume_transfer=transfer(), **parts)
+
+
+def particles():
+    rng = np.random.default_rng(1)
+    position = rng.uniform(-1, 1, (30, 3)).astype(np.float32)
+    return {
+        "particles": js.Particles.from_arrays(position, 0.6, rng.uniform(0, 1, 30).astype(np.float32)),
+        "transfer": transfer(),
+    }
+
+
+@pytest.mark.parametrize(
+    ("projection", "parts"),
+    [
+        ("perspective", "both"),
+        pytest.param("orthographic", "volume", marks=pytest.mark.slow),
+        pytest.param("perspective", "volume", marks=pytest.mark.slow),
+        pytest.param("orthographic", "both", marks=pytest.mark.slow),
+    ],
+)
+def test_an_image_is_that_of_the_reference(compare, projection, parts):
+    shown, view = scene(**(particles() if parts == "both" else {})), camera(projection)
+    image, truth = js.render(shown, view, SETTINGS), js.reference.render(shown, view, SETTINGS)
+    assert float(truth.alpha.max()) > 0.5
+    compare(image, truth, 2e-5, share=0.995)  # a sample on a face of the box is inside or not
+    if parts == "volume":
+        assert image.stats["evaluations"] == 0
+
+
+@pytest.mark.slow
+def test_bytes_are_kept_and_show_what_their_floats_do():
+    data = (255 * FIELD).astype(np.uint8)
+    volume = js.Volume.from_array(data, LOWER, SPACING)
+    assert volume.values.dtype == np.uint8
+    shown = js.Scene(volume=volume, volume_transfer=transfer((51, 128, 204)))
+    as_floats = dataclasses.replace(shown, volume=js.Volume.from_array(data.astype(np.float32), LOWER, SPACING))
+    images = [js.render(one, camera("orthographic"), SETTINGS) for one in (shown, as_floats)]
+    np.testing.assert_array_equal(images[0].color, images[1].color)
+
+
+@pytest.mark.slow
+def test_a_scene_of_float64_is_rendered_in_float64(x64):
+    shown, view = scene(FIELD.astype(np.float64)), camera()
+    image, truth = js.render(shown, view, SETTINGS), js.reference.render(shown, view, SETTINGS)
+    assert image.color.dtype == np.float64
+    assert np.abs(np.asarray(image.color) - truth.color).max() < 2e-5  # the camera is float32
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences(x64):
+    """By values and extinction, in reverse mode."""
+    shown, view = scene(FIELD.astype(np.float64)), camera(width=8, height=8)
+    shown = dataclasses.replace(shown, volume_transfer=transfer(extinction=(0.1, 2.0, 0.5)))
+    plan = js.plan(shown, view, SETTINGS)
+
+    def light(values, extinction):
+        volume = dataclasses.replace(shown.volume, values=values)
+        looks = dataclasses.replace(shown.volume_transfer, extinction=extinction)
+        image = js.render(dataclasses.replace(shown, volume=volume, volume_transfer=looks), view, SETTINGS, plan=plan)
+        return (image.color * jnp.arange(1.0, 4.0)).sum() + image.transmittance.sum()
+
+    at = shown.volume.values, shown.volume_transfer.extinction.astype(float)
+    rng, step = np.random.default_rng(0), 1e-6
+    both = jax.jit(jax.value_and_grad(light, (0, 1)))
+    found = both(*at)[1]
+    for k, gradient in enumerate(found):
+        way = jnp.asarray(rng.normal(size=at[k].shape))
+        ends = [both(*(leaf + sign * step * way if i == k else leaf for i, leaf in enumerate(at)))[0] for sign in (1, -1)]
+        np.testing.assert_allclose((gradient * way).sum(), (ends[0] - ends[1]) / (2 * step), rtol=2e-3)
+
+
+def test_values_that_are_no_numbers_are_a_fault_under_jit():
+    shown, view = scene(), camera()
+    broken = dataclasses.replace(shown.volume, values=jnp.asarray(np.where(FIELD[3, 2, 1] == FIELD, np.nan, FIELD)))
+    words = [int(FAULTS(volume, shown.volume_transfer, view)) for volume in (shown.volume, broken)]
+    assert words == [0, faults.BAD_VOLUME]
+    for volume in (broken, dataclasses.replace(shown.volume, spacing=jnp.zeros(3))):
+        with pytest.raises(ValueError, match="a volume holds values that are not finite"):
+            js.render(dataclasses.replace(shown, volume=volume), view, SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("parts", "missing"),
+    [(("volume",), "volume_transfer"), (("volume_transfer",), "volume"), (("particles",), "transfer"), ((), "particles")],
+)
+def test_a_part_without_its_looks_is_refused_by_name(parts, missing):
+    whole = scene(**particles())
+    some = js.Scene(**{name: getattr(whole, name) for name in parts})
+    with pytest.raises(ValueError, match=f"^`{missing}`"):
+        js.render(some, camera(), SETTINGS)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_no_extinction_lies_in_a_slab_that_is_called_empty(seed, many_points):
+    """Slabs of random extents; samples in their corners, on their faces and inside; values are often control points."""
+    rng = np.random.default_rng(seed)
+    points = np.sort(rng.uniform(0, 1, 20)) if many_points else np.linspace(0, 1, 6)
+    if many_points and rng.uniform() < 0.5:
+        points = np.linspace(0, 1, 20)
+    extinction = np.where(rng.uniform(size=len(points)) < 0.3, 1.0, 0.0)
+    looks = js.TransferFunction.from_points(points, np.ones((len(points), 3)), extinction)
+    values = rng.choice(points, (11, 9, 14))
+    values[: rng.integers(1, 11)] = rng.choice(points)  # empty parts, if there is no extinction
+    smooth = rng.uniform() < 0.5
+    values = np.where(smooth, values * rng.uniform(0.9, 1, values.shape), values).astype(np.float32)
+    volume = js.Volume.from_array(values, rng.uniform(-2, 2, 3), rng.uniform(0.1, 0.5, 3))
+    medium = EXAMPLES(volume, looks, camera())
+    grid = np.asarray(volume.bounds())
+    middle = np.asarray(camera().to_view(jnp.asarray(rng.uniform(grid[0], grid[1], (200, 3)).astype(np.float32))))
+    half = 10.0 ** rng.uniform(-2, 0, (200, 3))
+    lower, upper = (middle - half).astype(np.float32), (middle + half).astype(np.float32)
+    slabs = SlabExtents(*(jnp.asarray(side[:, axis])[:, None] for axis in range(3) for side in (lower, upper)))
+    empty = ~np.asarray(OCCUPIED(medium, slabs))[:, 0]
+    share = rng.choice([0.0, 1.0, 0.5, 0.3], (200, 30, 3))
+    samples = np.clip(lower[:, None] + share * (upper - lower)[:, None], lower[:, None], upper[:, None]).astype(np.float32)
+    shown = np.asarray(SHOWN(medium, jnp.asarray(samples)))
+    assert not (shown > 0)[empty].any()
+
+
+@jax.jit
+def EXAMPLES(volume, looks, view):
+    return VolumeMedium.seen(volume, looks, view)
+
+
+@jax.jit
+def FAULTS(volume, looks, view):
+    return VolumeMedium.seen(volume, looks, view).faults()
+
+
+@jax.jit
+def OCCUPIED(medium, slabs):
+    return medium.occupied(slabs)
+
+
+@jax.jit
+def SHOWN(medium, samples):
+    place = medium.grid.coordinates(tuple(samples[..., axis][..., None] for axis in range(3)))
+    gathered = medium.grid.interpolate(place), medium.grid.inside(place)
+    return medium.extinction(gathered, None)[0][..., 0]
+
+
+def test_empty_space_is_skipped():
+    values = np.zeros((33, 33, 33), np.float32)
+    values[20:24, 20:24, 20:24] = 1.0
+    volume = js.Volume.from_array(values, 0 * np.ones(3), 1 / 32)
+    ranges = jax.jit(MacrocellRanges.of)(volume.values)
+    assert ranges.lo.shape == (8, 8, 8) == tuple(32 // MACROCELL for _ in range(3))
+    shown = jax.jit(MacrocellRanges.shown_by)(ranges, js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [0.0, 1.0]))
+    assert int(shown.sum()) == 8
+    grid = VolumeGrid(volume.values, jnp.zeros(3), jnp.eye(3) * 32)
+    ends = [np.float32([[low], [low + 0.05]]) for low in (0.1, 0.65)]
+    boxes = [SlabExtents(*(jnp.asarray(edge[i : i + 1]) for _ in range(3) for i in range(2))) for edge in ends]
+    touched = jax.jit(lambda box: grid.touched(Occupancy.of(shown), box))
+    assert [bool(touched(box)[0, 0]) for box in boxes] == [False, True]

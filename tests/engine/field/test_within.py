@@ -1,0 +1,197 @@
+"""What a clip leaves is what the reference shows of it, by every integrator; faces move, and have derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.access.slab_windows import whole_cells
+from jaxsph.engine.field.schedule import SlabSchedule, clipped
+
+PLANE, BOX, BALL = (
+    js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
+    js.Box((-0.5, -0.4, -0.9), (0.6, 0.7, 0.3)),
+    js.Sphere((0.2, 0, 0.1), 0.5),
+)
+CLIPS = {"plane": PLANE, "box": BOX, "outside": ~BALL, "both": PLANE & ~BALL, "either": BALL | ~PLANE}
+pytestmark = pytest.mark.usefixtures("quick_programs")
+TRANSFER = js.TransferFunction.from_points([0.0, 0.5, 1.0], [[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]], [0.4, 2.0, 5.0])
+
+
+def camera(projection="perspective", side=16):
+    where = {"eye": (1.4, 1.1, -2.6), "target": (0.0, 0.0, 0.0), "width": side, "height": side, "near": 1.2, "far": 5.0}
+    if projection == "orthographic":
+        return js.Camera.orthographic(**where, view_height=2.8)
+    return js.Camera.look_at(**where, fov_degrees=50.0)
+
+
+def scene(within=None, parts="particles"):
+    """Supports that overlap several times, and a field that changes slowly."""
+    rng = np.random.default_rng(1)
+    position = rng.uniform(-1, 1, (150, 3)).astype(np.float32)
+    particles = js.Particles.from_arrays(position, 0.55, 0.5 + 0.4 * np.sin(2 * position[:, 0] + position[:, 1]))
+    made = js.Scene(particles=particles, transfer=TRANSFER, within=within)
+    if parts == "all":
+        x = np.linspace(0, 1, 9, dtype=np.float32)
+        volume = js.Volume.from_array(x[:, None, None] * x[:, None] + 0 * x, (-0.7, -0.9, -0.8), 0.18)
+        points = js.Points.from_arrays(rng.uniform(-0.8, 0.8, (20, 3)), 0.15, (1, 1, 0.3), opacity=0.6)
+        made = dataclasses.replace(made, volume=volume, volume_transfer=TRANSFER, points=points)
+    return made
+
+
+def worst(image, truth):
+    color = np.abs(np.asarray(image.color, np.float64) - truth.color).max(-1)
+    return np.maximum(color, np.abs(np.asarray(image.transmittance) - truth.transmittance))
+
+
+@pytest.mark.parametrize(
+    ("name", "projection", "parts"),
+    [
+        ("both", "perspective", "all"),
+        pytest.param("box", "orthographic", "particles", marks=pytest.mark.slow),
+        *(
+            pytest.param(name, projection, "all", marks=pytest.mark.slow)
+            for name in CLIPS
+            for projection in ("perspective", "orthographic")
+        ),
+    ],
+)
+def test_point_samples_are_those_of_the_reference(name, projection, parts):
+    shown, settings = scene(CLIPS[name], parts), js.Settings(samples=32, integrator="samples")
+    image, truth = js.render(shown, camera(projection), settings), js.reference.render(shown, camera(projection), settings)
+    assert 0.05 < float(truth.alpha.mean()) < 0.98
+    assert (worst(image, truth) < 2e-5).mean() > 0.99  # a sample on a face is inside or not
+    spent, of_all = (js.render(each, camera(projection), settings).stats["evaluations"] for each in (shown, scene(None, parts)))
+    assert spent <= of_all if name == "outside" else spent < of_all  # what is cut out of the middle may be less than a slab
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "parts"), [("both", "particles"), *((name, "all") for name in CLIPS)])
+def test_segments_err_about_as_without_faces_and_as_fast_less(name, parts):
+    """Where rays enter and leave is located: half as long segments err a third as much, as they do in a smooth field.
+
+    Faces lay bare what would be hidden, so that errors may be up to twice those of the whole.
+    """
+    view = camera()
+    truth = js.reference.integral(scene(CLIPS[name], parts), view, tolerance=1e-6)
+    free = js.reference.integral(scene(None, parts), view, tolerance=1e-6)
+    errors = {}
+    for samples in (24, 48):
+        settings = js.Settings(samples=samples, integrator="segments")
+        clipped = worst(js.render(scene(CLIPS[name], parts), view, settings), truth)
+        whole = worst(js.render(scene(None, parts), view, settings), free)
+        errors[samples] = clipped.mean(), whole.mean()
+    assert errors[48][0] < 2 * errors[48][1] + 1e-5
+    assert errors[48][0] < 0.5 * errors[24][0]
+
+
+@pytest.mark.parametrize("samples", [5, pytest.param(33, marks=pytest.mark.slow)])
+def test_a_slab_of_constant_extinction_is_cut_to_the_digit(samples):
+    """By planes: what is left of the light is an exponential of the way between them, however long segments are."""
+    particles = js.Particles.from_arrays(np.zeros((1, 3)), 10.0, 0.5)
+    even = js.TransferFunction.from_points([0.0, 1.0], [[1, 1, 1]] * 2, [0.7, 0.7])
+    slab = js.Plane((0, 0, 0.123), (0, 0, 1)) & js.Plane((0, 0, 0.821), (0, 0, -1))
+    view = js.Camera.orthographic(eye=(0, 0, -2), target=(0, 0, 0), width=8, height=8, near=0.5, far=4.0, view_height=1.0)
+    made = js.Scene(particles=particles, transfer=even, within=slab)
+    image = js.render(made, view, js.Settings(samples=samples, integrator="segments"))
+    np.testing.assert_allclose(image.transmittance, np.exp(-0.7 * 0.698), rtol=2e-6)
+    outside = js.render(dataclasses.replace(made, within=~slab), view, js.Settings(samples=samples, integrator="segments"))
+    np.testing.assert_allclose(outside.transmittance, np.exp(-0.7 * (3.5 - 0.698)), rtol=2e-6)
+
+
+@pytest.mark.slow
+def test_moving_a_face_compiles_nothing():
+    shown, settings = scene(PLANE), js.Settings(samples=24, integrator="samples")
+    plan = js.plan(shown, camera(), settings)
+    draw = jax.jit(lambda clip: js.render(dataclasses.replace(shown, within=clip), camera(), settings, plan=plan).color)
+    images = [draw(js.Plane((0.1 * k, 0, 0), (1, 0, k))) for k in range(3)]
+    assert draw._cache_size() == 1
+    assert float(jnp.abs(images[0] - images[2]).max()) > 0.05
+
+
+@pytest.mark.slow
+def test_one_of_several_media_may_be_clipped_by_itself():
+    """Wrapped, where the scene is not."""
+    rng = np.random.default_rng(0)
+    ball = js.in_octree(js.Scene(points=js.Points.from_arrays(rng.uniform(-0.5, 0.5, (20, 3)), 0.3, (1, 1, 1), opacity=0.9)))
+    settings = js.Settings(samples=24, integrator="samples")
+    alone = js.Scene(media=(js.Within(ball.media[0], BOX),))
+    together = dataclasses.replace(ball, within=BOX)
+    images = [js.render(one, camera(), settings) for one in (alone, together)]
+    np.testing.assert_allclose(images[1].color, images[0].color, atol=1e-6)
+    beside = js.Within(ball.media[0], js.Box((0.7, 0.7, 0.7), (0.8, 0.8, 0.8)))
+    assert float(images[0].alpha.max()) > 0.5 > float(js.render(js.Scene(media=(beside,)), camera(), settings).alpha.max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["samples", "segments"])
+def test_derivatives_are_those_of_differences(x64, integrator):
+    """By particles, by the camera's eye and, of segments, by the place of a plane, which samples are in or not."""
+    rng = np.random.default_rng(1)
+    particles = js.Particles.from_arrays(rng.uniform(-1, 1, (80, 3)), 0.6, rng.uniform(0, 1, 80))
+    settings = js.Settings(samples=24, integrator=integrator)
+    view = js.Camera.look_at(np.array([1.4, 1.1, -2.6]), np.zeros(3), width=8, height=8, near=1.2, far=5.0)
+    made = js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: leaf.astype(float), TRANSFER))
+    clip = js.Plane(np.array([0.1, 0.2, -0.1]), np.array([1, 0.4, -2.0])) & ~js.Sphere(np.array([0.2, 0, 0.1]), 0.4)
+    plan = js.plan(dataclasses.replace(made, within=clip), view, settings)
+
+    def light(position, point, half_height):
+        inner = dataclasses.replace(clip, first=dataclasses.replace(clip.first, point=point))
+        moved = dataclasses.replace(made, particles=dataclasses.replace(particles, position=position), within=inner)
+        image = js.render(moved, dataclasses.replace(view, half_height=half_height), settings, plan=plan)
+        return (image.color * jnp.arange(1.0, 4.0)).sum() + image.transmittance.sum()
+
+    at = particles.position, clip.first.point, view.half_height
+    both = jax.jit(jax.value_and_grad(light, (0, 1, 2)))
+    gradients, step = both(*at)[1], 1e-6
+    for k, gradient in enumerate(gradients):
+        way = jnp.asarray(rng.normal(size=at[k].shape))
+        ends = [both(*(leaf + sign * step * way if i == k else leaf for i, leaf in enumerate(at)))[0] for sign in (1, -1)]
+        if integrator == "samples" and k > 0:
+            assert k == 2 or not np.asarray(gradient).any()
+            continue
+        np.testing.assert_allclose((gradient * way).sum(), (ends[0] - ends[1]) / (2 * step), rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "how", [{"tolerance": 0.05}, {"tolerance": 0.02, "super_pixels": False}, {"tolerance": 0.004, "estimator": "pilot"}], ids=str
+)
+def test_a_tolerance_is_kept_where_faces_cut(how):
+    """Bounds are theorems: cells that a face may cross are at full rate, and others are as they were."""
+    rng = np.random.default_rng(0)
+    position = rng.uniform(0, 1, (400, 3))
+    particles = js.Particles.from_arrays(position, 0.35, position[:, 0] + 0.1 * position[:, 1])
+    view = js.Camera.look_at(eye=(2, 1.8, 3), target=(0.5, 0.5, 0.5), width=64, height=64, near=1.2, far=5.0, fov_degrees=30)
+    clip = js.Plane((0.5, 0.5, 0.5), (1, 0.3, -0.5)) & ~js.Sphere((0.5, 0.7, 0.4), 0.3)
+    made = js.Scene(particles=particles, transfer=TRANSFER, within=clip)
+    settings = js.Settings(samples=512, integrator="samples", **how)
+    full = js.render(made, view, dataclasses.replace(settings, tolerance=None))
+    image = js.render(made, view, settings)
+    error = worst(image, jax.tree.map(np.asarray, full))
+    assert image.stats["evaluations"] < full.stats["evaluations"]
+    assert error.max() <= settings.tolerance
+    if image.certified:
+        assert (error <= np.asarray(image.error_bound)).all()
+
+
+def test_slabs_that_a_clip_does_not_meet_are_not_marched():
+    count = jnp.asarray([[3, 2], [4, 0], [5, 1]], jnp.int32)
+    level = jnp.asarray([[0, 0], [0, 0], [2, 0]], jnp.int32)
+    schedule = SlabSchedule(count > 0, level, count[None], count[None], count, jnp.zeros((3, 2)))
+    meets = jnp.asarray([[False, True], [True, True]])
+    found = clipped(schedule, meets)
+    assert np.array_equal(found.filled, [[False, True], [True, False], [True, False]])  # wider ones are of cells inside
+    assert np.array_equal(found.count, [[0, 2], [4, 0], [5, 0]])
+    assert clipped(schedule, None) is schedule
+
+
+def test_a_cell_is_whole_where_all_of_its_slabs_are():
+    slabs = jnp.asarray([[True], [True], [True], [True], [True], [False]])
+    assert np.array_equal(whole_cells(slabs, 4), [[True], [False]])
+    assert np.array_equal(whole_cells(slabs[:5], 4), [[True], [True]])

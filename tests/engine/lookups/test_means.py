@@ -1,0 +1,194 @@
+"""Promises of means over ranges of the quantity: exact integrals of a piecewise linear function with jumps, for any range."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.lookups.means import MeanTables, mean_emission, mean_extinction
+
+COUNTS = (1, 2, 3, 6, 16, 17, 40, 70, 150)  # fixed shapes: few compilations
+WIDTHS = (0, 1e-7, 1e-5, 1e-3, 0.03, 0.3, 1, 3)
+
+
+@jax.jit
+def means(transfer, near, far):
+    tables = MeanTables.of(transfer.segments())
+    return jnp.stack([*mean_emission(tables, near, far, slice(0, 3)), mean_extinction(tables, near, far)], -1)
+
+
+def control_points(count, how, rng):
+    values = np.linspace(-1, 2, count) if how == "even" else np.sort(rng.uniform(-1, 2, count))
+    if how == "jumps":
+        repeated = rng.integers(1, max(count, 2), 1 + count // 4)
+        for k in np.sort(repeated[repeated < count]):
+            values[k] = values[k - 1]
+    return values.astype(np.float32).astype(np.float64)
+
+
+def made(count, how, rng):
+    values = control_points(count, how, rng)
+    return js.TransferFunction.from_points(values, rng.uniform(0, 1, (count, 3)), rng.uniform(0, 5, count))
+
+
+def ranges(values, rng, number=16):
+    near = np.where(rng.uniform(size=number) < 0.3, rng.choice(values, number), rng.uniform(-1.5, 2.5, number))
+    far = near + rng.choice(WIDTHS, number) * rng.uniform(-1, 1, number)
+    return near.astype(values.dtype), far.astype(values.dtype)
+
+
+def lines(transfer):
+    """Control points between infinities, and per piece (start, width) and rows at both ends."""
+    values = np.asarray(transfer.values, np.float64)
+    rows = np.concatenate([transfer.colors, np.asarray(transfer.extinction)[:, None]], 1).astype(np.float64)
+    return np.concatenate([[-np.inf], values, [np.inf]]), np.concatenate([rows[:1], rows, rows[-1:]])
+
+
+def optics_in(edges, rows, k, q):
+    """Emission and extinction of piece k at q."""
+    inside = np.isfinite(edges[k]) and np.isfinite(edges[k + 1])
+    part = (q - edges[k]) / (edges[k + 1] - edges[k]) if inside else 0.0
+    value = rows[k] * (1 - part) + rows[k + 1] * part
+    return np.append(value[:3] * value[3], value[3])
+
+
+def exact(transfer, near, far):
+    """Simpson's rule is exact for the quadratics of each piece."""
+    edges, rows = lines(transfer)
+    result = np.zeros((*near.shape, 4))
+    for n, (lo, hi) in enumerate(zip(np.minimum(near, far).astype(float), np.maximum(near, far).astype(float), strict=True)):
+        if lo == hi:
+            result[n] = optics_in(edges, rows, np.searchsorted(edges, lo, "right") - 1, lo)
+            continue
+        for k in range(np.searchsorted(edges, lo, "right") - 1, np.searchsorted(edges, hi)):
+            a, b = max(lo, edges[k]), min(hi, edges[k + 1])
+            if a < b:
+                values = [optics_in(edges, rows, k, q) for q in (a, (a + b) / 2, b)]
+                result[n] += (values[0] + 4 * values[1] + values[2]) / 6 * ((b - a) / (hi - lo))
+    return result
+
+
+def close_by(transfer, near, far, moved):
+    """Least and largest mean with ends off by some roundings of the control points: what the accuracy is stated by."""
+    values = np.asarray(transfer.values, np.float64)
+
+    def around(end):
+        closest = values[np.abs(values - end[:, None]).argmin(1)]  # an extremum, maybe
+        return [end - moved, end, end + moved, np.clip(closest, end - moved, end + moved)]
+
+    ends = [(a, b) for a in around(near) for b in around(far)]
+    every = np.stack([exact(transfer, *pair) for pair in ends])
+    return every.min(0), every.max(0)
+
+
+draws = given(
+    count=st.sampled_from(COUNTS),
+    how=st.sampled_from(["even", "uneven", "jumps"]),
+    seed=st.integers(0, 10**6),
+)
+
+
+@settings(max_examples=20, deadline=None)
+@draws
+def test_means_are_those_of_the_exact_integral_in_float64(count, how, seed):
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(seed)
+        transfer = made(count, how, rng)
+        near, far = ranges(np.asarray(transfer.values), rng)
+        low, high = close_by(transfer, near, far, 1e-13)
+        got = np.asarray(means(transfer, near, far))
+        assert (got >= low * (1 - 1e-13) - 1e-14).all()
+        assert (got <= high * (1 + 1e-13) + 1e-14).all()
+
+
+@pytest.mark.slow
+@settings(max_examples=20, deadline=None)
+@draws
+def test_float32_is_right_for_ends_moved_by_a_few_roundings(count, how, seed):
+    rng, eps = np.random.default_rng(seed), np.finfo(np.float32).eps
+    transfer = made(count, how, rng)
+    near, far = ranges(np.asarray(transfer.values), rng)
+    rows = lines(transfer)[1]
+    largest = np.append(rows[:, :3].max(0) * rows[:, 3].max(), rows[:, 3].max())
+    low, high = close_by(transfer, near.astype(float), far.astype(float), 16 * eps)
+    got = np.asarray(means(transfer, near, far))
+    assert (got >= low - 8 * eps * largest).all()
+    assert (got <= high + 8 * eps * largest).all()
+
+
+@settings(max_examples=20, deadline=None)
+@draws
+def test_a_constant_stays_itself(count, how, seed):
+    rng = np.random.default_rng(seed)
+    values = np.float32(control_points(count, how, rng))
+    colors, extinction = np.float32(rng.uniform(0, 1, 3)), np.float32(rng.uniform(0, 5))
+    transfer = js.TransferFunction.from_points(values, np.tile(colors, (count, 1)), np.full(count, extinction))
+    got = np.asarray(means(transfer, *ranges(values, rng)), np.float64)
+    want = np.append(colors.astype(float) * extinction, extinction)
+    rounded = 2 if count > 16 or count < 3 else 3  # a rounding for each piece that is met
+    assert np.abs(got / want - 1).max() <= rounded * np.finfo(np.float32).eps
+
+
+@settings(max_examples=20, deadline=None)
+@draws
+def test_means_lie_between_least_and_largest_values_of_the_range(count, how, seed):
+    rng, eps = np.random.default_rng(seed), np.finfo(np.float32).eps
+    transfer = made(count, how, rng)
+    near, far = ranges(np.asarray(transfer.values), rng)
+    edges, rows = lines(transfer)
+    got = np.asarray(means(transfer, near, far))[:, 3]
+    for value, lo, hi in zip(got, np.minimum(near, far) - 16 * eps, np.maximum(near, far) + 16 * eps, strict=True):
+        pieces = [k for k in range(len(edges) - 1) if max(lo, edges[k]) <= min(hi, edges[k + 1])]
+        ends = [optics_in(edges, rows, k, np.clip(q, edges[k], edges[k + 1]))[3] for k in pieces for q in (lo, hi) if
+                edges[k] < edges[k + 1]]  # fmt: skip
+        assert min(ends) - 4 * eps * rows[:, 3].max() <= value <= max(ends) + 4 * eps * rows[:, 3].max()
+
+
+@pytest.mark.parametrize("extra", [0, 20])
+def test_at_a_jump_the_later_point_holds_and_a_range_across_has_shares_of_both(extra):
+    values = np.concatenate([[0, 0.5, 0.5, 1], 1 + np.arange(1, extra + 1)])
+    extinction = np.concatenate([[1, 1, 7, 7], np.full(extra, 7)])
+    transfer = js.TransferFunction.from_points(values, np.zeros((len(values), 3)), extinction)
+    got = means(transfer, np.float32([0.5, 0.25, 0.75]), np.float32([0.5, 0.75, 0.0]))[:, 3]
+    np.testing.assert_allclose(got, [7, 4, 3], rtol=3e-5)
+
+
+@pytest.mark.parametrize("count", [1, 5, 40])
+@pytest.mark.parametrize("how", ["even", "uneven"])
+def test_what_lies_beyond_the_control_points_counts_with_its_true_length(count, how):
+    transfer = made(count, how, np.random.default_rng(1))
+    near, far = np.float32([-1e30, -7, 1e30, np.inf, 3e38]), np.float32([3e30, 11, 2e30, np.inf, 3e38])
+    got = np.asarray(means(transfer, near, far))
+    near, far = np.minimum(near, np.float32(3e38)), np.minimum(far, np.float32(3e38))
+    np.testing.assert_allclose(got, exact(transfer, near.astype(float), far.astype(float)), rtol=2e-6)
+
+
+@pytest.mark.parametrize("count", [5, 40])
+@pytest.mark.parametrize("unit", [1e-30, 1e-12, 1e12, 1e30])
+def test_units_of_the_quantity_do_not_matter(count, unit):
+    rng = np.random.default_rng(2)
+    values, colors, extinction = control_points(count, "uneven", rng), rng.uniform(0, 1, (count, 3)), rng.uniform(0, 5, count)
+    near, far = rng.uniform(-1, 2, (2, 50))
+    one = means(js.TransferFunction.from_points(values, colors, extinction), np.float32(near), np.float32(far))
+    other = js.TransferFunction.from_points(values * unit, colors, extinction)
+    np.testing.assert_allclose(means(other, np.float32(near * unit), np.float32(far * unit)), one, rtol=1e-4)
+
+
+@pytest.mark.parametrize("count", [5, 40])
+def test_order_of_ends_does_not_matter_and_channels_are_those_selected(count):
+    rng = np.random.default_rng(3)
+    tables = MeanTables.of(made(count, "even", rng).segments())
+    near, far = np.float32(rng.uniform(-2, 3, (2, 4, 5, 6)))
+    both = mean_emission(tables, near, far, slice(0, 3))
+    assert np.array_equal(mean_extinction(tables, near, far), mean_extinction(tables, far, near))
+    assert len(both) == 3
+    assert both[0].shape == near.shape
+    np.testing.assert_allclose(mean_emission(tables, near, far, slice(2, 3))[0], both[2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [5, 40])
+def test_nan_in_gives_nan_out_and_no_crash(count):
+    assert np.isnan(means(made(count, "uneven", np.random.default_rng(4)), np.float32([np.nan]), np.float32([0]))).all()

@@ -1,0 +1,132 @@
+"""Programs are compiled once for the shapes they are given, the least recently used are let go and free what they held."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from jaxsph.engine.runtime import memory_maps
+from jaxsph.engine.runtime.executors import Clock, Forecast, Unforeseen
+from jaxsph.engine.runtime.programs import Programs, compiled_quickly, shapes_of
+
+traces = []
+
+
+@jax.jit
+def double(value):
+    traces.append(value.shape)
+    return 2 * value
+
+
+@compiled_quickly
+@jax.jit
+def settle(value):
+    """Some kernels, in a loop, so that memory maps are seen to come and go."""
+    return jax.lax.fori_loop(0, 3, lambda _, x: jnp.sort(x)[::-1] + jnp.cumsum(jnp.sin(x)), value)
+
+
+@pytest.fixture(autouse=True)
+def no_traces():
+    traces.clear()
+
+
+def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
+    clock = Clock(Programs())
+    for value, wanted in ((jnp.ones(3), 1), (jnp.zeros(3), 1), (jnp.ones(4), 2), (jnp.ones(3, jnp.int32), 3), (jnp.ones(3), 3)):
+        assert clock.one("cast", double, (value,)).shape == value.shape
+        assert len(traces) == wanted
+
+
+def test_the_least_recently_used_programs_are_let_go():
+    clock = Clock(Programs(most=2))
+    for size in (1, 2, 1, 3, 1, 2):
+        clock.one("cast", double, (jnp.ones(size),))
+    assert traces == [(1,), (2,), (3,), (2,)], "1 is used all the time and never compiled again"
+
+
+def test_programs_that_are_let_go_give_their_memory_maps_back():
+    """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function."""
+    programs = Programs()
+    Clock(programs).one("cast", settle, (jnp.ones(5),))
+    programs.clear()
+    gc.collect()
+    before = memory_maps.in_use() or 0
+    for size in range(10, 20):
+        Clock(programs).one("cast", settle, (jnp.ones(size),))
+    held = (memory_maps.in_use() or 0) - before
+    programs.clear()
+    gc.collect()
+    left = (memory_maps.in_use() or 0) - before
+    assert held >= 10 * 3 or memory_maps.in_use() is None
+    assert left <= held // 5
+
+
+def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch):
+    programs = Programs()
+    Clock(programs).one("cast", double, (jnp.ones(7),))
+    monkeypatch.setattr(memory_maps, "limit", lambda: 1)
+    monkeypatch.setattr(memory_maps, "in_use", lambda: 1)
+    with pytest.warns(UserWarning, match="memory maps"):
+        Clock(programs).one("cast", double, (jnp.ones(8),))
+    assert len(programs) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert float(Clock(programs).one("cast", double, (jnp.ones(9),)).sum()) == 18
+
+
+def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory_maps, "LIMIT", tmp_path / "absent")
+    monkeypatch.setattr(memory_maps, "IN_USE", tmp_path / "absent")
+    assert memory_maps.in_use() is None and memory_maps.limit() is None and not memory_maps.crowded()
+
+
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_results_come_in_the_order_of_inputs(number):
+    clock = Clock(Programs())
+    found = clock.each("cast", double, [(jnp.float32(k),) for k in range(number)])
+    assert [float(value) for value in found] == [2 * k for k in range(number)]
+    assert clock.seconds["cast"] > 0 and clock.seconds["grid"] == 0
+
+
+def test_what_was_foreseen_is_not_compiled_again():
+    programs = Programs()
+    value = jnp.ones(6)
+    shape = Forecast((), programs).one("cast", double, (Forecast((), programs).one("cast", double, shapes_of((value,))),))
+    assert shape.shape == (6,) and len(traces) == 1
+    clock = Clock(programs)
+    assert float(clock.one("cast", double, (clock.one("cast", double, (value,)),)).sum()) == 24
+    assert len(traces) == 1
+
+
+def test_a_flag_that_is_not_known_ends_a_forecast_until_it_is():
+    seen = []
+
+    def draw(known):
+        run = Forecast(known, Programs())
+        seen.append("begun")
+        seen.append(run.may_hold(jnp.bool_(True)))
+
+    clock = Clock(Programs())
+    clock.foresee(draw)
+    assert clock.may_hold(jnp.bool_(False)) is False
+    assert seen == ["begun", "begun", False]
+    with pytest.raises(Unforeseen):
+        Forecast().may_hold(jnp.bool_(True))
+
+
+def test_a_program_that_cannot_be_compiled_is_tried_again():
+    @jax.jit
+    def broken(value):
+        traces.append(value.shape)
+        if len(traces) == 1:
+            raise RuntimeError("no luck")
+        return value
+
+    clock = Clock(Programs())
+    with pytest.raises(RuntimeError, match="no luck"):
+        clock.one("cast", broken, (jnp.ones(3),))
+    assert clock.one("cast", broken, (jnp.ones(3),)).shape == (3,)

@@ -1,0 +1,59 @@
+"""From wanted pixels to packets: each is cast once, and what is room is never painted."""
+
+from __future__ import annotations
+
+import types
+
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from jaxsph.engine.access.lists import BUNDLE, ListPlan, bundle_origins
+from jaxsph.engine.screen.packets import SCATTERED, by_bundle, queued, scattered, whole
+
+LISTS = ListPlan(2, 2, 1, 1)
+SHAPE = 29, 27  # less than the band
+PACKETS = 3  # which do not divide the bundles
+
+
+def corners():
+    row, column = bundle_origins(LISTS, 0)
+    return types.SimpleNamespace(row=row, column=column)
+
+
+def cast(queue, pick):
+    """How often each pixel of the image is cast, and the packets."""
+    count, parts = np.zeros(SHAPE[0] * SHAPE[1] + 1, int), []
+    for turn in range(-(-int(queue.number) // PACKETS)):
+        chosen = pick(queue, jnp.int32(turn * PACKETS), PACKETS)
+        pixel = np.asarray(chosen.pixels(corners(), SHAPE))
+        real = np.asarray(chosen.real).T
+        assert (pixel[~real] == SHAPE[0] * SHAPE[1]).all(), "room is painted past the last pixel"
+        np.add.at(count, pixel.ravel(), 1)
+        parts += [bundle for bundle, some in zip(np.asarray(chosen.bundle), real.any(1), strict=True) if some]
+    return count[:-1].reshape(SHAPE), parts
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 2, 15, 16, 17, 40, 64]), min_size=16, max_size=16))
+@example(0, [0] * 16)
+@example(0, [SCATTERED] * 16)
+@example(0, [BUNDLE * BUNDLE] * 16)
+def test_every_wanted_pixel_is_in_exactly_one_packet(seed, counts):
+    """Of those bundles have so many; none is in two, and scattered packets hold no other."""
+    rng = np.random.default_rng(seed)
+    wanted = np.stack([rng.permutation(BUNDLE * BUNDLE) < count for count in counts])
+    image = np.asarray(LISTS.as_image(wanted.reshape(-1, BUNDLE, BUNDLE)))[: SHAPE[0], : SHAPE[1]]
+    apart, together = queued(by_bundle(LISTS, jnp.asarray(image)))
+    (few, parts), (many, wholes) = cast(apart, scattered), cast(together, whole)
+    assert ((few + many)[image] == 1).all()
+    assert (few[~image] == 0).all() and many.max(initial=0) <= 1
+    assert len(set(parts)) == len(parts) and len(set(wholes)) == len(wholes) and not set(parts) & set(wholes)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_bundles_of_an_image_lie_as_they_do_in_it(seed):
+    image = np.random.default_rng(seed).uniform(size=SHAPE) < 0.5
+    back = np.asarray(LISTS.as_image(by_bundle(LISTS, jnp.asarray(image)).reshape(-1, BUNDLE, BUNDLE)))
+    np.testing.assert_array_equal(back[: SHAPE[0], : SHAPE[1]], image)
+    assert not back[SHAPE[0] :].any() and not back[:, SHAPE[1] :].any()

@@ -1,0 +1,125 @@
+"""What an image says of itself: after a fault nothing is certified, and no error is told that is not known."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.engine.frame.claims import faults_of_settings
+from jaxsph.numerics import faults
+
+ALL = [bit for bit in faults.MESSAGES if not bit & faults.TOLD]
+
+
+@pytest.fixture(scope="module")
+def drawn(frames):
+    """A jitted frame of a plan with little room, a transfer function and an extent that may be anything."""
+    rng = np.random.default_rng(3)
+    scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
+    plan = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, list_capacity=96))
+
+    @jax.jit
+    def draw(grown, change, at):
+        particles = dataclasses.replace(scene.particles, support=scene.particles.support * grown)
+        look = dataclasses.replace(scene.transfer, colors=scene.transfer.colors.at[at, 0].add(change))
+        look = dataclasses.replace(look, extinction=look.extinction.at[at].add(change))
+        return js.render(js.Scene(particles=particles, transfer=look), camera, frames.settings, plan=plan)
+
+    return draw
+
+
+@given(
+    st.sampled_from([0.01, 0.1, 1.0, 3.0]),
+    st.sampled_from([0.0, 1e-9, 0.3, -0.3, 5.0, -5.0, np.nan, np.inf]),
+    st.integers(0, 4),
+)
+def test_no_image_with_a_fault_is_certified_and_its_bound_is_1(drawn, grown, change, at):
+    image = drawn(grown, change, at)
+    faulty = int(image.faults) != 0
+    assert bool(image.certified) != faulty
+    assert (np.asarray(image.error_bound) == (1 if faulty else 0)).all()
+    assert np.isfinite(image.color).all() and bool(image.fault_messages) == faulty
+    if not np.isfinite(change) or abs(change) >= 5 or grown == 3:
+        assert faulty
+
+
+def test_under_vmap_each_image_is_judged_alone(drawn):
+    images = jax.vmap(drawn, (0, None, None))(jnp.array([0.01, 3.0, 0.01]), 0.0, 0)
+    assert np.asarray(images.certified).tolist() == [True, False, True]
+    assert np.asarray(images.error_bound).max((1, 2)).tolist() == [0, 1, 0]
+    with pytest.raises(js.CapacityError, match="too small"):
+        images.check()
+
+
+@given(
+    st.sampled_from([None, 0.0, 0.01, -0.01, np.nan, np.inf]),
+    st.sampled_from([0.0, 1.0, -0.1, 2.0, np.nan]),
+    st.sampled_from([0.0, 0.005, 0.01, 0.5, 1.5, -1.0, np.nan]),
+)
+@settings(max_examples=200)
+def test_traced_numbers_are_faults_where_known_ones_are_refused(tolerance, relax, least):
+    values = {"tolerance": tolerance, "relax": relax, "min_transmittance": least}
+    try:
+        given, refused = js.Settings(**values), False
+    except ValueError:
+        given, refused = js.Settings(tolerance=None if tolerance is None else 0.1), True
+    given = jax.tree.unflatten(jax.tree.structure(given), [value for value in values.values() if value is not None])
+    assert bool(jax.jit(faults_of_settings)(given)) == refused
+    if refused:
+        with pytest.raises(ValueError, match="must"):
+            given.require_numbers()
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_a_traced_tolerance_out_of_range_certifies_nothing(frames, value):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    plan = js.plan(scene, camera, dataclasses.replace(frames.settings, tolerance=0.05))
+    image = _by_tolerance(scene, camera, value, plan, frames.samples)
+    assert int(image.faults) == faults.BAD_SETTINGS and not image.certified and (np.asarray(image.error_bound) == 1).all()
+    kept = _by_tolerance(scene, camera, 0.05, plan, frames.samples)
+    assert not int(kept.faults) and kept.certified and np.asarray(kept.error_bound).max() <= 0.05
+
+
+def _by_tolerance(scene, camera, tolerance, plan, samples):
+    return _BY_TOLERANCE(scene, camera, tolerance, plan, samples)
+
+
+_BY_TOLERANCE = jax.jit(
+    lambda scene, camera, tolerance, plan, samples: js.render(
+        scene, camera, js.Settings(samples=samples, tolerance=tolerance), plan=plan
+    ),
+    static_argnums=4,
+)
+
+
+def test_only_point_samples_know_their_error_at_full_rate(frames):
+    rng = np.random.default_rng(1)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    reference = js.render(scene, camera, frames.settings)
+    assert reference.certified and (np.asarray(reference.error_bound) == 0).all()
+    image = js.render(scene, camera, dataclasses.replace(frames.settings, integrator="segments"))
+    assert not image.certified and np.isnan(image.error_bound).all() and not image.faults
+
+
+@pytest.mark.parametrize("bit", ALL)
+def test_every_fault_has_words_and_is_raised_by_check(bit):
+    layer = np.zeros((2, 2), np.float32)
+    image = js.Image(np.zeros((2, 2, 3), np.float32), layer, layer, layer, layer, False, bit, {})
+    assert image.fault_messages == (faults.MESSAGES[bit],)
+    with pytest.raises(ValueError, match="this frame") as raised:
+        image.check()
+    assert isinstance(raised.value, js.CapacityError) == bool(bit & faults.OVERFLOWS)
+    fine = dataclasses.replace(image, faults=faults.TOLERANCE_MISSED)
+    assert fine.check() is fine and len(fine.fault_messages) == 1
+
+
+def test_an_image_that_is_traced_cannot_be_checked(frames):
+    layer = np.zeros((2, 2), np.float32)
+    with pytest.raises(ValueError, match="outside"):
+        jax.jit(lambda word: js.Image(layer, layer, layer, layer, layer, False, word, {}).check())(0)

@@ -1,0 +1,233 @@
+"""Similar frames share a plan, and with it what is compiled; whatever was rendered before, an image is the same."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.planning.fit import PLANS, Plans, shape_of
+from jaxsph.engine.planning.plan import next_class
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.programs import PROGRAMS
+from jaxsph.model import registry
+from jaxsph.model.medium import Medium
+from jaxsph.model.particles import capacity_class
+
+SETTINGS = js.Settings(samples=24)
+
+
+def snapshot(count: int, seed: int = 0, width: int = 40) -> tuple[js.Scene, js.Camera]:
+    """A cloud of so many particles, whose supports shrink as their number grows."""
+    rng = np.random.default_rng(seed)
+    position = rng.normal(size=(count, 3)) * 0.3
+    particles = js.Particles.from_arrays(position, 2.0 * count ** (-1 / 3), position[:, 0])
+    transfer = js.TransferFunction.from_points([-0.5, 0.5], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])
+    camera = js.Camera.look_at((0, 0, 3), (0, 0, 0), width=width, height=30, near=1.5, far=4.5)
+    return js.Scene(particles=particles, transfer=transfer), camera
+
+
+@pytest.fixture
+def plans():
+    """No plans kept from other tests, and none kept for them."""
+    PLANS.clear()
+    yield PLANS
+    PLANS.clear()
+
+
+@pytest.fixture
+def compiles():
+    """Counts the programs that begin to be compiled."""
+    count = []
+    PROGRAMS.on_compile(lambda: count.append(1))
+    yield count
+    PROGRAMS.on_compile(None)
+
+
+def same(one: js.Image, other: js.Image) -> bool:
+    return all((np.asarray(a) == np.asarray(b)).all() for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=False))
+
+
+@pytest.mark.slow
+def test_snapshots_whose_number_drifts_by_a_fifth_compile_at_most_three_times(plans, compiles):
+    """Up and down by steps that no two frames share, from the middle of a capacity class on."""
+    drift = 1 + 0.1 * np.sin(np.linspace(0, 4 * np.pi, 40))
+    frames = 0
+    for nth, count in enumerate((2000 * drift).astype(int)):
+        before = len(compiles)
+        image = js.render(*snapshot(count, seed=nth), SETTINGS)
+        assert float(image.alpha.max()) > 0.5
+        frames += len(compiles) > before
+    assert 1 <= frames <= 3
+
+
+@pytest.mark.slow
+def test_an_image_does_not_depend_on_what_was_rendered_before(plans):
+    scene, camera = snapshot(1000)
+    fresh = js.render(scene, camera, SETTINGS)
+    js.render(*snapshot(capacity_class(1000) + 1), SETTINGS)
+    plans.clear()
+    js.render(*snapshot(capacity_class(1000) + 1, seed=3), SETTINGS)
+    after = js.render(scene, camera, SETTINGS)
+    for name in ("color", "transmittance", "depth", "evaluations"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(fresh, name))
+    assert {**after.stats, "seconds": 0} == {**fresh.stats, "seconds": 0}
+
+
+def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans):
+    scene, camera = snapshot(1000)
+    js.render(scene, camera, SETTINGS)
+    (kept,) = plans._kept
+    assert plans._similar(shape_of(Request.of(scene, camera, SETTINGS))).num_particles == kept.num_particles
+    smaller = snapshot(kept.num_particles // 2)[0]
+    assert plans._similar(shape_of(Request.of(smaller, camera, SETTINGS))).num_particles == smaller.particles.capacity
+    narrow = dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1))
+    assert not narrow.serves(kept) and kept.serves(narrow)
+    assert not dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1 << 20)).is_near(kept)
+
+
+def test_the_oldest_plans_are_let_go(monkeypatch):
+    monkeypatch.setattr("jaxsph.engine.planning.fit.MAX_KEPT", 2)
+    plans = Plans()
+    made = [js.plan(*snapshot(100, width=width), SETTINGS) for width in (20, 30, 40)]
+    for plan in (*made[:2], made[0], made[2]):
+        plans._keep(plan)
+    assert plans._kept == [made[0], made[2]]
+
+
+def test_like_grows_a_plan_and_gives_it_back_where_it_has_room():
+    small, large = snapshot(500), snapshot(2000, seed=1)
+    plan = js.plan(*small, SETTINGS)
+    assert js.plan(*small, SETTINGS, like=plan) is plan
+    grown = js.plan(*large, SETTINGS, like=plan)
+    assert grown.num_particles == large[0].particles.capacity and grown.cast == plan.cast
+    assert grown.lists.list_capacity >= js.plan(*large, SETTINGS).lists.list_capacity
+    assert js.plan(*small, SETTINGS, like=grown) is grown
+    with pytest.raises(js.CapacityError, match="too small"):
+        tight = dataclasses.replace(grown, lists=dataclasses.replace(grown.lists, tile_capacity=1, list_capacity=1))
+        js.render(*large, SETTINGS, plan=tight)
+
+
+@pytest.mark.slow
+def test_one_plan_serves_smaller_frames_with_the_same_image(plans):
+    """Eagerly and under jit: particles are padded to the plan, and room changes no bit."""
+    small, large = snapshot(500), snapshot(2000, seed=1)
+    plan = js.plan(*large, SETTINGS, like=js.plan(*small, SETTINGS))
+    alone = js.render(*small, SETTINGS, plan=js.plan(*small, SETTINGS))
+    shared = js.render(*small, SETTINGS, plan=plan)
+    np.testing.assert_array_equal(shared.color, alone.color)
+    traced = jax.jit(lambda scene: js.render(scene, small[1], SETTINGS, plan=plan).color)(small[0])
+    np.testing.assert_allclose(traced, alone.color, atol=1e-6)
+
+
+@pytest.mark.parametrize("settings", [{"tolerance": 0.1, "estimator": "pilot"}, {"tolerance": 0.1}, {"samples": 25}])
+def test_like_is_of_the_same_image_and_error_control(settings):
+    plan = js.plan(*snapshot(100), SETTINGS)
+    with pytest.raises(ValueError, match=r"`plan` was made for .*make a new one"):
+        js.plan(*snapshot(100), dataclasses.replace(SETTINGS, **settings), like=plan)
+
+
+def test_a_plan_checks_its_own_choices_no_less_than_those_of_the_frame():
+    """Lattices and coverage are the plan's to choose; merging, super-pixels and allocation are the user's."""
+    scene, camera = snapshot(100)
+    settings = js.Settings(samples=24, tolerance=0.1)
+    plan = js.plan(scene, camera, settings)
+    for change in ({"merge": False}, {"super_pixels": False}, {"allocation": "greedy"}, {"estimator": "pilot"}):
+        with pytest.raises(ValueError, match="`plan` was made for"):
+            js.render(scene, camera, dataclasses.replace(settings, **change), plan=plan)
+    with pytest.raises(ValueError, match=r"full rate"):
+        js.render(scene, camera, dataclasses.replace(settings, tolerance=None), plan=plan)
+
+
+@dataclasses.dataclass(frozen=True)
+class Nothing(Medium):
+    """A medium that is nowhere."""
+
+    def occupied(self, slabs):
+        return slabs.z_upper < slabs.z_lower
+
+    def extinction(self, gathered, task):
+        return 0 * task.depth[..., None], ()
+
+    def colors(self, samples, task, channels):
+        return [0 * task.depth[..., None]] * len(range(3)[channels])
+
+
+jax.tree_util.register_dataclass(Nothing, data_fields=[], meta_fields=[])
+
+
+@pytest.mark.parametrize("estimator", ["interval", "pilot"])
+def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypatch, estimator):
+    """By whatever is asked first: a plan, an image with one, or without."""
+    scene, camera = snapshot(100)
+    plan = js.plan(scene, camera, dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator))
+    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    with_medium = dataclasses.replace(scene, media=(Nothing(),))
+    for changed, choices, name in (
+        (with_medium, {}, r"`Scene\(media=\.\.\.\)`"),
+        (scene, {"screen": "again"}, "`screen='again'`"),
+        (scene, {"integrator": "again"}, "`integrator='again'`"),
+    ):
+        asked = dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator, **choices)
+        for attempt in (
+            js.plan,
+            js.render,
+            functools.partial(js.render, plan=plan),
+            jax.jit(functools.partial(js.render, plan=plan)),
+        ):
+            with pytest.raises(ValueError, match=f"`tolerance` does not cover {name} yet; give `tolerance=None`"):
+                attempt(changed, camera, asked)
+
+
+def least_of(attempt):
+    """The least memory that a refusal names."""
+    with pytest.raises(ValueError, match=r"`memory_limit` = 1000 bytes .* needs about (\d+) bytes") as refused:
+        attempt(dataclasses.replace(SETTINGS, memory_limit=1000))
+    return int(str(refused.value).split("needs about ")[1].split()[0])
+
+
+def test_the_least_memory_that_is_named_works_and_a_byte_less_does_not():
+    scene, camera = snapshot(700)
+    least = least_of(functools.partial(js.plan, scene, camera))
+    assert js.plan(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least)).bytes == least
+    with pytest.raises(ValueError, match=f"needs about {least} bytes"):
+        js.plan(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least - 1))
+
+
+def test_room_for_more_than_a_frame_needs_is_no_reason_to_refuse_it():
+    scene, camera = snapshot(700)
+    tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, scene, camera)))
+    assert js.plan(scene, camera, tight, headroom=1.5) == js.plan(scene, camera, tight)
+    assert Plans().for_frame(Request.of(scene, camera, tight), Clock())[0].bytes <= tight.memory_limit
+
+
+def test_the_room_of_an_earlier_frame_is_no_reason_to_refuse_the_next():
+    plans, frames = Plans(), [snapshot(count) for count in (880, 700)]
+    tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, *frames[1])))
+    plans.for_frame(Request.of(*frames[0], SETTINGS), Clock())
+    assert plans.for_frame(Request.of(*frames[1], tight), Clock())[0].bytes <= tight.memory_limit
+
+
+@pytest.mark.slow
+def test_at_full_rate_media_screens_and_integrators_are_free_to_choose(monkeypatch):
+    scene, camera = snapshot(100)
+    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    usual = js.render(scene, camera, SETTINGS)
+    other = dataclasses.replace(SETTINGS, screen="again", integrator="again")
+    plan = js.plan(scene, camera, other)
+    assert (plan.screen, plan.integrator) == ("again", "again")
+    image = js.render(dataclasses.replace(scene, media=(Nothing(),)), camera, other, plan=plan)
+    np.testing.assert_allclose(image.color, usual.color, atol=1e-6)
+    for choice in ({"screen": "pixels"}, {"integrator": "samples"}):
+        with pytest.raises(ValueError, match=f"`plan` was made for settings.{next(iter(choice))} = again, got"):
+            js.render(scene, camera, dataclasses.replace(other, **choice), plan=plan)
+
+
+@pytest.mark.parametrize("count", [1, 5, 100, 4097, 10**6])
+def test_the_next_class_is_the_least_larger_one(count):
+    assert capacity_class(count) < next_class(count) <= 1.25 * capacity_class(count) + 1

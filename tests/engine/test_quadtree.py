@@ -1,0 +1,232 @@
+"""Rays chosen by a quadtree: no pixel is over the tolerance, nothing is missed, and without a tolerance nothing is left out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, filled, towards, weights
+
+import jaxsph as js
+from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.runtime.programs import PROGRAMS
+from jaxsph.engine.screen.quadtree import QuadtreePlan
+
+QUADTREE = {"screen": "quadtree", "leaf_pixels": 8}
+ROUNDING = 1e-6
+
+
+@pytest.fixture(scope="module")
+def screened(frames):
+    """Settings and plan of a quadtree for all random frames, whose rays are cast in several turns."""
+    coarse = QuadtreePlan(8, "hierarchical", ListPlan(1, 1, 4 * frames.capacity, 16 * frames.capacity), 3)
+    plan = dataclasses.replace(frames.plan(), screen="quadtree", quadtree=coarse)
+    return dataclasses.replace(frames.settings, **QUADTREE), plan
+
+
+@pytest.fixture(scope="module")
+def tolerant(screened):
+    """The same with a tolerance: along rays there is none, so the plan is the same."""
+    return dataclasses.replace(screened[0], tolerance=0.02), screened[1]
+
+
+@pytest.fixture
+def compiles():
+    """Counts the programs that begin to be compiled."""
+    count = []
+    PROGRAMS.on_compile(lambda: count.append(1))
+    yield count
+    PROGRAMS.on_compile(None)
+
+
+def light(image):
+    return np.concatenate([image.color, np.asarray(image.transmittance)[..., None]], -1).astype(np.float64)
+
+
+def agree(image, truth):
+    np.testing.assert_allclose(light(image), light(truth), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(image.depth, truth.depth, rtol=1e-5)
+
+
+def cloud(frames, rng, supports=5.0, extinction=0.4):
+    """A smooth scene: all supports reach beyond what is seen, and colours are linear in the quantity."""
+    scene = frames.scene(rng)
+    particles = dataclasses.replace(scene.particles, support=jnp.full(frames.capacity, supports, jnp.float32))
+    points = np.linspace(0, 1, 5)
+    colors = np.stack([points, 0.5 + 0 * points, 1 - points], 1)
+    transfer = js.TransferFunction.from_points(points, colors, np.full(5, extinction))
+    return js.Scene(particles=particles, transfer=transfer)
+
+
+def specks(frames, rng, camera, pixels=0.8):
+    """As many particles as there is room for, each seen through a few pixels at most; far from each other in most cases."""
+    scene, height = frames.scene(rng), 2 * float(camera.half_height) * 3 / frames.height
+    support = jnp.full(frames.capacity, pixels * height, jnp.float32).at[8:].set(1e-3 * height)
+    transfer = dataclasses.replace(scene.transfer, extinction=jnp.full(5, 1e3, jnp.float32))
+    return js.Scene(dataclasses.replace(scene.particles, support=support), transfer)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distance", [3.0, 0.2])
+def test_without_a_tolerance_the_image_is_that_of_every_pixel(frames, screened, distance):
+    """From outside and from among the particles; what is no ray's is empty for certain."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scene, camera = frames.scene(rng, decades=2), frames.camera(rng, distance=distance)
+        image = js.render(scene, camera, screened[0], plan=screened[1])
+        truth = js.render(scene, camera, frames.settings, plan=frames.plan())
+        agree(image, truth)
+        assert not image.certified and float(np.abs(image.error_bound).max()) == 0
+        np.testing.assert_array_equal(np.asarray(image.evaluations)[np.asarray(truth.alpha) > 0] > 0, True)
+        assert image.stats["evaluations_full"] == truth.stats["evaluations"]
+
+
+def test_an_empty_scene_takes_no_ray(frames, screened):
+    rng = np.random.default_rng(0)
+    image = js.render(frames.scene(rng, count=0), frames.camera(rng), screened[0], plan=screened[1])
+    assert image.stats["rays"] == 0 and not np.asarray(image.alpha).any() and np.isinf(image.depth).all()
+
+
+def test_a_smooth_image_takes_few_rays_and_no_pixel_is_over_the_tolerance(frames, tolerant):
+    """An estimate, which is 0 where there was a ray."""
+    rays = []
+    for tolerance in (0.004, 0.01, 0.02):
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            scene, camera = cloud(frames, rng), frames.camera(rng)
+            settings = dataclasses.replace(tolerant[0], tolerance=tolerance)
+            image = js.render(scene, camera, settings, plan=tolerant[1])
+            truth = js.render(scene, camera, frames.settings, plan=frames.plan())
+            assert np.abs(light(image) - light(truth)).max() <= tolerance
+            assert not image.certified
+            cast, bound = np.asarray(image.evaluations) > 0, np.asarray(image.error_bound)
+            assert cast.sum() <= image.stats["rays"]  # a bundle that is cast whole has rays for pixels that had one
+            assert not bound[cast].any() and (cast.all() or bound.any())
+            rays.append(image.stats["rays"])
+    assert sum(rays[-4:]) <= 0.7 * 4 * frames.width * frames.height
+    assert sum(rays[:4]) >= sum(rays[4:8]) >= sum(rays[8:])
+
+
+def test_specks_smaller_than_a_leaf_are_never_missed(frames, tolerant):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        camera = frames.camera(rng)
+        scene = specks(frames, rng, camera)
+        truth = js.render(scene, camera, frames.settings, plan=frames.plan())
+        image = js.render(scene, camera, dataclasses.replace(tolerant[0], tolerance=0.3), plan=tolerant[1])
+        assert 0 < (np.asarray(truth.alpha) > 0.1).sum() < 100
+        assert np.abs(light(image) - light(truth)).max() <= 0.3
+
+
+def test_another_tolerance_pose_or_particle_compiles_nothing(frames, tolerant, compiles):
+    """However many rays that takes, in however many turns: here first in few, and of whole bundles alone."""
+    PROGRAMS.clear()
+    rng = np.random.default_rng(0)
+    js.render(cloud(frames, rng), frames.camera(rng), tolerant[0], plan=tolerant[1])
+    assert compiles
+    compiles.clear()
+    for tolerance, scene in ((0.001, frames.scene(rng)), (0.5, cloud(frames, rng)), (0.05, frames.scene(rng, decades=3))):
+        js.render(scene, frames.camera(rng), dataclasses.replace(tolerant[0], tolerance=tolerance), plan=tolerant[1])
+    assert not compiles
+
+
+@pytest.mark.slow
+def test_jit_equals_eager_at_any_tolerance(frames, tolerant):
+    traced = jax.jit(lambda *inputs: js.render(*inputs, plan=tolerant[1]), compiler_options=QUICKLY)
+    rng = np.random.default_rng(1)
+    scene, camera = cloud(frames, rng), frames.camera(rng)
+    for tolerance in (0.0, 0.02):
+        settings = dataclasses.replace(tolerant[0], tolerance=tolerance)
+        image, eager = traced(scene, camera, settings), js.render(scene, camera, settings, plan=tolerant[1])
+        agree(image, eager)
+        assert not bool(image.certified) and int(image.faults) == 0
+        assert float(image.stats["rays"]) == pytest.approx(eager.stats["rays"], rel=0.02)
+
+
+def narrow(height=37, width=1):
+    """An orthographic image, one pixel wide, in three bands."""
+    camera = js.Camera.orthographic((0.1, 0.2, -3), (0, 0, 0), view_height=2.0, width=width, height=height, near=1.3, far=4.7)
+    lists = ListPlan(1, -(-width // 16), 200, 600)
+    return camera, lists, QuadtreePlan(4, "hierarchical", ListPlan(-(-height // 32), 1, 200, 600), 4)
+
+
+@pytest.mark.slow
+def test_one_column_in_several_bands_orthographic(frames):
+    camera, lists, coarse = narrow()
+    size = {"width": camera.width, "height": camera.height, "lists": lists}
+    plan = dataclasses.replace(frames.plan(), bands=3, **size)
+    scene = frames.scene(np.random.default_rng(2))
+    truth = js.render(scene, camera, frames.settings, plan=plan)
+    settings = dataclasses.replace(frames.settings, screen="quadtree", leaf_pixels=4)
+    image = js.render(scene, camera, settings, plan=dataclasses.replace(plan, screen="quadtree", quadtree=coarse))
+    agree(image, truth)
+    assert float(truth.alpha.max()) > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("size", [(1, 1), (37, 29), (64, 1), (1, 33)])
+@pytest.mark.parametrize("leaf", [4, 16, 32])
+def test_any_image_size_is_that_of_every_pixel(frames, projection, size, leaf):
+    """Eagerly, with plans of their own and little memory."""
+    rng = np.random.default_rng(0)
+    shape = dataclasses.replace(frames, width=size[0], height=size[1])
+    scene, camera = shape.scene(rng), shape.camera(rng, projection)
+    settings = dataclasses.replace(frames.settings, screen="quadtree", leaf_pixels=leaf)
+    agree(js.render(scene, camera, settings), js.render(scene, camera, frames.settings))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["interval", "pilot"])
+@pytest.mark.parametrize("name", ["mixer", "radial"])
+def test_of_built_in_scenes_at_most_one_pixel_in_a_thousand_is_over(name, estimator):
+    scene, camera = js.scenes.load(name, particles=30_000, width=160, height=130)
+    truth = js.render(scene, camera, js.Settings(samples=96))
+    for tolerance in (0.01, 0.04):
+        image = js.render(scene, camera, js.Settings(samples=96, tolerance=tolerance, estimator=estimator, **QUADTREE))
+        assert (np.abs(light(image) - light(truth)).max(-1) > tolerance).mean() <= 1e-3
+
+
+@pytest.mark.slow
+def test_gradients_are_those_of_differences_in_both_modes(frames, screened, x64):
+    rng = np.random.default_rng(3)
+    inputs, cotangent = filled(frames, rng), weights(rng, frames)
+    move = towards(inputs, anyhow("position", "support", "quantity", "extinction", "eye", "half_height")(inputs, rng))
+    slope, pushed, gradient = differ(inputs, move, cotangent, *screened)
+    pulled, size = along(gradient, move)
+    assert pushed == pytest.approx(slope, abs=CLOSE * (1 + size))
+    assert pulled == pytest.approx(pushed, abs=AGREE * (1 + size))
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"leaf_pixels": 12}, r"`leaf_pixels` must be one of 4, 8, 16, 32, got 12"),
+    ({"leaf_estimator": "best"}, r"`leaf_estimator` must be one of hierarchical, corner_variance, uniform, got 'best'"),
+    ({"screen": "octree"}, r"`screen` must be one of .*quadtree.*, got 'octree'"),
+])  # fmt: skip
+def test_what_leaves_cannot_be_is_refused_with_what_they_can(given, message):
+    with pytest.raises(ValueError, match=message):
+        js.Settings(**given)
+
+
+@pytest.mark.parametrize("other", [{"leaf_pixels": 16}, {"leaf_estimator": "uniform"}, {"screen": "pixels"}])
+def test_a_plan_for_other_leaves_is_refused_by_name(frames, screened, other):
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=f"settings.{next(iter(other))} = .*make a new one"):
+        js.render(frames.scene(rng), frames.camera(rng), dataclasses.replace(screened[0], **other), plan=screened[1])
+
+
+def test_rooms_of_the_first_lattice_grow_with_a_plan(frames):
+    rng = np.random.default_rng(0)
+    settings, camera = dataclasses.replace(frames.settings, **QUADTREE), frames.camera(rng)
+    few, many = frames.scene(rng, decades=2), cloud(frames, rng)
+    small, large = (js.plan(scene, camera, settings) for scene in (few, many))
+    assert large.quadtree.lists.list_capacity > small.quadtree.lists.list_capacity
+    grown = js.plan(many, camera, settings, like=small)
+    for name in ("tile_capacity", "list_capacity"):
+        assert getattr(grown.quadtree.lists, name) >= getattr(large.quadtree.lists, name)
+    assert grown != small and grown.serves(small) and not small.serves(grown)
+    assert all(js.plan(scene, camera, settings, like=grown) is grown for scene in (few, many))
+    assert not dataclasses.replace(grown, quadtree=grown.quadtree.with_room(1, 1)).serves(grown)

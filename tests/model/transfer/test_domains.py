@@ -1,0 +1,114 @@
+"""Domains: where control points sit, and how far a linear function between them is from a logarithmic one."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from jaxsph.model.transfer.domains import DOMAINS, control_values, log_departure
+
+QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
+exponents = st.floats(-12, 12)
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+@pytest.mark.parametrize("points", [2, 16, 33])
+def test_control_values_ascend_and_are_as_many_as_asked(domain, points):
+    values = control_values(domain, QUANTITY, points=points)
+    assert values.shape == (points,) and (np.diff(values) > 0).all()
+
+
+@pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
+def test_ends_that_are_given_are_kept_exactly(domain):
+    values = control_values(domain, np.concatenate([QUANTITY, [0.1, 30.0]]), low=0.1, high=30.0)
+    assert values[[0, -1]].tolist() == [0.1, 30.0]
+
+
+@given(exponents, exponents)
+def test_control_values_of_a_log_domain_have_even_logarithms(low, high):
+    assume(high - low > 0.1)
+    values = control_values("log", low=10.0**low, high=10.0**high)
+    np.testing.assert_allclose(np.log10(values), np.linspace(low, high, 16), rtol=0, atol=1e-12)
+
+
+@given(st.floats(1e-3, 1e6))
+def test_a_symlog_domain_is_odd_about_zero_linear_within_its_width_and_logarithmic_far_beyond(high):
+    values = control_values("symlog", low=-high, high=high, points=33)
+    np.testing.assert_allclose(values, -values[::-1], rtol=0, atol=1e-12 * high)
+    np.testing.assert_allclose(values[-1] / values[-2], values[-2] / values[-3], rtol=1e-2)
+
+
+def test_an_equalised_domain_gives_every_colour_to_as_many_particles():
+    values = control_values("equalised", QUANTITY, points=11)
+    counts = np.histogram(QUANTITY, values)[0]
+    assert np.abs(counts - len(QUANTITY) / 10).max() <= 1
+
+
+def test_an_equalised_domain_counts_by_weight():
+    weights = np.where(QUANTITY > 1, 9.0, 1.0)
+    values = control_values("equalised", QUANTITY, weights=weights, points=11)
+    share = np.histogram(QUANTITY, values, weights=weights)[0] / weights.sum()
+    np.testing.assert_allclose(share, 0.1, atol=2 * 9 / weights.sum())
+
+
+def test_values_that_many_share_take_no_more_than_one_colour():
+    values = control_values("equalised", [*np.zeros(1000), 1.0, 2.0, 3.0], points=4)
+    np.testing.assert_allclose(values, [0, 1, 2, 3])
+
+
+def test_percentages_are_of_the_quantity():
+    values = control_values("percentile", QUANTITY, low=10, high=90)
+    np.testing.assert_allclose(values[[0, -1]], np.percentile(QUANTITY, [10, 90]))
+    np.testing.assert_allclose(np.diff(values, 2), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("domain", ["linear", "symlog", "percentile", "equalised"])
+def test_a_constant_quantity_has_a_range_around_it(domain):
+    values = control_values(domain, np.full(20, -4.0))
+    assert values[0] < -4 < values[-1]
+
+
+def test_what_is_not_finite_is_not_counted():
+    odd = np.concatenate([QUANTITY, [np.nan, np.inf, -np.inf]])
+    for domain in DOMAINS:
+        np.testing.assert_array_equal(control_values(domain, odd), control_values(domain, QUANTITY))
+
+
+@settings(max_examples=15)
+@given(st.floats(1.01, 1e6), st.integers(2, 20), st.randoms(use_true_random=False))
+def test_the_departure_from_a_logarithm_is_a_bound_that_is_reached(span, points, random):
+    values = control_values("log", low=1e-3, high=1e-3 * span, points=points)
+    colors = np.array([[random.random() for _ in range(3)] for _ in values])
+    fine = np.geomspace(values[0], values[-1], 40_001)
+    linear = np.stack([np.interp(fine, values, channel) for channel in colors.T])
+    logarithmic = np.stack([np.interp(np.log(fine), np.log(values), channel) for channel in colors.T])
+    largest = np.abs(linear - logarithmic).max()
+    bound = log_departure(values, colors)
+    assert largest <= bound + 1e-10 and largest >= 0.99 * bound - 1e-10
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"domain": "loglog"}, "linear, log, symlog, percentile, equalised"),
+        ({"domain": "log", "low": 0.0, "high": 1.0}, "symlog"),
+        ({"domain": "log", "quantity": QUANTITY, "low": -1.0}, f"{QUANTITY.min():.4g}"),
+        ({"domain": "log", "quantity": -QUANTITY}, "has none"),
+        (
+            {"domain": "log", "quantity": [0.0, 0.0, 1.0, -2.0]},
+            "only positive value .* 3 of 4 are not positive.* 'symlog'",
+        ),
+        ({"domain": "linear", "low": 1.0}, "`high`"),
+        ({"domain": "linear", "low": 2.0, "high": 1.0}, "ascend"),
+        ({"domain": "percentile", "quantity": QUANTITY, "high": 101.0}, "percentages"),
+        ({"domain": "equalised"}, "`quantity`"),
+        ({"domain": "equalised", "quantity": QUANTITY, "low": -2.0, "high": -1.0}, "widen"),
+        ({"domain": "symlog", "low": -1.0, "high": 1.0, "width": 0.0}, "`width`"),
+        ({"domain": "linear", "low": 0.0, "high": 1.0, "width": 1.0}, "leave it out"),
+        ({"domain": "linear", "low": 0.0, "high": 1.0, "points": 1}, "two ends"),
+        ({"domain": "equalised", "quantity": QUANTITY, "weights": [1.0]}, "`weights`"),
+    ],
+)
+def test_what_makes_no_domain_is_refused_with_a_remedy(given, said):
+    with pytest.raises(ValueError, match=said):
+        control_values(**given)

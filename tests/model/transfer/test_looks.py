@@ -1,0 +1,102 @@
+"""The default transfer function: readable opacity whatever the units, and colour maps by name."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
+from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, colormap, default_transfer, opacity_by_second, value_range
+from jaxsph.scenes.sampling import scatter
+
+
+def block(count=1500, size=1.0, shift=0.0, values=None):
+    position = size * scatter(np.zeros(3), np.ones(3), count) + shift
+    quantity = np.linspace(0, 1, count) if values is None else values
+    return Particles.from_arrays(position.astype(np.float32), 2 * size * count ** (-1 / 3), quantity)
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(-3, 6))
+def test_a_block_of_any_size_is_readable(decades):
+    particles = block(size=10.0**decades, shift=10.0**decades)
+    camera = Camera.framing(particles, width=9, height=9, direction=(0.1, 0.1, -1))
+    scene = Scene(particles=particles, transfer=default_transfer(particles))
+    image = reference.render(scene, camera, Settings(samples=32))
+    assert 0.8 < np.asarray(image.alpha)[4, 4] < 0.995
+
+
+def test_extinction_rises_with_the_quantity_over_the_range():
+    transfer = default_transfer(block(), "gray", values=(-2.0, 5.0))
+    extinction = np.asarray(transfer.extinction)
+    assert np.asarray(transfer.values)[[0, -1]].tolist() == [-2.0, 5.0]
+    assert (np.diff(extinction) > 0).all() and extinction[0] == pytest.approx(FAINTEST * extinction[-1])
+
+
+@pytest.mark.parametrize("values", [np.zeros(50), np.full(50, -3.0), np.full(50, 1e7) + np.arange(50) * 1e-3])
+def test_a_constant_quantity_has_a_range(values):
+    low, high = value_range(values)
+    assert low < values.min() and high > values.max() and np.float32(low) < np.float32(high)
+
+
+def test_a_few_odd_values_do_not_take_the_colours():
+    values = np.append(np.linspace(0, 1, 10_000), 1e6)
+    assert value_range(values)[1] < 1.01
+    assert value_range(np.append(np.zeros(10_000), 1.0)) == (0.0, 1.0)  # unless they are all there is to see
+
+
+def test_an_empty_or_single_set_has_a_transfer_function():
+    for count in (0, 1):
+        particles = Particles.from_arrays(np.zeros((count, 3)), 1.0, np.zeros(count))
+        assert np.isfinite(np.asarray(default_transfer(particles).extinction)).all()
+
+
+@pytest.mark.parametrize("name", [*COLORMAPS, "viridis_r"])
+def test_built_in_colour_maps(name):
+    colors = colormap(name)
+    assert colors.ndim == 2 and colors.shape[1] == 3 and colors.min() >= 0 and colors.max() <= 1
+    assert (colormap(name.removesuffix("_r")) == colormap(name.removesuffix("_r") + "_r")[::-1]).all()
+
+
+def test_matplotlib_names_work_where_it_is_installed():
+    pytest.importorskip("matplotlib")
+    assert colormap("plasma").shape[1] == 3 and (colormap("plasma_r") == colormap("plasma")[::-1]).all()
+
+
+def test_bad_arguments_are_named():
+    with pytest.raises(ValueError, match=r"viridis, heat, ice, coolwarm, gray.*'nope'"):
+        colormap("nope")
+    with pytest.raises(ValueError, match=r"ascend, got \(1\.0, 0\.0\)"):
+        default_transfer(block(10), values=(1, 0))
+    with pytest.raises(ValueError, match="`optical_depth` must be > 0"):
+        default_transfer(block(10), optical_depth=0)
+
+
+def pair(count=200):
+    density = np.geomspace(1e-3, 10, count)
+    position = scatter(np.zeros(3), np.ones(3), count).astype(np.float32)
+    return Particles.from_arrays(position, 2 * count ** (-1 / 3), (np.linspace(-1, 1, count), np.log10(density)))
+
+
+def test_of_two_quantities_colours_span_the_first_and_extinction_rises_from_nothing_over_the_second():
+    transfer = default_transfer(pair(), values=(-1.0, 1.0))
+    own, extinction = np.asarray(transfer.extinction_values), np.asarray(transfer.extinction)
+    assert np.asarray(transfer.values)[[0, -1]].tolist() == [-1.0, 1.0]
+    assert -3 <= own[0] < -2.9 and 0.9 < own[-1] <= 1 and extinction[0] == 0 and (np.diff(extinction) > 0).all()
+
+
+def test_colours_of_any_function_are_kept_where_extinction_is_by_the_second():
+    colored = TransferFunction.from_points([0, 1, 5], [(1, 0, 0), (0, 1, 0), (0, 0, 1)], np.full(3, 3.0))
+    made = opacity_by_second(colored, pair())
+    assert (made.values == colored.values).all() and (made.colors == colored.colors).all()
+    with pytest.raises(ValueError, match="two quantities"):
+        opacity_by_second(colored, block())
+
+
+def test_ramps_are_even_rising_or_steep_and_nothing_else():
+    low, high = (float(default_transfer(block(), ramp="even")(np.array([end]))[1][0]) for end in (0.1, 0.9))
+    assert low == pytest.approx(high) and low > 0
+    steep = default_transfer(block(), ramp="steep")
+    assert float(steep(np.array([0.0]))[1][0]) == 0
+    with pytest.raises(ValueError, match="even, rising, steep"):
+        default_transfer(block(), ramp="falling")

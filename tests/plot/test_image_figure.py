@@ -1,0 +1,157 @@
+"""Pictures with a key: the picture's own pixels, colours of the bar that are those of the picture, lengths that are right."""
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.io.units import LENGTH, CodeUnit
+from jaxsph.plot.bars import Axis, look_up, raised
+
+pytest.importorskip("matplotlib")
+LOOK = js.TransferFunction.from_colormap("viridis", (0, 1), [200, 200])
+CAMERA = js.Camera.orthographic((1, 0.5, -3), (1, 0.5, 0.5), view_height=1.5, width=200, height=100, near=2.5, far=4.5)
+
+
+def ramp(values=None, transfer=LOOK):
+    """An opaque volume whose quantity rises from left to right in the picture, and that scene's image."""
+    rising = np.linspace(1, 0, 17) if values is None else values
+    volume = js.Volume.from_array((rising[:, None, None] * np.ones((17, 2, 2))).astype(np.float32), (0, 0, 0), (2 / 16, 1, 1))
+    scene = js.Scene(volume=volume, volume_transfer=transfer)
+    return scene, js.reference.render(scene, CAMERA, js.Settings(samples=24))
+
+
+def pixels(figure):
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return np.asarray(Image.open(buffer).convert("RGB")).astype(int)
+
+
+def bar_of(figure):
+    return figure.axes[1]
+
+
+def test_pixels_of_the_picture_are_those_of_the_png_without_a_key():
+    scene, image = ramp()
+    for shown in (image.figure(), image.figure(scene)):
+        found = pixels(shown)
+        assert found.shape[0] == 100 and (found[:, :200] == image.to_uint8()).all()
+    assert found.shape[1] > 220
+
+
+@pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.8])
+def test_a_colour_of_the_bar_is_that_of_an_opaque_place_of_its_value(share):
+    scene, image = ramp()
+    figure = image.figure(scene)
+    found = pixels(figure)
+    extent = bar_of(figure).get_window_extent()
+    row = round(100 - (extent.y0 + share * extent.height) - 0.5)
+    of_bar = found[row, round((extent.x0 + extent.x1) / 2)]
+    right = np.asarray(CAMERA.axes)[0, 0]  # the picture's x runs against the world's here
+    x = (1 - share) * 2
+    column = int(100 + right * (x - 1) * 100 / 1.5)
+    assert np.abs(of_bar - found[50, column]).max() <= 6  # a row of the bar and a column of the picture are steps
+
+
+@pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
+def test_the_bar_spans_the_control_points_on_their_scale(domain):
+    values = np.geomspace(1e-3, 10, 17)
+    look = js.TransferFunction.from_colormap("viridis", js.control_values(domain, values, low=1e-3, high=10), 100.0)
+    scene, image = ramp(values, look)
+    axes = bar_of(image.figure(scene, labels="density"))
+    assert axes.get_ylim() == pytest.approx((1e-3, 10), rel=1e-5)
+    places = axes.transAxes.inverted().transform(axes.transData.transform([(0.5, float(value)) for value in look.values]))[:, 1]
+    np.testing.assert_allclose(places, np.linspace(0, 1, 16), atol=1e-4)
+    assert axes.get_ylabel().replace("\n", " ") == "density (code units)"
+
+
+def test_a_logarithmic_quantity_has_its_own_values_on_the_bar():
+    look = js.TransferFunction.from_colormap("viridis", (-3, 1), 100.0)
+    axis = Axis(look, "log10:Density", "g cm^-3", 2.0)
+    assert axis.scale.name == "log" and axis.title.startswith("Density (g cm$^")
+    np.testing.assert_allclose(axis.scale.values[[0, -1]], [2e-3, 20], rtol=1e-6)
+    np.testing.assert_allclose(axis.colors(np.array([2e-3, 0.2, 20])), np.asarray(look(np.array([-3.0, -1, 1]))[0]), atol=1e-6)
+
+
+def test_look_up_is_the_transfer_function_jumps_included():
+    made = js.TransferFunction.from_points([0, 1, 1, 2], [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [0, 1, 5, 2])
+    asked = np.array([-1, 0, 0.25, 0.999, 1, 1.5, 2, 9])
+    for own, theirs in zip(look_up(made, asked), made(asked), strict=True):
+        np.testing.assert_allclose(own, theirs, atol=1e-6)
+
+
+def test_look_up_reads_extinction_at_its_own_control_points():
+    made = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 0, 0)], [0, 4, 1], extinction_values=[0, 0.5, 2])
+    asked = np.array([-1, 0, 0.25, 0.5, 1, 3])
+    for own, theirs in zip(look_up(made, asked), made(asked), strict=True):
+        np.testing.assert_allclose(own, theirs, atol=1e-6)
+
+
+def texts(figure):
+    return [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_the_scale_bar_is_as_long_as_it_says():
+    scene, image = ramp()
+    figure = image.figure(scene, CAMERA, outline=False, triad=False)
+    (line,) = figure.axes[0].lines
+    assert np.ptp(line.get_xdata()) == pytest.approx(0.5 * 100 / 1.5, rel=1e-6)
+    assert texts(figure) == ["0.5 code units"]
+
+
+def test_a_perspective_scale_bar_says_where_it_holds():
+    scene, _ = ramp()
+    camera = js.Camera.look_at((1, 0.5, -3), (1, 0.5, 0.5), width=40, height=20, near=2.5, far=4.5)
+    image = js.reference.render(scene, camera, js.Settings(samples=8))
+    assert "at mid depth" in texts(image.figure(scene, camera))
+    figure = image.figure(scene, camera, target=(1, 0.5, 1), outline=False, triad=False)
+    pixels_per_length = 20 / (2 * np.tan(np.radians(22.5)) * 4)
+    length = float(texts(figure)[0].split()[0])
+    assert "at the target" in texts(figure)
+    assert np.ptp(figure.axes[0].lines[0].get_xdata()) == pytest.approx(length * pixels_per_length, rel=1e-5)
+
+
+def test_labels_are_said_in_the_units_that_files_state():
+    pytest.importorskip("unyt")
+    scene, image = ramp()
+    labels = js.io.Labels("p", "erg cm^-3", 10.0, CodeUnit(3.0857e21, LENGTH), None, "t = 3 Myr")
+    figure = image.figure(scene, CAMERA, labels=labels)
+    assert "500 pc" in texts(figure) and "t = 3 Myr" in texts(figure)
+    assert bar_of(figure).get_ylim() == pytest.approx((0, 10)) and raised("cm^-3") in bar_of(figure).get_ylabel()
+
+
+def test_several_volumes_have_bars_side_by_side_that_are_not_clipped():
+    scene, image = ramp()
+    other = js.TransferFunction.from_colormap("heat", (0, 123456.0), 1.0)
+    both = js.Scene(volume=scene.volumes[0][0], volume_transfer=LOOK)
+    both = js.Scene(volume=(both.volume, both.volume), volume_transfer=(LOOK, other))
+    figure = image.figure(both, labels="a long name of a quantity that takes two lines")
+    figure.canvas.draw()
+    extents = [axes.get_tightbbox() for axes in figure.axes[1:]]
+    assert len(extents) == 2 and extents[0].x1 <= extents[1].x0
+    width = figure.get_size_inches()[0] * figure.dpi
+    assert extents[1].x1 <= width and extents[0].x0 >= 200
+
+
+def test_a_camera_of_another_size_and_a_target_behind_the_eye_are_refused():
+    scene, image = ramp()
+    with pytest.raises(ValueError, match="200 x 100"):
+        image.figure(scene, js.Camera.framing(scene.volumes[0][0], width=20, height=20))
+    camera = js.Camera.framing(scene.volumes[0][0], width=200, height=100)
+    with pytest.raises(ValueError, match="not ahead"):
+        image.figure(scene, camera, target=2 * camera.exact_eye())
+
+
+def test_figures_need_no_display_and_leave_pyplot_alone():
+    code = (
+        "import sys, numpy as np, jaxsph as js\n"
+        "image = js.Image(np.zeros((20, 30, 3)), np.ones((20, 30)), np.ones((20, 30)), np.ones((20, 30)), 0, True, 0, {})\n"
+        "image.figure(labels='x'); js.TransferFunction.from_colormap('heat', (0, 1)).figure()\n"
+        "assert 'matplotlib.figure' in sys.modules and 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,405 @@
+"""The sweep: errors are those of the images, the table is kept and never measured twice, the figures are drawn."""
+
+import csv
+import dataclasses
+import importlib
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.cli import main as cli
+from jaxsph.plot import sweep_figures as figures
+from jaxsph.trade import provenance
+from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
+from jaxsph.trade.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
+
+PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
+CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2",)}
+ONCE = {"repeats": 1, "converged": 1, "integral": 0}
+SETTINGS, POINTS_8, POINTS_4 = (js.Settings(samples=samples, integrator="samples") for samples in (SAMPLES, 8, 4))
+SOURCE = ["scene:radial", "--particles", PARTICLES, "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
+LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]
+
+
+@pytest.fixture(scope="module")
+def view():
+    return js.scenes.load("radial", PARTICLES, width=WIDTH, height=HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("sweep")
+
+
+@pytest.fixture(scope="module")
+def rows(view, folder):
+    return js.sweep(*view, SETTINGS, **CHOSEN, **ONCE, name="radial", folder=folder)
+
+
+def layers(image):
+    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.alpha, np.float64)[..., None]], -1)
+
+
+def run(capsys, *arguments):
+    code = cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return code, out, err.splitlines()
+
+
+def test_there_is_a_row_for_every_setting_full_rate_first(rows):
+    expected = [("full rate", None), ("samples/2", None)]
+    expected += [(name, tolerance) for name in CHOSEN["estimators"] for tolerance in CHOSEN["tolerances"]]
+    assert [(row.method, row.tolerance) for row in rows] == expected
+    size = (PARTICLES, WIDTH, HEIGHT, SAMPLES)
+    assert {(row.particles, row.width, row.height, row.samples) for row in rows} == {size}
+    assert all(row.repeats == 1 and row.dtype == "float32" and row.jaxsph == js.__version__ for row in rows)
+
+
+def test_errors_are_the_differences_of_the_images(view, rows):
+    scene, camera = view
+    settings = SETTINGS
+    full = js.render(scene, camera, settings)
+    coarse = js.render(scene, camera, dataclasses.replace(settings, samples=SAMPLES // 2))
+    error = np.abs(layers(coarse) - layers(full)).max(-1)
+    row = rows[1]
+    assert row.max_error == pytest.approx(error.max(), abs=1e-7) and row.mean_error == pytest.approx(error.mean(), abs=1e-7)
+    assert (row.evaluations, row.evaluations_full) == (coarse.stats["evaluations"], full.stats["evaluations"])
+    assert rows[0].max_error == 0 and rows[0].evaluations == rows[0].evaluations_full
+    relaxed = js.render(scene, camera, dataclasses.replace(settings, tolerance=0.3, relax=1.0))
+    away, row = np.abs(layers(relaxed) - layers(full)).max(-1), rows[-1]
+    assert row.max_error == pytest.approx(away.max(), abs=1e-7) and row.over_tolerance == (away > 0.3).mean()
+    assert row.max_bound == np.asarray(relaxed.error_bound).max() and row.evaluations == relaxed.stats["evaluations"]
+
+
+def test_certified_settings_keep_their_word(rows):
+    certified = [row for row in rows if row.certified]
+    assert [row.method for row in certified] == ["interval"] * 2
+    for row in certified:
+        assert row.max_error <= row.max_bound <= row.tolerance and row.over_tolerance == row.over_bound == 0
+
+
+def test_the_converged_image_has_that_many_times_the_samples(view, rows):
+    """Half the samples against twice as many is what `samples/2` is against full rate."""
+    few = dataclasses.replace(SETTINGS, samples=SAMPLES // 2)
+    (half,) = js.sweep(*view, few, estimators=(), baselines=(), **ONCE | {"converged": 2})
+    assert half.max_error == 0 and half.max_error_converged == pytest.approx(rows[1].max_error, abs=1e-7)
+    assert half.mean_error_converged == pytest.approx(rows[1].mean_error, abs=1e-7)
+
+
+def test_stages_add_up_and_compiling_is_apart(rows):
+    for row in rows:
+        assert row.total == pytest.approx(row.grid + row.adapt + row.cast + row.image)  # of one turn the median is the turn
+        assert row.deviation == 0 and row.bytes > 0
+
+
+def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypatch):
+    before = (folder / JOURNAL).read_text()
+    steps = []
+    settings = SETTINGS
+    more = {"name": "radial", "folder": folder, "progress": lambda done, total: steps.append((done, total))}
+    assert js.sweep(*view, settings, **CHOSEN, **ONCE, **more) == rows
+    assert not steps and (folder / JOURNAL).read_text() == before
+    found = js.sweep(*view, settings, **CHOSEN | {"tolerances": (0.02, 0.1), "estimators": ("interval",)}, **ONCE, **more)
+    assert [row.tolerance for row in found[2:]] == [0.02, 0.1] and found[:3] == rows[:3]
+    added = (folder / JOURNAL).read_text().removeprefix(before).splitlines()
+    assert [json.loads(line)["tolerance"] for line in added] == [0.1]
+    assert steps == [(done, 5) for done in range(1, 6)]  # two truths, the new setting, and its turn with full rate
+
+
+def test_estimators_are_those_that_suit_full_rate():
+    assert suitable(SETTINGS) == tuple(ESTIMATORS)
+    assert suitable(js.Settings(integrator="segments")) == ("segments",)
+    groups = contenders(SETTINGS, (0.1,), None, ())
+    kept = {group[0].method: group[0].is_against_integral for group in groups}
+    assert kept == {"full rate": False, "interval": False, "interval relaxed": False, "pilot": False, "segments": True}
+
+
+@pytest.fixture
+def by_reference(monkeypatch):
+    """The reference renderer in place of the fast one: nothing is compiled. Gives the settings and sizes it was asked for."""
+    module, calls = importlib.import_module("jaxsph.sweep"), []
+
+    def render(scene, camera, settings, *, plan=None):
+        calls.append((settings.tolerance, camera.width))
+        image = js.reference.render(scene, camera, settings)
+        seconds = dict.fromkeys(("plan", "compile", "grid", "adapt", "cast", "image"), 1.0)
+        return dataclasses.replace(image, stats=image.stats | {"seconds": seconds})
+
+    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(module, "make_plan", lambda *_: types.SimpleNamespace(bytes=1))
+    return calls
+
+
+def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
+    scene, camera = js.scenes.load("radial", 50, width=24, height=16)
+    settings = POINTS_8
+    full, half = js.sweep(scene, camera, settings, estimators=(), baselines=("size/2",), **ONCE)
+    small = js.reference.render(scene, dataclasses.replace(camera, width=12, height=8), settings)
+    expected = np.abs(scaled_up(layers(small), camera) - layers(js.reference.render(scene, camera, settings))).max(-1)
+    assert half.max_error == expected.max() > 0 and half.mean_error == expected.mean()
+    assert half.evaluations < full.evaluations == half.evaluations_full
+    assert half.image > full.image and half.certified is False and half.max_bound is None
+
+
+def test_each_group_takes_turns_with_full_rate(by_reference):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.1, 0.2), "estimators": ("pilot",), "baselines": ("size/2",), "repeats": 2, "integral": 0}
+    rows = js.sweep(scene, camera, POINTS_4, **chosen)
+    truths, turns = [(None, 8)] * 2, [(None, 8), (0.1, 8), (0.2, 8)]
+    assert by_reference == [*truths, (None, 4), *[(None, 8), (None, 4)] * 2, (0.1, 8), (0.2, 8), *turns * 2]
+    assert all(row.full_total == 4 and row.repeats == 2 for row in rows)
+
+
+def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_held_against_it(by_reference):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.01,), "estimators": ("pilot", "segments"), "baselines": ("samples/2",), **ONCE}
+    steps = []
+    more = {"integral": 64, "progress": lambda done, total: steps.append((done, total))}
+    rows = js.sweep(scene, camera, POINTS_8, **chosen | more)
+    truth = layers(js.reference.integral(scene, camera))
+    images = [layers(js.reference.render(scene, camera, one)) for one in (POINTS_8, POINTS_4)]
+    full, half = (np.abs(image - truth).max(-1) for image in images)
+    for row, error in zip(rows, (full, half, full, full), strict=True):  # here all but the second are full rate
+        expected = (error.mean(), np.quantile(error, 0.999), error.max())
+        assert (row.integral_mean, row.integral_p999, row.integral_max) == pytest.approx(expected, abs=2e-6)
+    _, _, pilot, segments = rows
+    assert pilot.over_tolerance == pilot.over_bound == 0
+    assert segments.over_tolerance == (full > 0.01).mean() > 0 and segments.over_bound == (full > 0).mean()
+    assert steps[-1][0] == steps[-1][1] == len(steps)
+    without = js.sweep(scene, camera, POINTS_8, **chosen)[-1]
+    assert without.integral_max is without.over_tolerance is without.over_bound is None and without.key != segments.key
+
+
+def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
+    module = importlib.import_module("jaxsph.sweep")
+    views = [js.scenes.load("letters", 20, frame, width=8, height=8) for frame in range(3)]
+    made, fits = [], module.render
+
+    def render(scene, camera, settings, *, plan):
+        if scene is views[2][0] and plan.bytes <= 2:
+            raise js.CapacityError("too small")
+        return fits(scene, camera, settings, plan=plan)
+
+    monkeypatch.setattr(module, "render", render)
+    monkeypatch.setattr(module, "make_plan", lambda *_: made.append(None) or types.SimpleNamespace(bytes=len(made)))
+    rows = js.sweep(*zip(*views, strict=True), POINTS_4, estimators=(), baselines=(), **ONCE | {"converged": 2})
+    assert [(row.frame, row.bytes) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
+
+
+def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
+    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+    chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "integral": 0, "folder": tmp_path}
+
+    def stop(done, total):
+        if done == total:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        js.sweep(scene, camera, POINTS_4, **chosen, progress=stop)
+    assert [row.method for row in read_journal(tmp_path / JOURNAL)] == ["full rate"]
+    by_reference.clear()
+    rows = js.sweep(scene, camera, POINTS_4, **chosen)
+    assert [row.method for row in rows] == ["full rate", "pilot"] and len(by_reference) == 2 + 1 + 2
+
+
+def test_other_data_is_another_measurement(view):
+    scene, camera = view
+    settings = SETTINGS
+    moved = dataclasses.replace(scene.particles, quantity=scene.particles.quantity + 1e-3)
+    nearer = dataclasses.replace(camera, near=camera.near * 0.9)
+    wider = dataclasses.replace(camera, width=WIDTH + 1)
+    variants = [(scene, camera, settings, 8), (dataclasses.replace(scene, particles=moved), camera, settings, 8)]
+    variants += [(scene, nearer, settings, 8), (scene, wider, settings, 8), (scene, camera, settings, 4)]
+    variants += [(scene, camera, dataclasses.replace(SETTINGS, merge=False), 8)]
+    digests = [provenance.of_frame(*variant)["fingerprint"] for variant in variants]
+    assert len(set(digests)) == len(variants) and digests[0] == provenance.of_frame(*view, settings, 8)["fingerprint"]
+
+
+def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(rows, tmp_path):
+    path = tmp_path / JOURNAL
+    append(path, rows[0])
+    with open(path, "a") as file:
+        file.write('{"scene": "rad')
+    assert read_journal(path) == [rows[0]]
+    append(path, rows[1])
+    assert read_journal(path) == rows[:2]
+    path.write_text('{"scene": "radial"}\n')
+    with pytest.raises(ValueError, match=r"line 1 is not a measurement.*another folder"):
+        read_journal(path)
+
+
+def test_two_processes_that_measured_the_same_leave_one_line_of_it(rows, tmp_path):
+    path = tmp_path / JOURNAL
+    for row in (rows[0], rows[1], rows[0], rows[1]):
+        append(path, row)
+    assert read_journal(path) == rows[:2]
+
+
+def test_lines_from_before_there_was_an_integral_are_read(rows, tmp_path):
+    new = {name: getattr(rows[1], name) for name in COLUMNS}
+    old = {name: value for name, value in new.items() if not name.startswith("integral")}
+    (tmp_path / JOURNAL).write_text(json.dumps(old) + "\n")
+    assert read_journal(tmp_path / JOURNAL) == [dataclasses.replace(rows[1], integral=0)]
+
+
+def test_the_csv_is_the_same_table(rows, tmp_path):
+    write_table(tmp_path / TABLE, rows)
+    with open(tmp_path / TABLE, newline="") as file:
+        found = list(csv.DictReader(file))
+    assert tuple(found[0]) == COLUMNS and len(found) == len(rows)
+    for got, row in zip(found, rows, strict=True):
+        assert got["method"] == row.method and float(got["max_error"]) == row.max_error
+        assert got["tolerance"] == ("" if row.tolerance is None else str(row.tolerance))
+
+
+def test_a_smaller_image_is_read_where_its_rays_pass():
+    """A ramp over the view is reproduced by fewer pixels of another aspect, but for the border that they do not reach."""
+    camera = js.Camera.look_at((0, 0, 5), (0, 0, 0), width=40, height=33, near=1, far=2)
+    small = baseline(js.Settings(), "size/2").camera(camera)
+    assert (small.width, small.height) == (20, 17)
+
+    def ramp(view):
+        across = (2 * (np.arange(view.width) + 0.5) / view.width - 1) * view.width / view.height
+        down = 2 * (np.arange(view.height) + 0.5) / view.height - 1
+        return np.stack(np.broadcast_arrays(across[None], down[:, None], 0.0, 1.0), -1)
+
+    inner = np.s_[2:-2, 2:-2]
+    assert scaled_up(ramp(small), camera)[inner] == pytest.approx(ramp(camera)[inner], abs=1e-12)
+    assert scaled_up(ramp(camera), camera) is not None and (scaled_up(ramp(camera), camera) == ramp(camera)).all()
+    made = [baseline(js.Settings(), name) for name in BASELINES]
+    assert [one.shrink for one in made] == [1, 1, 1, 1, 2, 4]
+    assert [one.settings.samples for one in made] == [128, 64, 256, 64, 256, 256]
+    assert [one.settings.integrator for one in made[:4]] == ["samples"] * 2 + ["segments"] * 2
+    assert baseline(js.Settings(), "segments") == made[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"estimators": ("exact",)}, "'interval', 'interval relaxed', 'pilot', 'segments', got 'exact'"),
+        (
+            {"estimators": ("pilot",), "settings": js.Settings(integrator="segments")},
+            "'pilot'.*full rate of point samples.*integrator='segments'",
+        ),
+        ({"baselines": ("pixels/2",)}, "'samples/2', 'segments', 'segments/2' or 'size/4', got 'pixels/2'"),
+        ({"integral": -1}, "`integral` must be an integer of at least 0, got -1"),
+        ({"baselines": ("size/0",)}, "got 'size/0'"),
+        ({"tolerances": (-1.0,)}, "`tolerance` must be >= 0"),
+        ({"repeats": 0}, "`repeats` must be an integer of at least 1, got 0"),
+        ({"converged": 0}, "`converged` must be"),
+        ({"settings": js.Settings(tolerance=0.1)}, "give `tolerances` instead"),
+        ({"frames": (1, 2)}, "1 different numbers"),
+    ],
+)
+def test_bad_arguments_are_named(view, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        js.sweep(*view, **arguments)
+    with pytest.raises(ValueError, match="must pair, got 2 and 1"):
+        js.sweep([view[0]] * 2, view[1])
+
+
+def test_the_front_holds_what_nothing_beats():
+    errors, seconds = [0.1, 0.01, 0.1, 0.001, 0.0, 0.5], [1.0, 2.0, 0.5, 3.0, 9.0, 0.5]
+    assert figures.pareto_front(errors, seconds) == [4, 3, 1, 2]
+    assert figures.pareto_front([], []) == []
+
+
+def test_scenes_are_not_drawn_over_each_other(rows, tmp_path):
+    pytest.importorskip("matplotlib")
+    with pytest.raises(ValueError, match="one scene, got mixer, radial; draw each on its own"):
+        figures.draw([*rows, dataclasses.replace(rows[0], scene="mixer")], tmp_path)
+    with pytest.raises(ValueError, match="got nothing"):
+        figures.draw([], tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
+    pytest.importorskip("matplotlib")
+    later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=2.0, full_total=4.0) for row in rows]
+    points = figures.summary([*rows, *later])
+    assert [point.error for point in points] == [row.max_error + 1 for row in rows]
+    assert [point.time for point in points] == pytest.approx([(row.total + 2) / (row.full_total + 4) for row in rows])
+
+
+@pytest.mark.parametrize("least", [0.0, 0.0003])
+def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, least):
+    """Whether or not some are zero: from the least to the tolerance they take up a good part of the axis."""
+    pytest.importorskip("matplotlib")
+    wrong = [row if row.tolerance is None else dataclasses.replace(row, max_error=least, max_bound=0.001) for row in rows]
+    (axis,) = figures._error(figures.summary(wrong), "a title").axes
+    bottom, top = axis.get_ylim()
+    lowest = max(least, figures.MIN_SHOWN)
+    assert lowest / 10 < bottom < lowest < max(CHOSEN["tolerances"]) < top
+
+
+def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(rows, tmp_path):
+    pytest.importorskip("matplotlib")
+    taken = {"integral_mean": 0.001, "integral_p999": 0.01, "integral_max": 0.02}
+    more = [dataclasses.replace(row, method="segments", **taken) for row in rows if row.method == "interval"]
+    points = figures.summary([*rows, *more])
+    assert [point.kept for point in points[-2:]] == [0.02] * 2 and points[2].kept == rows[2].max_error
+    (axis,) = figures._error(points, "a title").axes
+    assert "segments: the light integral" in axis.get_ylabel()
+    shown = figures._integral(points, "a title").axes[1]
+    assert shown.get_xlabel() == "largest error, against the light integral"
+    assert "segments" in shown.get_legend_handles_labels()[1]
+    unknown = figures.summary([*rows, *(dataclasses.replace(row, integral_max=None) for row in more)])
+    assert "segments" not in str(figures._error(unknown, "a title").axes[0].get_legend_handles_labels())
+    far_off = [dataclasses.replace(point, integral=5.0) for point in points]
+    assert figures._error(far_off, "a title").axes[0].get_ylim()[1] > 5
+    assert [path.name for path in figures.draw(rows, tmp_path)] == ["error.png", "pareto.png"]
+
+
+def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--frames", 0, 2, *LEAST_WORK)
+    assert (code, err) == (0, [])
+    names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "integral.png", "frames.png")
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == sorted(names)
+    assert all(name in out for name in names) and "samples/2" in out and "frame 2" in out
+    found = read_journal(tmp_path / "new" / "out" / JOURNAL)
+    assert [(row.frame, row.method) for row in found] == [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
+    assert {row.max_error for row in found[1::2]} == {rows[1].max_error}  # it does not move
+    assert all(0 < row.integral_mean <= row.integral_max and row.integral == 10 for row in found) and "to integral" in out
+
+
+def test_without_matplotlib_the_command_says_so_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxsph.cli.scene.scene_of", lambda options: pytest.fail("a scene was made"))
+        code, _, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "out", *LEAST_WORK)
+    assert code == 1 and len(err) == 1 and "jaxsph[color]" in err[0] and not (tmp_path / "out").exists()
+    assert "is needed for the figures of a sweep" in err[0]
+    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "out", *LEAST_WORK, "--no-figures")
+    assert (code, err) == (0, []) and "png" not in out and (tmp_path / "out" / TABLE).exists()
+
+
+def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    code, _, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "taken", *LEAST_WORK, "--no-figures")
+    assert code == 1 and len(err) == 1 and "taken" in err[0] and "another one" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "-o"),
+        (["-o", "out", "--tolerances", "-1"], "number >= 0"),
+        (["-o", "out", "--tolerances", "none"], "'none'"),
+        (["-o", "out", "--estimators", "exact"], "invalid choice"),
+        (["-o", "out", "--baselines", "half"], "samples/2"),
+        (["-o", "out", "--repeats", "0"], "at least 1"),
+        (["-o", "out", "--integral", "-1"], "at least 0"),
+        (["-o", "out", "--integrator", "walks"], "invalid choice"),
+        (["-o", "out", "--samples", "0"], "--samples must be"),
+        (["-o", "out", "--frames", "1", "1"], "different"),
+        (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2_and_one_line(capsys, arguments, message):
+    code, _, err = run(capsys, "sweep", "scene:radial", *arguments)
+    assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
