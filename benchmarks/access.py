@@ -26,7 +26,7 @@ import jaxsph as js
 from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
 from jaxsph.engine.planning.fit import measured, see
 from jaxsph.engine.runtime.executors import Clock
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 SIDES = workloads.CUBE, 100
 ACCESS = "view", "measure and sort", "order", "lists"

@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxsph as js
-from jaxsph.sequence.workers import local_client
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.sequence.cluster import local_client
+from jaxsph.trade.measurement import of_this_run
 
 RESULT = Path(__file__).parent / "results" / "cluster.json"
 FRAMES = 40

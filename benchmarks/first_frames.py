@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 SETTINGS = {
     "full rate": {},

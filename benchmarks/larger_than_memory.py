@@ -32,7 +32,7 @@ import jaxsph as js
 from jaxsph.io.replace import written_whole
 from jaxsph.io.snapshot_sort import CELLS, Grid
 from jaxsph.scale.from_disk import TooLittleMemoryError
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 FILES, NEIGHBOURS = 8, 32
 SAMPLES = 256

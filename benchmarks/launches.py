@@ -31,7 +31,7 @@ from jaxsph.engine.frame.layers import develop
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.runtime.executors import AllShards, HostStage
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 MOST = 3_000
 MEMORY = 16 << 30  # bytes that a plan may take: in one band

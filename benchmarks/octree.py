@@ -39,7 +39,7 @@ from leaves_along import LeavesAlong, leaves_along
 import jaxsph as js
 from jaxsph.engine.access.octree import Octree
 from jaxsph.engine.access.octree_build import OctreePlan, build_octree, plan_octree
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 SAMPLES, SIZE, LEAVES = 256, 512, 512
 RATIOS = 1.0, 2.0, 4.0

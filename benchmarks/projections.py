@@ -34,7 +34,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.io.quantities import ROLES, choose_quantity
-from jaxsph.trade.provenance import of_this_run
+from jaxsph.trade.measurement import of_this_run
 
 MASS, UNIFORM, PEER, HELD = 1e-3, 1e-4, 1e-3, 1e-3
 OFF = 1e-6  # pixels

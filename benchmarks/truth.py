@@ -31,7 +31,7 @@ import jaxsph as js
 from jaxsph.io.replace import written_whole
 from jaxsph.reference.chords import Spheres, rays_of
 from jaxsph.reference.media import to_view
-from jaxsph.trade.provenance import of_frame, of_this_run
+from jaxsph.trade.measurement import of_frame, of_this_run
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 RESULTS = pathlib.Path(__file__).with_name("results") / "truth.json"

@@ -87,7 +87,7 @@ def met(scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, of: i
 
 
 def _recording(scene: Scene, of: int) -> tuple[TransferFunction, Recording]:
-    looks = [*([] if scene.transfer is None else [scene.transfer]), *(look for _, look in scene.volumes)]
+    looks = scene.looks
     if not 0 <= of < len(looks):
         there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
         raise ValueError(f"`of` must be the number of a part with a transfer function, got {of}; there are {there}")

@@ -1,4 +1,4 @@
-"""What the command line tells a person: lines of text, and a progress bar.
+"""What the command line tells a person: lines of text, a progress bar, and what it refuses.
 
 Flow: particles, camera, image -> [console] -> cli.
 """
@@ -7,18 +7,22 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxsph.io import ParticleTable
+from jaxsph.io import ParticleTable, Report
 from jaxsph.model import Camera, Image, Settings
 from jaxsph.model.registry import ESTIMATING
+from jaxsph.numerics.checks import Progress
 
+IMAGES = (".exr", ".png")
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 OPTIONS = {
     "values": "--range",
@@ -30,19 +34,8 @@ OPTIONS = {
 }
 """Options whose names in the library differ."""
 SAME = (
-    "samples",
-    "tolerance",
-    "relax",
-    "support",
-    "share",
-    "eye",
-    "target",
-    "up",
-    "frame",
-    "particles",
-    "domain",
-    "estimator",
-    "integrator",
+    *("samples", "tolerance", "relax", "estimator", "integrator", "support", "share", "domain"),
+    *("eye", "target", "up", "frame", "particles"),
 )
 
 
@@ -56,6 +49,33 @@ def by_option(message: str) -> str:
     if found is None or found[1] not in (*OPTIONS, *SAME):
         return message
     return OPTIONS.get(found[1], f"--{found[1]}") + message[found.end() :]
+
+
+@contextlib.contextmanager
+def wrong_usage(before: str = "", of: type[Exception] = ValueError) -> Iterator[None]:
+    """What is refused in the block is wrong usage; `before` stands before what is said of it."""
+    try:
+        yield
+    except of as error:
+        raise UsageError(f"{before}{error}") from error
+
+
+def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Raise `UsageError` where an option is given that is for something else."""
+    for name in names:
+        given = getattr(options, name, None)
+        if given is not None and given is not False:
+            raise UsageError(f"--{name.replace('_', '-')} {why}")
+
+
+def require_writable(path: Path, must_be: str, suffixes: Sequence[str]) -> None:
+    """Know before the work that its result can be written after it."""
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"{path}: {must_be} {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: there is no folder {path.parent} to write it to; make it first")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path}: cannot be written; choose another place with -o")
 
 
 @contextlib.contextmanager
@@ -83,23 +103,15 @@ def tell(command: str, text: str) -> None:
 def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
     """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try."""
     shown = [np.asarray(color, np.float64).reshape(-1, 3) for color in colors]
-    for beyond, what, remedy in (
-        (
-            lambda color: color.max(-1) < DARK,
-            f"darker than {DARK:.0%}",
-            "a larger --opacity, --opacity-by log10:NAME, or another camera",
-        ),
-        (
-            lambda color: color.min(-1) > BRIGHT,
-            f"brighter than {BRIGHT:.0%}",
-            "a smaller --opacity, or another --range or --colormap",
-        ),
+    dark = [float((color.max(-1) < DARK).mean()) for color in shown if len(color)]
+    bright = [float((color.min(-1) > BRIGHT).mean()) for color in shown if len(color)]
+    for shares, what, remedy in (
+        (dark, f"darker than {DARK:.0%}", "a larger --opacity, --opacity-by log10:NAME, or another camera"),
+        (bright, f"brighter than {BRIGHT:.0%}", "a smaller --opacity, or another --range or --colormap"),
     ):
-        shares = [float(beyond(color).mean()) for color in shown if len(color)]
         if shares and min(shares) >= NEARLY_ALL:
-            tell(
-                command, f"{output}: {min(shares):.4g} of the pixels are {what}; try {remedy}".replace(" 1 of the", " all of the")
-            )
+            share = f"{min(shares):.4g}"
+            tell(command, f"{output}: {'all' if share == '1' else share} of the pixels are {what}; try {remedy}")
 
 
 def largest(layer: Any) -> float:
@@ -107,14 +119,8 @@ def largest(layer: Any) -> float:
     return float(np.asarray(layer).max(initial=0))
 
 
-def largest_difference(image: Image, truth: Image) -> float:
-    """Largest difference of any colour channel or alpha of any pixel."""
-    pairs = ((image.color, truth.color), (image.transmittance, truth.transmittance))
-    return max(float(np.abs(np.asarray(one, np.float64) - np.asarray(other)).max()) for one, other in pairs)
-
-
 @contextlib.contextmanager
-def progress(what: str, unit: str = " bands") -> Iterator[Callable[[int, int], None] | None]:
+def progress(what: str, unit: str = " bands") -> Iterator[Progress | None]:
     """A progress bar on stderr where a person watches and tqdm is there, else `None`."""
     try:
         from tqdm import tqdm
@@ -136,6 +142,19 @@ def progress(what: str, unit: str = " bands") -> Iterator[Callable[[int, int], N
 def say(what: str, text: str) -> None:
     """Print a line with its subject in front."""
     print(f"{what:<10}{text}")
+
+
+def say_report(report: Report, support: Any = None) -> None:
+    """Say what was settled of supports, their range where it is known, of volumes and of the kernel."""
+    say("support", report.support if support is None else f"{span(support)}: {report.support}")
+    say("volume", report.volume)
+    say("kernel", report.kernel)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """A line for each."""
+    for note in notes:
+        say("note", note)
 
 
 def span(values: Any) -> str:

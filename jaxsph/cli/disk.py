@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import transfer as cli_transfer
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, camera_line, progress, say, span, time_line
+from jaxsph.cli.console import UsageError, camera_line, progress, refuse, say, span, time_line
+from jaxsph.cli.options import SCENE
 from jaxsph.io.snapshot_index import index_path
 from jaxsph.io.snapshot_rows import Snapshot
 from jaxsph.io.snapshot_sort import sort_snapshot
@@ -45,9 +46,9 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     """
     if not 0 < options.from_disk < 2**20:
         raise UsageError(f"--from-disk must be a positive number of GiB, got {options.from_disk:g}")
-    if options.source is None or options.source.startswith(cli_scene.SCENE):
+    if options.source is None or options.source.startswith(SCENE):
         raise UsageError("--from-disk is for a snapshot file")
-    cli_scene.refuse(options, (*OTHERS, *cli_where.OF_PARTICLES), "needs all particles at once; leave out --from-disk")
+    refuse(options, (*OTHERS, *cli_where.OF_PARTICLES), "needs all particles at once; leave out --from-disk")
     if options.progressive or options.screen == "quadtree" or options.annotate:
         raise UsageError("--from-disk renders the image pane by pane; leave out --progressive, --screen and --annotate")
     with progress("index", " reads") as show:
@@ -67,7 +68,7 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     say("quantity", f"{name}, {span(values)} of a sample of {len(values):,}")
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_transfer.look(on_disk.sample, options, name, on_disk.ramp)
+    transfer = cli_look.look(on_disk.sample, options, name, on_disk.ramp)
     camera = cli_scene.camera_of(on_disk, options)
     say("camera", camera_line(camera))
     started = time.perf_counter()

@@ -21,40 +21,39 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 import jaxsph
 from jaxsph import scenes
-from jaxsph.cli import annotate as cli_annotate
 from jaxsph.cli import cache as cli_cache
-from jaxsph.cli import devices as cli_devices
 from jaxsph.cli import disk as cli_disk
+from jaxsph.cli import look as cli_look
 from jaxsph.cli import merge as cli_merge
 from jaxsph.cli import movie as cli_movie
 from jaxsph.cli import options as cli_options
-from jaxsph.cli import points as cli_points
+from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import project as cli_project
+from jaxsph.cli import render as cli_render
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import several as cli_several
 from jaxsph.cli import sweep as cli_sweep
-from jaxsph.cli import transfer as cli_transfer
-from jaxsph.cli import volume as cli_volume
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import (
+    IMAGES,
     UsageError,
     by_option,
     camera_line,
-    error_line,
     largest,
-    largest_difference,
     progress,
+    refuse,
+    require_writable,
     say,
-    tell_if_unseen,
     time_line,
     warnings_in_lines,
 )
-from jaxsph.cli.progressive import render_in_stages
 from jaxsph.model import Camera, Settings
+from jaxsph.model.camera.camera import BoundingBox
+from jaxsph.trade.contenders import layers_of
 
-IMAGE_SUFFIXES = (".exr", ".png")
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 AGAIN_SECONDS = 0.02
 DEMO_TOLERANCE = 0.004
@@ -166,8 +165,8 @@ def _parser() -> argparse.ArgumentParser:
         made.set_defaults(run=run)
         return made
 
-    render = command("render", _render, "make an image", "What you do not say is chosen, and said.")
-    render.epilog = f"Built-in scenes: {', '.join(cli_scene.SCENE + name for name in scenes.names())}."
+    render = command("render", cli_render.run, "make an image", "What you do not say is chosen, and said.")
+    render.epilog = f"Built-in scenes: {', '.join(cli_options.SCENE + name for name in scenes.names())}."
     cli_options.add_source(render, optional=True, several=True)
     _add_parts(render)
     cli_where.add_places(render)
@@ -176,16 +175,16 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("-o", "--output", type=Path, metavar="OUT", help=where)
     cli_options.add_picture(render)
     cli_options.add_control(render)
-    cli_transfer.add_looks(render)
-    cli_annotate.add_options(render)
-    cli_devices.add_options(render)
+    cli_look.add_looks(render)
+    cli_look.add_key(render)
+    cli_options.add_devices(render)
     cli_merge.add_tile(render)
-    cli_merge.add_options(command("merge", _merge, "make one image of its parts", cli_merge.MORE))
+    cli_merge.add_options(command("merge", cli_merge.run, "make one image of its parts", cli_merge.MORE))
     transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
     cli_options.add_source(transfer)
     cli_options.add_picture(transfer, means=False)
-    cli_transfer.add_looks(transfer)
-    cli_transfer.add_command(transfer)
+    cli_look.add_looks(transfer)
+    cli_look.add_command(transfer)
     info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
     cli_options.add_source(info, optional=True, surface=False)
     _add_parts(info, mixed=False)
@@ -195,15 +194,15 @@ def _parser() -> argparse.ArgumentParser:
         command("project", cli_project.run, "integrate along rays: column densities, means", cli_project.MORE)
     )
     more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
-    sweep = command("sweep", _sweep, "measure error against tolerance against time", more)
+    sweep = command("sweep", cli_sweep.run, "measure error against tolerance against time", more)
     cli_options.add_source(sweep)
     cli_options.add_picture(sweep)
     cli_sweep.add_options(sweep)
     sweep.set_defaults(integrator="samples")  # whose full rate bounds and the pilot keep a tolerance against
-    movie = command("movie", _movie, "make a movie", cli_movie.MORE)
+    movie = command("movie", cli_movie.run, "make a movie", cli_movie.MORE)
     cli_options.add_source(movie, several=True)
     _add_parts(movie)
-    cli_transfer.add_looks(movie)
+    cli_look.add_looks(movie)
     cli_options.add_picture(movie)
     cli_options.add_control(movie)
     cli_where.add_places(movie, slices=False)
@@ -217,109 +216,22 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_parts(parser: argparse.ArgumentParser, *, mixed: bool = True) -> None:
     cli_where.add_selection(parser)
-    cli_volume.add_options(parser)
-    cli_points.add_options(parser, mixed=mixed)
-
-
-def _render(options: argparse.Namespace) -> None:
-    cli_several.render_each(options, _render_one)
-
-
-def _render_one(options: argparse.Namespace) -> None:
-    settings, devices = _settings(options), cli_devices.devices_of(options)
-    cli_where.settle(options)
-    if options.progressive and options.screen == "pixels":
-        raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
-    cli_scene.require_something(options)
-    first = options.source or (options.volume or options.points)[0]
-    output = options.output or Path(cli_several.stem_of(first) + cli_merge.suffix(options))
-    _require_writable(output, cli_where.suffixes(options, IMAGE_SUFFIXES))
-    cli_annotate.check(options, output)
-    cli_merge.check(options, settings, output)
-    if options.from_disk is not None:
-        cli_disk.render(options, settings).save(output)
-        say("image", str(output))
-        return
-    scene, camera = cli_scene.scene_of(options)
-    scene = cli_where.shown(scene, options)
-    if options.slice is not None:
-        cli_where.save_slice(scene, camera, options, output)
-        return
-    say("camera", camera_line(camera, options))
-    started = time.perf_counter()
-    if options.progressive:
-        image = render_in_stages(scene, camera, settings, output)
-    else:
-        with progress("render") as show:
-            image = cli_merge.render(scene, camera, settings, options, show, devices)
-    elapsed = time.perf_counter() - started
-    image = cli_where.labelled(image, options)
-    if options.annotate:
-        cli_annotate.save(image, scene, camera, options, output)
-    else:
-        image.save(output)
-    say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
-    if settings.tolerance is not None:
-        say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
-    say("time", time_line(image, elapsed))
-    if options.tile is None and (scene.particles is None or scene.particles.num_particles):
-        tell_if_unseen(options.command, output, [image.color])
-
-
-def _merge(options: argparse.Namespace) -> None:
-    cli_merge.run(options, _require_writable)
-
-
-def _movie(options: argparse.Namespace) -> None:
-    cli_movie.run(options, _settings(options), cli_scene.scene_of)
+    cli_parts.add_options(parser, mixed=mixed)
 
 
 def _transfer(options: argparse.Namespace) -> None:
-    output = cli_transfer.check_figure(options)
+    output = cli_look.check_figure(options)
     if Path(options.source).suffix.lower() == ".json":
-        of_scenes = ("quantity", "save", *cli_transfer.LOOKS)
-        cli_scene.refuse(options, of_scenes, "is for FILE or scene:NAME, and this is a saved function")
-        cli_transfer.draw_file(options, output)
+        refuse(options, ("quantity", "save", *cli_look.LOOKS), "is for FILE or scene:NAME, and this is a saved function")
+        cli_look.draw_file(options, output)
         return
-    scene, shown, camera = cli_scene.source_of(options)
-    cli_transfer.draw(scene, camera or cli_scene.camera_of(shown, options), options.labels, options, output)
-
-
-def _sweep(options: argparse.Namespace) -> None:
-    settings = _settings(options)
-    if options.frames is not None and options.frame is not None:
-        raise UsageError("--frame and --frames exclude each other; name all moments after --frames")
-    if options.frames is not None and len(set(options.frames)) < len(options.frames):
-        raise UsageError(f"--frames must be different numbers, got {' '.join(f'{moment:g}' for moment in options.frames)}")
-    cli_sweep.require_figures(options)
-    views = []
-    for moment in options.frames or [options.frame]:
-        options.frame = moment
-        views.append((moment, *cli_scene.scene_of(options)))
-    cli_sweep.run(views, settings, Path(options.source.removeprefix(cli_scene.SCENE)).stem, options)
-
-
-def _settings(options: argparse.Namespace) -> Settings:
-    """Settings from the options given; what this version's `Settings` does not know, or refuses, is wrong usage."""
-    if options.memory is not None and not 0 < options.memory < 2**30:
-        raise UsageError(f"--memory must be a positive number of GiB, got {options.memory:g}")
-    given = {
-        "samples": options.samples,
-        **{name: getattr(options, name, None) for name in ("integrator", "tolerance", "estimator", "relax", "screen")},
-        "memory_limit": None if options.memory is None else int(options.memory * 2**30),
-    }
-    given = {name: value for name, value in given.items() if value is not None}
-    missing = sorted(set(given) - {field.name for field in dataclasses.fields(Settings)})
-    if missing:
-        raise UsageError(f"--{missing[0]} is not available in this version")
-    try:
-        return Settings(**given)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    source = cli_scene.source_of(options)
+    camera = source.camera or cli_scene.camera_of(source.shown, options)
+    cli_look.draw(source.scene, camera, source.labels, options, output)
 
 
 def _info(options: argparse.Namespace) -> None:
-    cli_where.settle(options)
+    options = cli_where.settled(options)
     if options.cache:
         for what, text in cli_cache.described():
             say(what, text)
@@ -330,18 +242,19 @@ def _info(options: argparse.Namespace) -> None:
     if options.source is not None:
         shown, camera = cli_scene.described(options)
         parts.append((options.source, shown))
-    parts += [(path, cli_volume.describe(path, options.volume_quantity)) for path in options.volume or ()]
-    parts += cli_points.describe(options)
-    together = cli_points.Together(parts)
-    say("camera", camera_line(camera if camera is not None and len(parts) == 1 else Camera.framing(together)))
-    cli_points.warn(together, options.command)
+    parts += [(path, cli_parts.described_volume(path, options.volume_quantity)) for path in options.volume or ()]
+    parts += cli_parts.points_of(options, described=True)
+    if camera is None or len(parts) > 1:
+        camera = Camera.framing(BoundingBox.around(part for _, part in parts))
+    say("camera", camera_line(camera))
+    cli_parts.warn_apart(parts, options.command)
 
 
 def _demo(options: argparse.Namespace) -> None:
     width, height = options.size
-    outputs = [Path(f"{options.output}{suffix}") for suffix in IMAGE_SUFFIXES]
+    outputs = [Path(f"{options.output}{suffix}") for suffix in IMAGES]
     for output in outputs:
-        _require_writable(output)
+        require_writable(output, "an image must be", IMAGES)
     scene, camera = scenes.load("mixer", width=width, height=height)
     settings = Settings(tolerance=DEMO_TOLERANCE, integrator="samples")
     exact = dataclasses.replace(settings, tolerance=None)
@@ -354,10 +267,9 @@ def _demo(options: argparse.Namespace) -> None:
     for output in outputs:
         image.save(output)
     full = jaxsph.render(scene, camera, exact)
-    error = largest_difference(image, full)
+    error = largest(np.abs(layers_of(image) - layers_of(full)))
     truth, some = truth_of.result(), slice(every // 2, None, every)
-    seen = dataclasses.replace(full, color=full.color[some, some], transmittance=full.transmittance[some, some])
-    rounding = largest_difference(seen, truth)
+    rounding = largest(np.abs(layers_of(full)[some, some] - layers_of(truth)))
     say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
     for output in outputs:
         say("image", str(output.resolve()))
@@ -365,14 +277,3 @@ def _demo(options: argparse.Namespace) -> None:
     say("error", f"{error:.2g}, the largest against full sampling")
     say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
     say("time", time_line(image, elapsed))
-
-
-def _require_writable(path: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> None:
-    """Know before the work that the image can be written after it."""
-    if path.suffix.lower() not in suffixes:
-        raise UsageError(f"{path}: an image must be {' or '.join(suffixes)}")
-    folder = path.parent
-    if not folder.is_dir():
-        raise ValueError(f"{path}: there is no folder {folder} to write it to; make it first")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise ValueError(f"{path}: cannot be written; choose another place with -o")

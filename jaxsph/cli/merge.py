@@ -1,4 +1,4 @@
-"""One picture by several commands: `render --tile I/N` for each part of it, and `merge` for the whole.
+"""One picture by several commands: which part `render --tile I/N` makes, and `merge` for the whole.
 
 Flow: I/N -> render_tile -> part.exr ... parts -> [cli_merge] -> merge -> EXR or PNG.
 """
@@ -6,15 +6,11 @@ Flow: I/N -> render_tile -> part.exr ... parts -> [cli_merge] -> merge -> EXR or
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import jaxsph
 from jaxsph import io
-from jaxsph.cli.console import UsageError, largest, say
-from jaxsph.engine.render import Progress
-from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.cli.console import IMAGES, UsageError, largest, refuse, require_writable, say
+from jaxsph.model import Settings
 from jaxsph.scale import parts as tiles
 
 MORE = "Parts are those of `jaxsph render --tile I/N`, in any order; they must be all of one picture."
@@ -53,29 +49,16 @@ def suffix(options: argparse.Namespace) -> str:
     return ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
 
 
-def check(options: argparse.Namespace, settings: Settings, output: Path) -> None:
+def check_tile(options: argparse.Namespace, settings: Settings, output: Path) -> None:
     """Refuse what a part cannot be asked for."""
     if options.tile is None:
         return
-    for name in ("progressive", "annotate", "slice", "devices"):
-        if getattr(options, name, None):
-            raise UsageError(f"--{name} and --tile exclude each other; --tile is a part of one picture, as it is")
+    others = "progressive", "annotate", "slice", "devices"
+    refuse(options, others, "and --tile exclude each other; --tile is a part of one picture, as it is")
     if settings.screen == "quadtree":
         raise UsageError("--screen quadtree cannot be cut into parts; leave out --screen or --tile")
     if output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-
-
-def render(
-    scene: Scene, camera: Camera, settings: Settings, options: argparse.Namespace, show: Progress | None, devices: Any = None
-) -> Image:
-    """The picture, or the part of it that is asked for."""
-    if options.tile is None:
-        return jaxsph.render(scene, camera, settings, progress=show, devices=devices)
-    image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
-    first = dict(image.metadata)[tiles.FIRST_ROW]
-    say("part", f"{options.tile}, rows {first} to {first + image.shape[0] - 1} of {camera.height}")
-    return image
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -84,9 +67,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help=".exr or .png")
 
 
-def run(options: argparse.Namespace, require_writable: Callable[[Path], Any]) -> None:
+def run(options: argparse.Namespace) -> None:
     """Read the parts, put them together, and write the picture."""
-    require_writable(options.output)
+    require_writable(options.output, "an image must be", IMAGES)
     for path in options.parts:
         if path.suffix.lower() != ".exr":
             raise UsageError(f"{path}: parts are .exr")

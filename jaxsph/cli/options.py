@@ -1,18 +1,25 @@
-"""Options that commands share: what is shown, how, from where, and how exactly.
+"""Options that commands share: what is shown, how, from where, how exactly, and by what.
 
-Flow: [cli_options] -> cli.
+Flow: [cli_options] -> Settings, values -> cli.
 """
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxsph import scenes
+from jaxsph.cli.console import UsageError, wrong_usage
+from jaxsph.engine.runtime.devices import chosen_devices
 from jaxsph.model import Settings, registry
 from jaxsph.model.kernels import KERNELS
 
-SAMPLES = Settings().samples
+SCENE = "scene:"
+"""What the name of a built-in scene begins with."""
+PLACE: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
 INTEGRATORS = tuple(registry.INTEGRATORS)
 
 
@@ -44,23 +51,17 @@ def add_picture(parser: argparse.ArgumentParser, *, means: bool = True) -> None:
     add = parser.add_argument_group("picture").add_argument
     add("--size", type=size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
     if means:
-        add("--samples", type=int, metavar="N", help=f"samples along a ray (default {SAMPLES})")
+        add("--samples", type=int, metavar="N", help=f"samples along a ray (default {Settings().samples})")
         integrator = Settings().integrator
         add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
     add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
-    add(
-        "--range",
-        nargs=2,
-        type=float,
-        metavar=("LOW", "HIGH"),
-        help="values that the colours span (default: nearly all)",
-    )
+    span = "values that the colours span (default: nearly all)"
+    add("--range", nargs=2, type=float, metavar=("LOW", "HIGH"), help=span)
     add("--opacity", type=float, metavar="DEPTH", help=f"typical optical depth (default {depth:g})")
     add = parser.add_argument_group("camera", "default: one that frames the particles").add_argument
-    place: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    add("--eye", **place, help="where the eye is")
-    add("--target", **place, help="what it looks at (default: the middle of the particles)")
-    add("--up", **place, help="upward direction (default 0 1 0)")
+    add("--eye", **PLACE, help="where the eye is")
+    add("--target", **PLACE, help="what it looks at (default: the middle of the particles)")
+    add("--up", **PLACE, help="upward direction (default 0 1 0)")
     add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
     if means:
         add = parser.add_argument_group("means").add_argument
@@ -77,6 +78,51 @@ def add_control(parser: argparse.ArgumentParser) -> None:
     add("--relax", type=float, metavar="R", help="0 is certified, 1 takes neighbouring rays for alike")
 
 
+def add_devices(parser: argparse.ArgumentParser) -> None:
+    """The option of what one picture is shared among."""
+    add = parser.add_argument_group("devices").add_argument
+    add("--devices", type=_devices, metavar="all|N", help="share the picture among devices: all, or so many (default: one)")
+
+
+def settings_of(options: argparse.Namespace) -> Settings:
+    """Settings from the options given; what `Settings` refuses is wrong usage."""
+    if options.memory is not None and not 0 < options.memory < 2**30:
+        raise UsageError(f"--memory must be a positive number of GiB, got {options.memory:g}")
+    names = "samples", "integrator", "tolerance", "estimator", "relax", "screen"
+    given = {name: getattr(options, name, None) for name in names}
+    given["memory_limit"] = None if options.memory is None else int(options.memory * 2**30)
+    with wrong_usage():
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def devices_of(options: argparse.Namespace) -> str | int | None:
+    """The devices that are asked for, if this machine has them."""
+    wanted: str | int | None = options.devices
+    if wanted is not None:
+        if options.progressive:
+            raise UsageError("--devices is not for --progressive, whose stages go by one device; leave out one of them")
+        with wrong_usage("--devices: "):
+            chosen_devices(wanted)
+    return wanted
+
+
+def require_support(options: argparse.Namespace) -> None:
+    """Raise `UsageError` where a support radius is none."""
+    if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
+        raise UsageError(f"--support must be > 0, got {options.support:g}")
+
+
+def stem_of(source: str) -> str:
+    """The name of a picture: that of its source, without a suffix; a number behind a point is none, as in `snap.00001`."""
+    path = Path(source.removeprefix(SCENE))
+    return path.name if path.suffix[1:].isdecimal() else path.stem
+
+
+def replaced(options: argparse.Namespace, **values: Any) -> argparse.Namespace:
+    """The options with some other values; those that were given stay as they are."""
+    return argparse.Namespace(**{**vars(options), **values})
+
+
 def size(text: str) -> tuple[int, int]:
     """Width and height of `640x480`; of one number, a square."""
     parts = text.lower().split("x")
@@ -87,3 +133,9 @@ def size(text: str) -> tuple[int, int]:
     if len(parts) > 2 or width < 1 or height < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size; both edges must be at least 1 pixel, as in 640x480")
     return width, height
+
+
+def _devices(text: str) -> str | int:
+    if text != "all" and not text.removeprefix("-").isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is neither `all` nor a number of devices")
+    return text if text == "all" else int(text)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,10 @@ from jaxsph import io
 from jaxsph.analysis.projection.plan import PIXELS, plan_projection
 from jaxsph.analysis.projection.project import project
 from jaxsph.cli import options as cli_options
+from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, progress, say, span
+from jaxsph.cli.console import UsageError, progress, refuse, say, say_notes, span, wrong_usage
+from jaxsph.cli.options import PLACE
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.projections import SUFFIXES
 from jaxsph.io.quantities import ROLES, choose_quantity
@@ -30,7 +31,6 @@ from jaxsph.model.camera.framing import VIEWS, along_axis
 from jaxsph.model.held import emission
 from jaxsph.model.kernels import KERNELS
 from jaxsph.model.projection import NORMS, Projection
-from jaxsph.scenes.view import snug
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -40,7 +40,6 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 
-TEXT = "integrate along rays: column densities, means, emission"
 MORE = (
     "NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a "
     "column density, number to a column number density, and the integral of any other quantity is taken along rays; nothing is "
@@ -68,11 +67,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
     cli_where.add_selection(parser)
     add = parser.add_argument_group("camera", "default: parallel rays along z, all of the particles").add_argument
-    place: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     add("--axis", choices=tuple(VIEWS), help="parallel rays along an axis")
-    add("--eye", **place, help="perspective from here")
-    add("--target", **place, help="what the eye looks at (default: the middle of the particles)")
-    add("--up", **place, help="upward direction (default 0 1 0)")
+    add("--eye", **PLACE, help="perspective from here")
+    add("--target", **PLACE, help="what the eye looks at (default: the middle of the particles)")
+    add("--up", **PLACE, help="upward direction (default 0 1 0)")
     add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
     depths = "what lies between: coordinates along the --axis, or depths from the --eye"
     add("--depth-range", nargs=2, type=float, metavar=("A", "B"), help=depths)
@@ -85,17 +83,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Project, write, and say."""
-    _check(options)
+    options = _checked(options)
     output = options.output or Path(Path(options.source).stem + ".exr")
-    table = io.read_table(options.source, part_type=options.part_type, progress=sys.stderr.isatty())
+    table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    with cli_where.conditions():
+    with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", options.support, options.kernel, **cli_where.selected(options))
     particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
     say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
     say("kernel", report.kernel)
-    for note in report.notes:
-        say("note", note)
+    say_notes(report.notes)
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
@@ -125,18 +122,16 @@ def _projected(particles: Particles, camera: Camera, held: Any, pixel: str, name
     return image, {"plan": planned, "compile": clock.seconds["compile"], "cast": clock.seconds["cast"]}
 
 
-def _check(options: argparse.Namespace) -> None:
-    """Raise `UsageError` where options exclude each other, or are out of range."""
-    cli_where.settle(options)
+def _checked(options: argparse.Namespace) -> argparse.Namespace:
+    """The options; `UsageError` where they exclude each other, or are out of range."""
+    options = cli_where.settled(options)
     if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{options.output}: a projection must be {', '.join(SUFFIXES)}")
-    if options.support is not None and not (np.isfinite(options.support) and options.support > 0):
-        raise UsageError(f"--support must be > 0, got {options.support:g}")
+    cli_options.require_support(options)
     if options.axis is not None and options.eye is not None:
         raise UsageError("--axis and --eye exclude each other: rays are parallel or spread from the eye")
-    alone = [name for name in ("target", "up", "fov") if getattr(options, name) is not None and options.eye is None]
-    if alone:
-        raise UsageError(f"--{alone[0]} needs --eye: from where should it be looked at?")
+    if options.eye is None:
+        refuse(options, ("target", "up", "fov"), "needs --eye: from where should it be looked at?")
     if options.emission is not None and options.weight is not None:
         raise UsageError("--emission is an integral, not a mean: leave out --weight")
     if options.depth_range is not None and not options.depth_range[0] < options.depth_range[1]:
@@ -144,6 +139,7 @@ def _check(options: argparse.Namespace) -> None:
     png = options.output is not None and options.output.suffix.lower() == ".png"
     if not png and any(getattr(options, name) is not None for name in ("colormap", "norm", "range")):
         raise UsageError("--colormap, --norm and --range are for a picture: name one with -o OUT.png")
+    return options
 
 
 class _Columns:
@@ -210,19 +206,11 @@ def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, 
 
 
 def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
-    width, height = options.size
     depths = None if options.depth_range is None else tuple(options.depth_range)
-    try:
-        if options.eye is None:
-            return along_axis(particles, options.axis or "z", width, height, slab=depths)
-        lower, upper = particles.bounds()
-        target = (lower + upper) / 2 if options.target is None else options.target
-        near, far = depths or (1e-3, 1.0)
-        fov = 45.0 if options.fov is None else options.fov
-        made = Camera.look_at(options.eye, target, options.up or (0, 1, 0), fov, width, height, near=near, far=far)
-        return made if depths else snug(made, particles)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    if options.eye is not None:
+        return cli_scene.camera_of(particles, options, depths)
+    with wrong_usage():
+        return along_axis(particles, options.axis or "z", *options.size, slab=depths)
 
 
 def _look(options: argparse.Namespace) -> dict[str, Any]:

@@ -6,11 +6,12 @@ Flow: scene, camera -> sweep -> [cli_sweep] -> table and figures in a folder.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
-from jaxsph.cli.console import progress, say
-from jaxsph.model import Camera, Scene, Settings
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli.console import UsageError, progress, say
+from jaxsph.cli.options import SCENE, replaced, settings_of
+from jaxsph.model import Settings
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade import contenders
 from jaxsph.trade.measurement import JOURNAL, TABLE, Measurement
@@ -36,22 +37,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--no-figures", action="store_true", help="write the table only")
 
 
-def require_figures(options: argparse.Namespace) -> None:
-    """Know before anything is read that figures can be drawn, if they are to be."""
-    if not options.no_figures:
-        figures.require_matplotlib()
-
-
-def run(views: Sequence[tuple[float | None, Scene, Camera]], settings: Settings, name: str, options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> None:
     """Sweep, write, and say."""
+    settings = settings_of(options)
+    if options.frames is not None and options.frame is not None:
+        raise UsageError("--frame and --frames exclude each other; name all moments after --frames")
+    if options.frames is not None and len(set(options.frames)) < len(options.frames):
+        raise UsageError(f"--frames must be different numbers, got {' '.join(f'{moment:g}' for moment in options.frames)}")
+    if not options.no_figures:
+        figures.require_matplotlib()  # before anything is read
+    moments = options.frames or [options.frame]
+    views = [cli_scene.scene_of(replaced(options, frame=moment))[:2] for moment in moments]
+    scenes, cameras = zip(*views, strict=True)
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
     chosen = {part: getattr(options, part) for part in parts}
-    numbers, scenes, cameras = zip(*views, strict=True)
-    moments = None if numbers == (None,) else numbers
-    place = (scenes, cameras) if moments else (scenes[0], cameras[0])
+    chosen |= {"name": Path(options.source.removeprefix(SCENE)).stem, "folder": options.output}
     with progress("sweep", " images") as show:
-        more = {"name": name, "frames": moments, "folder": options.output, "progress": show}
-        rows = sweep(place[0], place[1], settings, **chosen, **more)
+        if moments == [None]:
+            rows = sweep(scenes[0], cameras[0], settings, **chosen, progress=show)
+        else:
+            rows = sweep(scenes, cameras, settings, **chosen, frames=moments, progress=show)
     print(f"\n{'method':17s} tolerance max error  mean error  to integral      bound  evaluations  seconds  of full rate")
     print("\n".join(map(_line, rows)) + "\n")
     written = [options.output / JOURNAL, options.output / TABLE]

@@ -14,11 +14,12 @@ import dataclasses
 import itertools
 import warnings
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from jaxsph.numerics.checks import Progress
 
 from .replace import written_whole
 from .snapshot_rows import RUN, Snapshot, needed_columns, supports_and_volumes, together
@@ -27,7 +28,6 @@ from .table import ParticleTable
 SUFFIX = ".jaxsph-index.npz"
 OF_RUNS = "run_"
 VERSION = 2
-Progress = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxsph.numerics.checks import Progress
+
 from .damage import DataError
 from .datasets import read_dataset
 from .hdf5_links import holds, member, members, opened
@@ -24,7 +26,6 @@ from .hdf5_storage import shape_of
 from .optional import require
 from .replace import written_whole
 from .reserved import reserve
-from .snapshot_index import Progress
 from .snapshot_rows import Snapshot
 
 BITS = 4

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import NOTHING, Particles
@@ -110,6 +112,20 @@ class Scene:
     def point_sets(self) -> tuple[Points, ...]:
         """All of them."""
         return _all_of(self.points)
+
+    @property
+    def looks(self) -> tuple[TransferFunction, ...]:
+        """All transfer functions: that of particles, then those of volumes."""
+        return (*_all_of(self.transfer), *_all_of(self.volume_transfer))
+
+    @property
+    def parts(self) -> tuple[Bounded, ...]:
+        """Particles, volumes and point sets: what says how large it is, as media do not."""
+        return (*_all_of(self.particles), *_all_of(self.volume), *self.point_sets)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the box around all particles, volumes and points (host side); zeros around nothing."""
+        return BoundingBox.around(self.parts)
 
     @property
     def particle_set(self) -> Particles:

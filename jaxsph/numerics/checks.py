@@ -7,12 +7,26 @@ and bad data becomes a fault bit (`jaxsph.numerics.faults`).
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
+
+Progress = Callable[[int, int], None]
+"""Told how far work is, as `progress(done, total)`."""
+Record = TypeVar("Record")
+
+
+def record_of(kind: type[Record], given: dict[str, Any], of: str) -> Record:
+    """A dataclass of the keyword arguments that a function has for it; `TypeError` names one that it does not have."""
+    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    wrong = next((name for name in given if name not in known), None)
+    if wrong is not None:
+        raise TypeError(f"`{of}` has no argument `{wrong}`; others that it has are {', '.join(known)}")
+    return kind(**given)
 
 
 def is_traced(*values: Any) -> bool:

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.labels import CODE_UNITS
+from jaxsph.io.quantities import LOG_PREFIX
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.scales import Scale
 
-LOG_PREFIX = "log10:"
 STEPS = 256
 MAX_TICKS = 7
 POWER = re.compile(r"\^(-?[\d./]+)")

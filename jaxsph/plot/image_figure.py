@@ -7,10 +7,12 @@ Pixels of the image are pixels of the figure, as they are in the PNG without a k
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxsph.io.labels import CODE_UNITS, Labels
 from jaxsph.io.optional import require
@@ -18,7 +20,6 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, Axis, raised
-from jaxsph.plot.projected import bounds_of, box_lines, pixels_per_length, round_length, to_pixels
 
 DOTS_AN_INCH = 100
 LETTERS = 42  # lines of text that are as high as the image
@@ -29,6 +30,8 @@ LONGEST_BAR = 0.25  # of the image's width
 TALLEST = 0.55  # of a letter: its mean width
 AXES_COLORS = "#ff7b72", "#7ee787", "#79b8ff"
 LIGHT, DARK = "#ffffff", "#000000"
+PIECES = 128  # of an edge, each of which is hidden or not
+AHEAD = 1e-3  # of the far depth, before which nothing is drawn
 
 
 def image_figure(
@@ -70,7 +73,7 @@ def image_figure(
     if camera is not None and (camera.height, camera.width) != image.shape:
         size, given = f"{image.shape[1]} x {image.shape[0]}", f"{camera.width} x {camera.height}"
         raise ValueError(f"`camera` must be the one of the image, of {size} pixels, got one of {given}")
-    labels, bounds = Labels.of(labels), None if scene is None else bounds_of(scene)
+    labels, bounds = Labels.of(labels), None if scene is None or not scene.parts else scene.bounds()
     bars = [] if scene is None else _bars(scene, labels)
     page = _Page(image)
     if camera is not None and bounds is not None and outline:
@@ -86,7 +89,7 @@ def image_figure(
 
 
 def _bars(scene: Scene, labels: Labels) -> list[Axis]:
-    looks = [*([] if scene.transfer is None else [scene.transfer]), *(look for _, look in scene.volumes)]
+    looks = scene.looks
     names = [f"volume {number}" if len(looks) > 2 else "volume" for number in range(1, len(looks))]
     first = [Axis(look, labels.quantity, labels.unit, labels.factor) for look in looks[:1]]
     return first + [Axis(look, name, CODE_UNITS) for look, name in zip(looks[1:], names, strict=True)]
@@ -217,6 +220,66 @@ class _Page:
         axes.set_ylabel(bar.title if fits else bar.title.replace(" (", "\n(", 1), fontsize=self.points)
         extent = axes.get_tightbbox(self.canvas.get_renderer())
         self._fit(int(np.ceil((self.whole if extent is None else extent.x1) + 0.6 * self.letter)))
+
+
+class Lines(NamedTuple):
+    """Pieces of lines in pixels, x to the right and y down from the upper left corner of the image.
+
+    Attributes:
+        ends: of the pieces.
+        depth: of their middles, length units.
+    """
+
+    ends: Float[np.ndarray, "pieces 2 2"]
+    depth: Float[np.ndarray, " pieces"]
+
+    def hidden(self, depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, " pieces"]:
+        """Which of them lie behind the depth at which transmittance falls to 1/2."""
+        height, width = depth.shape
+        column, row = np.floor(self.ends.mean(1)).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        at = depth[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
+        return inside & (at < self.depth)
+
+
+def to_pixels(camera: Camera, position: Float[np.ndarray, "... 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel coordinates (..., 2) of world positions, the middle of the first pixel at 1/2; and their depths.
+
+    What is not ahead of a perspective eye has no place: NaN.
+    """
+    view = (np.asarray(position, np.float64) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    depth = view[..., 2]
+    ahead = depth > AHEAD * abs(float(camera.far)) if camera.is_perspective else np.ones(depth.shape, bool)
+    spread = np.where(ahead, depth, 1) if camera.is_perspective else np.ones_like(depth)
+    half = float(camera.half_height)
+    x = (view[..., 0] / spread / half * camera.height + camera.width) / 2
+    y = (1 - view[..., 1] / spread / half) / 2 * camera.height
+    return np.where(ahead[..., None], np.stack([x, y], -1), np.nan), depth
+
+
+def box_lines(camera: Camera, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> Lines:
+    """The twelve edges of a box, in pieces; those that are not ahead of the eye are left out."""
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    pairs = [(one, other) for one, other in itertools.combinations(corners, 2) if np.abs(one - other).sum() == 1]
+    share = np.linspace(0, 1, PIECES + 1)[:, None]
+    places = np.array([lower + (upper - lower) * (one + (other - one) * share) for one, other in pairs])
+    pixels, depth = to_pixels(camera, places)
+    ends = np.stack([pixels[:, :-1], pixels[:, 1:]], 2).reshape(-1, 2, 2)
+    middle = ((depth[:, :-1] + depth[:, 1:]) / 2).ravel()
+    drawn = np.isfinite(ends).all((1, 2))
+    return Lines(ends[drawn], middle[drawn])
+
+
+def pixels_per_length(camera: Camera, depth: float) -> float:
+    """Pixels that a length unit across the line of sight takes at a depth; in the middle of the image, and anywhere else."""
+    spread = depth if camera.is_perspective else 1.0
+    return camera.height / (2 * float(camera.half_height) * spread)
+
+
+def round_length(most: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is at most `most`, > 0."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max((step * power for step in (1, 2, 5) if step * power <= most), default=power))
 
 
 Image.drawer = staticmethod(image_figure)

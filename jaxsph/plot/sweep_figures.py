@@ -181,17 +181,11 @@ def _error(points: Sequence[Point], title: str) -> Any:
         top = max(4 * tolerances[-1], 2 * max(drawn))
         axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
         axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
-    for method, color in COLORS.items():
+    for method in COLORS:
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
             x = [point.tolerance for point in row]
-            style: dict[str, Any] = {
-                "color": color,
-                "marker": MARKERS[method],
-                "markersize": MARKER_SIZES[method],
-                "clip_on": False,
-            }
-            style["linewidth"] = MARKER_SIZES[method] / 3
+            style = {**_look(method, points), "clip_on": False, "linewidth": MARKER_SIZES[method] / 3}
             axis.plot(x, [_shown(point.kept or 0.0) for point in row], label=f"{method}: error", **style)
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]

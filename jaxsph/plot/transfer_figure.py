@@ -85,7 +85,7 @@ def transfer_figure(
 
 def _met(transfer: TransferFunction, scene: Scene, camera: Camera, rays: int, bins: int) -> Met:
     """Of the part that has this function; of the first part under it where none has."""
-    looks = [*([] if scene.transfer is None else [scene.transfer]), *(look for _, look in scene.volumes)]
+    looks = scene.looks
     number = next((number for number, look in enumerate(looks) if look is transfer), None)
     if number is not None:
         return met(scene, camera, rays=rays, bins=bins, of=number)

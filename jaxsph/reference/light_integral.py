@@ -8,7 +8,6 @@ $I = \int T(l)\,c(l)\,\sigma(l)\,dl$ over the path length l, with $T(l) = \exp(-
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
+from jaxsph.numerics.checks import Progress
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import AtNodes, Light, light_of, where_thickness
 from jaxsph.reference.media import Part, Whole, parts_of
@@ -28,8 +28,6 @@ MOST_PORTIONS = 1 << 16  # of a ray; beyond, its error is told as it is
 LEAST_TOLERANCE = 1e-12
 ROUNDING = 64 * np.finfo(float).eps  # of a ray's sums
 SHORTEST = 4 * np.finfo(float).eps  # of the depth
-
-Progress = Callable[[int, int], None]
 
 
 def integral(

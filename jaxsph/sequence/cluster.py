@@ -1,6 +1,6 @@
-"""Frames on the workers of a cluster of Dask's: each is read, rendered and written there, and told of here.
+"""Frames on workers of Dask's, of a cluster or processes of this machine: read, rendered and written there, told of here.
 
-Flow: FrameTask -> [frames_on_cluster: bytes -> worker -> outcome] -> images or files, in order.
+Flow: FrameTask -> [workers: bytes -> worker -> outcome] -> images or files, in order.
 
 One worker makes the plan of the first frame, and all compile for that; where a frame outgrows it, the plan that its worker made
 goes with later frames. Room changes no bit of an image, and all else in a plan is the first frame's: so images are the same bits
@@ -13,10 +13,14 @@ import contextlib
 import dataclasses
 import io
 import itertools
+import logging
+import os
 import pickle
+import signal
 import threading
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +32,6 @@ from jaxsph.numerics.version import __version__
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.task import (
     FrameFile,
-    FramesError,
     FrameTask,
     GrowingPlan,
     Still,
@@ -39,6 +42,10 @@ from jaxsph.sequence.task import (
     written,
 )
 
+distributed = require("distributed", "frames on several processes", "cluster")
+dask: Any = require("dask", "frames on several processes", "cluster")
+cloudpickle: Any = require("cloudpickle", "frames on several processes", "cluster")
+WorkerPlugin: Any = distributed.WorkerPlugin
 AHEAD = 2
 """Frames a worker that are on the way: one that is rendered, one that waits."""
 RETRIES = 2
@@ -47,6 +54,18 @@ SHARED = 4
 """Scenes and sequences that are kept by the cluster, the latest: frames come from few."""
 GONE = "the scheduler of the cluster is gone ({}); frames that are written stay"
 LARGE = "distributed.admin.large-graph-warning-threshold"
+CLOSING = 10.0
+"""Seconds that workers have to end by themselves; those that compile do not hear, and are killed."""
+PROFILE = "distributed.worker.profile.enabled"
+"""Whether Dask looks at what its workers are at, 100 times a second: half of what idle ones use, and nobody reads it here."""
+CACHE = (
+    "jax_enable_compilation_cache",
+    "jax_compilation_cache_dir",
+    "jax_compilation_cache_max_size",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+"""What JAX is told of compiled programs that are kept: workers share them with the process that starts them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,17 +93,10 @@ class Outcome(NamedTuple):
 
 def files_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) -> Iterator[FrameFile]:
     """Files of all frames, in order; see `jaxsph.render_frames`."""
-    failed: list[FrameFile] = []
-    last = 0
     for task, outcome in _Sequence(client, ahead).outcomes(tasks):
-        frame, last = outcome.frame, task.number
-        if outcome.error is not None:
-            frame = unmade(task, outcome.error)
-            failed.append(frame)
+        frame = outcome.frame if outcome.error is None else unmade(task, outcome.error)
         assert isinstance(frame, FrameFile) and task.output is not None
         yield dataclasses.replace(frame, path=task.output)
-    if failed:
-        raise FramesError(failed, last)
 
 
 def images_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) -> Iterator[Image]:
@@ -111,61 +123,70 @@ class _Sequence:
 
     def outcomes(self, tasks: Iterator[FrameTask]) -> Iterator[tuple[FrameTask, Outcome]]:
         """Of all frames in order, no more of which are on the way than keeps workers busy."""
-        finished = require("distributed", "frames on a cluster", "cluster").as_completed(loop=self._client.loop)
-        running: dict[str, tuple[Any, FrameTask]] = {}
-        ready: dict[int, tuple[FrameTask, Outcome]] = {}
+        finished = distributed.as_completed(loop=self._client.loop)
+        frames: dict[str, tuple[FrameTask, Any]] = {}  # by the name of what was sent: outcomes, or futures of them
         trouble: Exception | None = None
         more = True
         try:
-            for number in itertools.count(1):
-                while number not in ready and (more or running):
-                    while more and len(running) + _held(ready) < self._room():
-                        try:
-                            task = next(tasks, None)
-                        except Exception as error:  # told of after the frames before it
-                            task, trouble = None, error
-                        more = task is not None
-                        if task is not None:
-                            self._begin_or_send(task, running, ready, finished)
-                    if number not in ready and running:
-                        future = next(finished)
-                        task = running.pop(future.key)[1]
-                        ready[task.number] = task, self._received(future)
-                if number not in ready:
+            while True:
+                while more and self._has_room(found for _, found in frames.values()):
+                    try:
+                        task = next(tasks, None)
+                    except Exception as error:  # told of after the frames before it
+                        task, trouble = None, error
+                    more = task is not None
+                    if task is not None:
+                        found = self._begun(task)
+                        if isinstance(found, Outcome):
+                            frames[f"frame {task.number}"] = task, found
+                        else:
+                            frames[found.key] = task, found
+                            finished.add(found)
+                if not frames:
                     break
-                yield ready.pop(number)
+                first = next(iter(frames))
+                if isinstance(frames[first][1], Outcome):
+                    yield frames.pop(first)
+                else:
+                    future = next(finished)
+                    frames[future.key] = frames[future.key][0], self._received(future)
         except OSError as error:  # what is wrong with a frame is in its outcome
             raise RuntimeError(GONE.format(type(error).__name__)) from error
         finally:
             with contextlib.suppress(Exception):  # of a cluster that is gone nothing is on the way
-                self._client.cancel([future for future, _ in running.values()])
+                self._client.cancel([found for _, found in frames.values() if not isinstance(found, Outcome)])
         if trouble is not None:
             raise trouble
 
-    def _begin_or_send(self, task: FrameTask, running: dict[str, Any], ready: dict[int, Any], finished: Any) -> None:
+    def _has_room(self, frames: Iterable[Any]) -> bool:
+        """For one more frame, beside those on the way and the images that wait; what is told of files takes no room."""
+        if self._client.status != "running":
+            raise RuntimeError(GONE.format(self._client.status))
+        held = sum(not isinstance(found, Outcome) or isinstance(found.frame, bytes) for found in frames)
+        return held < AHEAD * max(len(self._client.nthreads()), 1)
+
+    def _begun(self, task: FrameTask) -> Any:
+        """The future of a frame's outcome, sent once there is a plan; its outcome, where planning tells that."""
         if self._lead.first is None:
             outcome = self._received(self._send(task, "plan"))
             if outcome.error is None:
                 self._lead = dataclasses.replace(self._lead, first=task)
             if outcome.error is not None or outcome.frame is not None:
-                ready[task.number] = task, outcome
-                return
-        future = self._send(task, "frame")
-        running[future.key] = future, task
-        finished.add(future)
-
-    def _room(self) -> int:
-        if self._client.status != "running":
-            raise RuntimeError(GONE.format(self._client.status))
-        return AHEAD * max(len(self._client.nthreads()), 1)
+                return outcome
+        return self._send(task, "frame")
 
     def _send(self, task: FrameTask, what: str) -> Any:
-        """Have a frame planned for or made by some worker."""
+        """Have a frame planned for or made by some worker, which may stand in another folder."""
         lead = self._lead if self._lead.plan is None else Lead(None, (), self._lead.plan)
-        payload, shared = self._packed((_found_anywhere(task), lead))
+        there = task if task.output is None else dataclasses.replace(task, output=task.output.absolute())
+        payload, shared = self._packed((there, lead))
         how = {"key": f"{self._name}-{what}-{task.number}", "pure": False, "retries": RETRIES}
-        with _silent():
-            return self._client.submit(_do, what, __version__, self._x64, payload, shared, **how)
+        return self._submit(_do, what, __version__, self._x64, payload, shared, **how)
+
+    def _submit(self, *what: Any, **how: Any) -> Any:
+        """Without Dask's advice on tasks of many bytes: a scene is sent once, and kept by the scheduler for workers to come."""
+        with dask.config.set({LARGE: "1 PB"}):
+            return self._client.submit(*what, **how)
 
     def _received(self, future: Any) -> Outcome:
         """What became of a frame, once it is known; what no other frame would escape is raised."""
@@ -199,29 +220,11 @@ class _Sequence:
 
     def _kept(self, thing: Any) -> Any:
         """What frames share, kept by the cluster as the result of a task: made again where the workers that had it are gone."""
-        with _silent():
-            return self._client.submit(_same, _pickled(thing), key=f"{self._name}-shared-{next(self._sent)}")
-
-
-def _held(ready: dict[int, tuple[FrameTask, Outcome]]) -> int:
-    """Images that wait for those before them; what is told of files takes no room."""
-    return sum(isinstance(outcome.frame, bytes) for _, outcome in ready.values())
-
-
-def _found_anywhere(task: FrameTask) -> FrameTask:
-    """A worker may stand in another folder."""
-    return task if task.output is None else dataclasses.replace(task, output=task.output.absolute())
-
-
-def _silent() -> Any:
-    """Without Dask's advice on tasks of many bytes: a scene is sent once, and kept by the scheduler for workers to come."""
-    dask: Any = require("dask", "frames on a cluster", "cluster")
-    return dask.config.set({LARGE: "1 PB"})
+        return self._submit(_same, _pickled(thing), key=f"{self._name}-shared-{next(self._sent)}")
 
 
 def _pickled(thing: Any, shared: Callable[[Any], str | None] = lambda _: None) -> bytes:
     """As bytes, functions of the user's script included; what is `shared` by its name."""
-    cloudpickle: Any = require("cloudpickle", "frames on a cluster", "cluster")
 
     class Packer(cloudpickle.Pickler):  # type: ignore[misc]
         def persistent_id(self, inner: Any) -> str | None:
@@ -282,3 +285,105 @@ def _made(task: FrameTask, lead: Lead) -> Outcome:
     if first.number != task.number:
         plan.begin(first)
     return Outcome(pickle.dumps(rendered(task, task.scene(), plan)), plan.made)
+
+
+@contextlib.contextmanager
+def local_client(workers: int, *, cores: Sequence[int] | None = None) -> Iterator[Any]:
+    """A client of so many processes of this machine, which end with the block.
+
+    Cores are dealt out: each worker keeps to its own, as frames are independent, and programs of one frame that run side by side
+    lose some of what two cores give. Accelerators are dealt out in turns. Processes are spawned, as forked ones would share JAX's
+    threads and stop; so a script that calls this needs `if __name__ == "__main__":`.
+
+    Args:
+        workers: how many.
+        cores: numbers of the cores that are dealt out; all that this process may use.
+
+    Raises:
+        ImportError: distributed is not installed.
+        ValueError: less than one worker.
+    """
+    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+        raise ValueError(f"`workers` must be an integer of at least 1, got {workers!r}")
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several processes may share an accelerator
+    config = {name: getattr(jax.config, name) for name in CACHE}
+    share = Share(workers, _cores() if cores is None else cores, _accelerators(), config)
+    how = {"threads_per_worker": 1, "processes": True, "memory_limit": 0, "silence_logs": logging.CRITICAL}
+    no_pages = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}  # at any free port, as several may run
+    with dask.config.set({PROFILE: False}), _held_back() as came:
+        cluster = distributed.LocalCluster(n_workers=workers, scheduler_kwargs=no_pages, dashboard_address=None, **how)
+    try:
+        for late in came[:1]:
+            signal.raise_signal(late)
+        with distributed.Client(cluster) as client:
+            client.register_plugin(share)
+            yield client
+    finally:
+        cluster.close(timeout=CLOSING)
+
+
+@contextlib.contextmanager
+def _held_back() -> Iterator[list[int]]:
+    """Note signals that come in the block, for later: processes that are half started cannot be closed."""
+    came: list[int] = []
+    before: dict[signal.Signals, Any] = {}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if callable(handler) and threading.current_thread() is threading.main_thread():
+                before[number] = handler
+                signal.signal(number, lambda late, _: came.append(late))
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@dataclasses.dataclass(eq=False)
+class Share(WorkerPlugin):  # type: ignore[misc]
+    """What a worker has of the machine; also of one that stands in for another that died, as it has the same name."""
+
+    workers: int
+    cores: Sequence[int]
+    accelerators: Sequence[str]
+    config: dict[str, Any]
+    name = "jaxsph-share"
+
+    def setup(self, worker: Any) -> None:
+        """Keep to some cores; leave it to the process that started this one, which closes it, to hear of signals."""
+        place = int(worker.name)
+        with contextlib.suppress(ValueError):  # only the main thread may
+            for number in (signal.SIGINT, signal.SIGTERM):  # those of a job get both at once, to all of its processes
+                signal.signal(number, signal.SIG_IGN)
+        for name, value in self.config.items():
+            jax.config.update(name, value)
+        if self.accelerators:
+            os.environ["CUDA_VISIBLE_DEVICES"] = self.accelerators[place % len(self.accelerators)]
+        if self.cores:
+            keep_to(share_of(self.cores, place, self.workers))
+
+
+def share_of(cores: Sequence[int], place: int, workers: int) -> list[int]:
+    """Every n-th core, or where there are fewer cores than workers one that others have, too."""
+    return list(cores[place::workers]) or [cores[place % len(cores)]]
+
+
+def keep_to(cores: Sequence[int]) -> None:
+    """Have all threads that this process has, and those that they start, run on some cores alone."""
+    for thread in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            os.sched_setaffinity(int(thread.name), cores)
+
+
+def _cores() -> list[int]:
+    """Cores that this process may use; none where the system deals them out itself."""
+    known = hasattr(os, "sched_getaffinity") and Path("/proc/self/task").is_dir()
+    return sorted(os.sched_getaffinity(0)) if known else []
+
+
+def _accelerators() -> list[str]:
+    """Names of the CUDA devices that this process may use."""
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name]
+    return sorted(path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*"))

@@ -16,7 +16,17 @@ import numpy as np
 
 from jaxsph.model import Camera, CameraPath, Image, Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots, Unreadable
-from jaxsph.sequence.task import FrameFile, FramesError, FrameTask, GrowingPlan, Still, UnwritableError, rendered, unmade, written
+from jaxsph.sequence.task import (
+    FrameFile,
+    FrameTask,
+    GrowingPlan,
+    Still,
+    UnwritableError,
+    each_or_raise,
+    rendered,
+    unmade,
+    written,
+)
 
 AHEAD = 16
 """Cameras, evenly spread, that are measured with the first scene before anything is compiled: it takes milliseconds each."""
@@ -70,8 +80,11 @@ def render_frames(
     if client is not None:
         from jaxsph.sequence.cluster import files_on, images_on
 
-        return images_on(client, tasks, ahead) if output is None else files_on(client, tasks, ahead)
-    return _images(tasks, GrowingPlan(ahead)) if output is None else _files(tasks, GrowingPlan(ahead))
+        return images_on(client, tasks, ahead) if output is None else each_or_raise(files_on(client, tasks, ahead))
+    plan = GrowingPlan(ahead)
+    if output is None:
+        return (rendered(task, task.scene(), plan) for task in tasks)
+    return each_or_raise(_files(tasks, plan))
 
 
 def _require_client(client: Any) -> None:
@@ -92,27 +105,19 @@ def _some(cameras: Any) -> Sequence[Camera]:
     return some if len({id(camera) for camera in some}) > 1 else ()
 
 
-def _images(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[Image]:
-    for task in tasks:
-        yield rendered(task, task.scene(), plan)
-
-
 def _files(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[FrameFile]:
-    """Write what is not there yet; what cannot be made is told of, and raised at the end."""
-    first, failed, last = None, [], 0
+    """Write what is not there yet; what cannot be made is told of."""
+    first = None
     for task in tasks:
-        first, last = first or task, task.number
+        first = first or task
         try:
             frame = written(task, plan, first)
         except UnwritableError:
             raise
         except Exception as error:
             frame = unmade(task, error)
-            failed.append(frame)
             first = None if first is task else first
         yield frame
-    if failed:
-        raise FramesError(failed, last)
 
 
 def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int], Path] | None) -> Iterator[FrameTask]:
@@ -126,7 +131,10 @@ def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int
     sources = Still(sources) if isinstance(sources, Scene) else _read(sources, strict=output is None)
     one_source, one_camera = _is_one(sources), isinstance(cameras, Camera)
     if not one_source and not one_camera:
-        _require_as_many(sources, cameras)
+        numbers = [len(each) for each in (sources, cameras) if hasattr(each, "__len__")]
+        if len(set(numbers)) > 1:
+            both = f"there are {numbers[0]} `sources` and {numbers[1]} `cameras`"
+            raise ValueError(f"{both}; give one of each a frame, or one for all")
     if one_source:
         sources = [sources] if one_camera else itertools.repeat(sources)
     if one_camera:
@@ -165,12 +173,6 @@ def _read(sources: Any, *, strict: bool) -> Any:
         return sources
     each = Snapshots.from_files(paths, strict=strict).each()
     return each[0] if paths is not sources else each
-
-
-def _require_as_many(sources: Any, cameras: Any) -> None:
-    numbers = [len(each) for each in (sources, cameras) if hasattr(each, "__len__")]
-    if len(set(numbers)) > 1:
-        raise ValueError(f"there are {numbers[0]} `sources` and {numbers[1]} `cameras`; give one of each a frame, or one for all")
 
 
 def _pattern(output: str | os.PathLike[str] | None) -> Callable[[int], Path] | None:

@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
-import hashlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.io.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles import capacity_class
-from jaxsph.sequence.survey import Reading, Survey, surveyed
+from jaxsph.numerics.checks import Progress, record_of
+from jaxsph.numerics.digest import digest_of, fingerprint
+from jaxsph.sequence.survey import Reading, Survey, Way, Who, surveyed, way_between
 
 ROUNDING = 1e-9
 """Share of the way between two snapshots by which a time may miss one of them, and mean it."""
@@ -32,15 +32,7 @@ class Loaded(NamedTuple):
 
     columns: dict[str, np.ndarray]
     kernel: str
-    ids: np.ndarray | str
-    velocity: np.ndarray | None
-
-
-class Way(NamedTuple):
-    """From one snapshot to the next: who is who, and velocities times the time between where they tell how particles move."""
-
-    matched: Matched
-    run: tuple[np.ndarray, np.ndarray] | None
+    who: Who
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,31 +59,22 @@ class Snapshots:
         paths: Iterable[str | os.PathLike[str]],
         quantity: str | None = None,
         *,
-        support: float | None = None,
-        kernel: str | None = None,
-        part_type: int | None = None,
-        box: Any = "file",
-        where: str | None = None,
-        share: float | None = None,
         center: Any = None,
         within: Clip | None = None,
-        opacity_by: str | None = None,
         transfer: TransferFunction | None = None,
         colormap: str = "viridis",
         gaps: bool = False,
         strict: bool = True,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
+        **reading: Any,
     ) -> Snapshots:
         """Read all files once, for their times and the range of the quantity over all of them.
 
         Args:
             paths: of particle files, in any order: times in the files order them, else numbers in their names.
-            quantity, support, kernel, part_type: as for `jaxsph.io.read_particles`; a quantity that is chosen is chosen by the
-                file in the middle, and taken of all.
-            box, where, share: as for `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids.
+            quantity: as for `jaxsph.io.read_particles`; one that is chosen is chosen by the file in the middle, and taken of all.
             center: (3,) middle of the periodic box, or "densest" for the densest point of the file in the middle.
             within: where particles are shown; default everywhere.
-            opacity_by: as for `jaxsph.io.read_particles`; `"auto"` by the file in the middle.
             transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
                 that suits the file in the middle.
             colormap: name of a colour map.
@@ -99,13 +82,17 @@ class Snapshots:
             strict: whether files that cannot be read are refused. Else the sequence is that of all others, and times between
                 the two beside such a file have no scene.
             progress: called as `progress(done, total)` after every file.
+            reading: `support`, `kernel`, `part_type`, `box`, `where`, `share` and `opacity_by`, as for
+                `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids, and opacity by `"auto"`
+                is by the file in the middle.
 
         Raises:
             FileNotFoundError: there is no such file.
+            TypeError: an argument that there is not.
             ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        reading = Reading(quantity, support, kernel, part_type, box, where, share, opacity_by)
-        survey = surveyed(paths, reading, gaps=gaps, strict=strict, progress=progress)
+        how = record_of(Reading, {"quantity": quantity, **reading}, "Snapshots.from_files")
+        survey = surveyed(paths, how, gaps=gaps, strict=strict, progress=progress)
         if transfer is None:
             ramp = None if survey.report.opacity_by is None else "steep"
             transfer = scenes.default_transfer(survey.middle, colormap, survey.span, ramp=ramp)
@@ -167,12 +154,8 @@ class Snapshots:
         """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
         before, share = self.place(time)
         files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
-        look = self.transfer, self.within
-        told = files, share, self.survey.reading, self.survey.quantity, self.center, jax.tree.structure(look)
-        digest = hashlib.sha256(repr(told).encode())
-        for leaf in jax.tree.leaves(look):
-            digest.update(np.ascontiguousarray(leaf).tobytes())
-        return digest.hexdigest()
+        read = self.survey.reading, self.survey.quantity, self.center
+        return fingerprint("s", files, share, *read, digest_of((self.transfer, self.within)))
 
     def _particles(self, before: int, share: float) -> Particles:
         first = self._load(before)
@@ -181,24 +164,14 @@ class Snapshots:
         second = self._load(before + 1)
         if before not in self._ways:
             self._ways.clear()
-            self._ways[before] = self._way(first, second, self.times[before + 1] - self.times[before])
+            duration = self.times[before + 1] - self.times[before] if self.survey.order.by_files else None
+            self._ways[before] = way_between(first.who, second.who, duration, self.survey.box)
         way = self._ways[before]
         if isinstance(way, str):
             nearer = first if share < 0.5 else second
             return self._packed(nearer.columns, nearer.kernel)
         columns = between(first.columns, second.columns, way.matched, share, self.survey.box, way.run)
         return self._packed(columns, first.kernel)
-
-    def _way(self, first: Loaded, second: Loaded, step: float) -> Way | str:
-        matched = match(first.ids, second.ids)
-        if isinstance(matched, str):
-            return matched
-        run = runs(first.velocity, second.velocity, step if self.survey.order.by_files else None)
-        if run is not None:
-            places = first.columns["position"][matched.first], second.columns["position"][matched.second]
-            way = way_of(*places, self.survey.box)
-            run = run if agree(way, (run[0][matched.first], run[1][matched.second])) else None
-        return Way(matched, run)
 
     def _load(self, number: int) -> Loaded:
         """A snapshot's particles; those of two files are kept."""
@@ -212,9 +185,8 @@ class Snapshots:
             quantity, by = self.survey.quantity, self.survey.report.opacity_by
             particles, _ = io.particles_from_table(table, quantity, *self.survey.reading.how, opacity_by=by)
             exact = particles.exact_position()[np.asarray(particles.valid)]
-            self._loaded[number] = Loaded(
-                {**particles.to_numpy(), "position": exact}, particles.kernel, ids_of(table), velocity_of(table)
-            )
+            columns, who = {**particles.to_numpy(), "position": exact}, Who(ids_of(table), exact, velocity_of(table))
+            self._loaded[number] = Loaded(columns, particles.kernel, who)
         return self._loaded[number]
 
     def _packed(self, columns: dict[str, np.ndarray], kernel: str) -> Particles:

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsph import io
-from jaxsph.io.matching import agree, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.quantities import choose_quantity
 from jaxsph.io.selection import chosen
 from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
+from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.numerics.checks import Progress
 
 MAX_VALUES = 1 << 16
 """Values of a file that the range over all files is taken from, evenly spread over its particles."""
@@ -63,15 +65,14 @@ class SnapshotFile:
         identity: its name, size in bytes, and time of change in nanoseconds.
         num_particles: in it.
         time: as the file says it, or None.
-        lower, upper: corners of the box around its particles, with their supports where the file has them.
+        bounding_box: the box around its particles, with their supports where the file has them.
     """
 
     path: Path
     identity: tuple[str, int, int]
     num_particles: int
     time: float | None
-    lower: np.ndarray
-    upper: np.ndarray
+    bounding_box: BoundingBox
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,10 +144,7 @@ class Survey:
         """Lower and upper corner of the box around all particles of all files, or of their period."""
         if self.box is not None:
             return np.zeros(3), np.array(self.box)
-        filled = [file for file in self.files if file.num_particles]
-        if not filled:
-            return np.zeros(3), np.zeros(3)
-        return np.min([file.lower for file in filled], 0), np.max([file.upper for file in filled], 0)
+        return BoundingBox.around(file.bounding_box for file in self.files)
 
     def told(self) -> list[str]:
         """Sentences on what is between the files."""
@@ -173,12 +171,15 @@ def surveyed(
     *,
     gaps: bool = False,
     strict: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Survey:
     """Read all files once; see `Snapshots.from_files`."""
-    named = _by_name([Path(path) for path in paths])
+    named = [Path(path) for path in paths]
     if not named:
         raise ValueError("`paths` must be at least one particle file, got none")
+    numbers = numbers_of(named)
+    if numbers is not None:
+        named = [path for _, path in sorted(zip(numbers, named, strict=True))]
     for path in named:
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such file")
@@ -190,8 +191,9 @@ def surveyed(
         looking.look(path)
         if progress is not None:
             progress(number, len(named))
-    if strict:
-        looking.refuse_unread(len(named))
+    if strict and looking.unread:
+        told = "; ".join(why for _, why, _ in looking.unread)
+        raise ValueError(f"{len(looking.unread)} of {len(named)} snapshots cannot be read, so nothing is rendered: {told}")
     order = in_order([file.path for file in looking.files], [file.time for file in looking.files])
     as_read = order.indices == tuple(range(len(looking.files)))
     return Survey(
@@ -225,11 +227,6 @@ def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
     raise AssertionError("there is a last path")
 
 
-def _by_name(paths: list[Path]) -> list[Path]:
-    numbers = numbers_of(paths)
-    return paths if numbers is None else [path for _, path in sorted(zip(numbers, paths, strict=True))]
-
-
 class _Looking:
     """What is found in one file after the other, of which two at a time are in memory."""
 
@@ -253,23 +250,18 @@ class _Looking:
             self.unread.append((path, why, len(self.files)))
             self._last = None
             return
-        reach = self._reach(table)
-        position, known = table.position.astype(np.float64) if len(table) else np.zeros((1, 3)), path.stat()
+        bounding_box, known = BoundingBox.around(()), path.stat()
+        if len(table):
+            position, reach = table.position.astype(np.float64), self._reach(table)
+            bounding_box = BoundingBox(position.min(0) - reach, position.max(0) + reach)
         identity = path.name, known.st_size, known.st_mtime_ns
-        box = position.min(0) - reach, position.max(0) + reach
-        self.files.append(SnapshotFile(path, identity, len(table), table.time, *box))
+        self.files.append(SnapshotFile(path, identity, len(table), table.time, bounding_box))
         self.values.append(values[:: max(len(values) // MAX_VALUES, 1)])
         self.boxes.append(table.box_size)
         self.wide |= table.position.dtype == np.float64
         if self._last is not None:
             self.steps.append(_step(self._last, table, table.box_size))
         self._last = table
-
-    def refuse_unread(self, number: int) -> None:
-        """Raise `ValueError` that names every file that could not be read."""
-        if self.unread:
-            told = "; ".join(why for _, why, _ in self.unread)
-            raise ValueError(f"{len(self.unread)} of {number} snapshots cannot be read, so nothing is rendered: {told}")
 
     def _values(self, table: io.ParticleTable) -> np.ndarray:
         try:
@@ -284,13 +276,46 @@ class _Looking:
 
 
 def _step(first: io.ParticleTable, second: io.ParticleTable, box: tuple[float, ...] | None) -> Step:
-    found = match(ids_of(first), ids_of(second))
-    if isinstance(found, str):
-        return Step(why=found)
-    way = way_of(first.position[found.first], second.position[found.second], box)
-    length = float(np.median(np.linalg.norm(way, axis=1)))
+    duration = None if first.time is None or second.time is None else second.time - first.time
+    one, other = (Who(ids_of(table), table.position, velocity_of(table)) for table in (first, second))
+    way = way_between(one, other, duration, box)
+    if isinstance(way, str):
+        return Step(why=way)
+    length = float(np.median(np.linalg.norm(way.moved, axis=1)))
     moved = None if first.support is None else length / float(np.median(first.support))
-    step = None if first.time is None or second.time is None else second.time - first.time
-    run = runs(velocity_of(first), velocity_of(second), step)
-    curved = run is not None and agree(way, (run[0][found.first], run[1][found.second]))
-    return Step(len(found.first), len(found.only_first), len(found.only_second), moved, curved)
+    matched = way.matched
+    return Step(len(matched.first), len(matched.only_first), len(matched.only_second), moved, way.run is not None)
+
+
+class Who(NamedTuple):
+    """The particles of one snapshot: who they are, or why that is not known, where, and how fast."""
+
+    ids: np.ndarray | str
+    position: np.ndarray
+    velocity: np.ndarray | None
+
+
+class Way(NamedTuple):
+    """From one snapshot to the next.
+
+    Attributes:
+        matched: who is who.
+        moved: how far those that are in both have moved.
+        run: velocities times the time between, of all in each, where they tell how particles move.
+    """
+
+    matched: Matched
+    moved: np.ndarray
+    run: tuple[np.ndarray, np.ndarray] | None
+
+
+def way_between(first: Who, second: Who, duration: float | None, box: tuple[float, ...] | None) -> Way | str:
+    """The way from one snapshot to the next, or why particles cannot be told."""
+    matched = match(first.ids, second.ids)
+    if isinstance(matched, str):
+        return matched
+    moved = way_of(first.position[matched.first], second.position[matched.second], box)
+    run = runs(first.velocity, second.velocity, duration)
+    if run is not None and not agree(moved, (run[0][matched.first], run[1][matched.second])):
+        run = None
+    return Way(matched, moved, run)

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,18 @@ class FramesError(ValueError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.failed, self.frames)
+
+
+def each_or_raise(frames: Iterator[FrameFile]) -> Iterator[FrameFile]:
+    """All frames, and at the end `FramesError` where some could not be made."""
+    failed, last = [], 0
+    for frame in frames:
+        last = frame.number
+        if frame.error is not None:
+            failed.append(frame)
+        yield frame
+    if failed:
+        raise FramesError(failed, last)
 
 
 class UnwritableError(ValueError):

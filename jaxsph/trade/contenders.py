@@ -1,4 +1,4 @@
-"""Contenders: what a sweep compares, and how an image of fewer pixels is made comparable.
+"""Contenders: what a sweep compares, how an image of fewer pixels is made comparable, and the light integral beside them.
 
 Flow: settings -> [contenders] -> sweep.
 """
@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import scipy
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxsph.model import Camera, Settings
+from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.model.registry import ESTIMATING
+from jaxsph.reference import integral
 
 TOLERANCES = (0.001, 0.004, 0.01)
 ESTIMATORS: dict[str, dict[str, Any]] = {
@@ -26,6 +27,8 @@ ESTIMATORS: dict[str, dict[str, Any]] = {
 }
 BASELINES = ("samples/2", "samples/4", "segments/1", "segments/4", "size/2", "size/4")
 FULL_RATE = "full rate"
+SEED = 0  # of the pixels that the light integral is taken at
+TOLERANCE = 1e-6  # of the integral itself: far below any tolerance that images are asked for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,3 +112,36 @@ def scaled_up(layers: Float[np.ndarray, "rows columns 4"], camera: Camera) -> Fl
     return np.stack(
         [scipy.ndimage.map_coordinates(layer, place, order=1, mode="nearest") for layer in np.moveaxis(layers, -1, 0)], -1
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class IntegralAt:
+    """The light integral at some pixels: colour and alpha, float64."""
+
+    rows: Int[np.ndarray, " pixels"]
+    columns: Int[np.ndarray, " pixels"]
+    light: Float[np.ndarray, "pixels 4"]
+
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera, count: int) -> IntegralAt | None:
+        """At so many pixels of the whole image, always the same of one size; None of no pixels, or of `media` unknown to it."""
+        if not count or scene.media:
+            return None
+        number = camera.width * camera.height
+        chosen = np.random.default_rng(SEED).choice(number, min(count, number), replace=False)
+        rows, columns = np.unravel_index(chosen, (camera.height, camera.width))
+        return cls(rows, columns, layers_of(integral(scene, camera, pixels=(rows, columns), tolerance=TOLERANCE)))
+
+    def at(self, layer: Any) -> np.ndarray:
+        """A layer of an image at these pixels."""
+        return np.asarray(layer)[self.rows, self.columns]
+
+    def errors(self, layers: Float[np.ndarray, "height width 4"]) -> Float[np.ndarray, " pixels"]:
+        """Of each pixel, the largest of any colour channel or alpha."""
+        return np.abs(self.at(layers) - self.light).max(-1)
+
+
+def layers_of(image: Image) -> Float[np.ndarray, "... 4"]:
+    """Colour and alpha, float64."""
+    alpha = 1 - np.asarray(image.transmittance, np.float64)
+    return np.concatenate([np.asarray(image.color, np.float64), alpha[..., None]], -1)

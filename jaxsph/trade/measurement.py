@@ -1,6 +1,6 @@
-"""Measurement: one row of a sweep's table, and the files that the table is kept in.
+"""Measurement: one row of a sweep's table, what it was made of and on what, and the files that the table is kept in.
 
-Flow: sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
+Flow: scene, camera, settings -> sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
 """
 
 from __future__ import annotations
@@ -10,12 +10,20 @@ import csv
 import dataclasses
 import json
 import os
+import platform
+import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
 from jaxsph.io.regular import regular_file
 from jaxsph.io.replace import written_whole
+from jaxsph.model import Camera, Scene, Settings
+from jaxsph.numerics.digest import digest_of, fingerprint
+from jaxsph.numerics.version import __version__
 
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
 """Names in a sweep's folder: one JSON object a line, appended as it is measured; and the same as comma-separated values."""
@@ -110,6 +118,34 @@ class Measurement:
 
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Measurement))
+
+
+def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -> dict[str, Any]:
+    """Size of a frame at full rate, and a digest of all that its image depends on."""
+    particles = scene.particle_set
+    size = {"width": camera.width, "height": camera.height, "samples": settings.samples}
+    count = {"particles": particles.num_particles, "dtype": str(particles.dtype)}
+    return size | count | {"fingerprint": fingerprint("m", settings, converged, digest_of((scene, camera)))}
+
+
+def of_this_run() -> dict[str, Any]:
+    """Machine and versions."""
+    versions = {"jaxsph": __version__, "jax": jax.__version__, "numpy": np.__version__, "python": platform.python_version()}
+    return {"device": jax.devices()[0].device_kind, "cores": os.cpu_count() or 1, "commit": _commit()} | versions
+
+
+def _commit() -> str | None:
+    """Of the checkout that this file is tracked in, if it is."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("describe", "--always", "--dirty", "--exclude", "*")
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 def read_journal(path: str | Path) -> list[Measurement]:

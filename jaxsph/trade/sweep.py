@@ -24,16 +24,29 @@ from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.trade.contenders import BASELINES, FULL_RATE, TOLERANCES, Contender, contenders, scaled_up
-from jaxsph.trade.integral_error import IntegralAt, layers_of
-from jaxsph.trade.measurement import JOURNAL, KEY, TABLE, Measurement, append, read_journal, write_table
-from jaxsph.trade.provenance import of_frame, of_this_run
+from jaxsph.numerics.checks import Progress, record_of
+from jaxsph.trade.contenders import BASELINES, FULL_RATE, TOLERANCES, Contender, IntegralAt, contenders, layers_of, scaled_up
+from jaxsph.trade.measurement import JOURNAL, KEY, TABLE, Measurement, append, of_frame, of_this_run, read_journal, write_table
 
 STAGES = ("grid", "adapt", "cast", "image")
 
-Progress = Callable[[int, int], None]
 Plans = dict[Hashable, Plan]
 """By kind of contender: frames of a sequence share them, so that little is compiled for the later ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How much is done to measure: see `sweep`."""
+
+    repeats: int = 3
+    converged: int = 8
+    integral: int = 1000
+
+    def __post_init__(self) -> None:
+        for name, least in (("repeats", 1), ("converged", 1), ("integral", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +70,11 @@ def sweep(
     tolerances: Sequence[float] = TOLERANCES,
     estimators: Sequence[str] | None = None,
     baselines: Sequence[str] = BASELINES,
-    repeats: int = 3,
-    converged: int = 8,
-    integral: int = 1000,
     name: str = "scene",
     frames: Sequence[float] | None = None,
     folder: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
+    **effort: int,
 ) -> list[Measurement]:
     """Measure error and time of every estimator at every tolerance, and of coarser sampling and smaller images.
 
@@ -79,18 +90,19 @@ def sweep(
             against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
         baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
             `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
-        repeats, converged: at least 1.
-        integral: at how many pixels to take the light integral (`jaxsph.reference.integral`, which knows no `media`); 0: none.
         name: of the scene, for the table.
         frames: a number for each frame; default 0, 1, ... of a sequence.
         folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
             be. What it holds already is not measured again. `None` keeps nothing.
         progress: called as `progress(done, total)` after every image.
+        effort: `repeats` and `converged`, at least 1, default 3 and 8; and `integral`, at how many pixels to take the light
+            integral (`jaxsph.reference.integral`, which knows no `media`), default 1000; 0: none.
 
     Returns:
         A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it.
 
     Raises:
+        TypeError: an argument that there is not.
         ValueError: arguments out of range, scenes and cameras that do not pair, a folder that holds something else.
 
     References:
@@ -99,38 +111,38 @@ def sweep(
     settings = settings or Settings(integrator="samples")
     if settings.tolerance is not None:
         raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
-    _require_count("repeats", repeats)
-    _require_count("converged", converged)
-    _require_count("integral", integral, least=0)
+    asked = record_of(Effort, effort, "sweep")
     groups = contenders(settings, tolerances, estimators, baselines)
     views = _views(scene, camera, frames)
-    shared = {"scene": name, "repeats": repeats, "converged": converged, "integral": integral} | of_this_run()
+    shared = {"scene": name} | dataclasses.asdict(asked) | of_this_run()
     each = [
-        _Frame(one, view, shared | of_frame(one, view, settings, converged) | {"frame": number}) for number, one, view in views
+        _Frame(one, view, shared | of_frame(one, view, settings, asked.converged) | {"frame": number})
+        for number, one, view in views
     ]
-    return _rows(each, groups, repeats, folder, progress)
+    return _rows(each, groups, asked, folder, progress)
 
 
 def _rows(
     frames: list[_Frame],
     groups: list[list[Contender]],
-    repeats: int,
+    effort: Effort,
     folder: str | os.PathLike[str] | None,
     progress: Progress | None,
 ) -> list[Measurement]:
     """The table: what the folder holds of it, and what is measured now."""
-    held = {row.key: row for row in read_journal(_journal(folder))} if folder is not None else {}
+    journal = None if folder is None else _journal(folder)
+    held = {} if journal is None else {row.key: row for row in read_journal(journal)}
     tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
-    truths = 2 + bool(frames[0].shared["integral"])
-    tick = _ticker(progress, sum(_num_renders(missing, truths, repeats) for _, missing in tasks))
+    truths = 2 + bool(effort.integral)
+    tick = _ticker(progress, sum(_num_renders(missing, truths, effort.repeats) for _, missing in tasks))
     plans: Plans = {}
     for frame, missing in tasks:
         for row in _measure(frame, groups[0][0], missing, plans, tick):
             held[row.key] = row
-            if folder is not None:
-                append(_journal(folder), row)
-    if folder is not None:
-        write_table(Path(folder) / TABLE, held.values())
+            if journal is not None:
+                append(journal, row)
+    if journal is not None:
+        write_table(journal.with_name(TABLE), held.values())
     return [held[frame.key(setting)] for frame, _ in tasks for group in groups for setting in group]
 
 
@@ -148,11 +160,6 @@ def _views(
     if len(set(frames)) != len(scenes) or len(frames) != len(scenes):
         raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(frames)}")
     return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
-
-
-def _require_count(name: str, value: int, least: int = 1) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}")
 
 
 def _num_renders(missing: list[list[Contender]], truths: int, repeats: int) -> int:
@@ -184,7 +191,7 @@ def _measure(
     tick()
     of_full = _First.of(frame, full, plans)
     tick()
-    truths = _Truths(of_full, converged, IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"]))
+    integral = IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"])
     if frame.shared["integral"]:
         tick()
     for group in missing:
@@ -196,8 +203,8 @@ def _measure(
         times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
         for first, turns in zip(firsts, times, strict=False):
             if first.setting in group:
-                found = _compared(first, truths) | _medians(turns) | {"full_total": _medians(times[0])["total"]}
-                yield Measurement(**frame.shared, **found)
+                found = _compared(first, of_full, converged, integral) | _medians(turns)
+                yield Measurement(**frame.shared, **found, full_total=_medians(times[0])["total"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,18 +257,11 @@ def _medians(turns: list[dict[str, float]]) -> dict[str, float]:
     return stages | {"total": total, "deviation": statistics.median(abs(one - total) for one in sums)}
 
 
-@dataclasses.dataclass(frozen=True)
-class _Truths:
-    """What images of a frame are compared with."""
-
-    full: _First
-    converged: Float[np.ndarray, "height width 4"]
-    integral: IntegralAt | None
-
-
-def _compared(first: _First, truths: _Truths) -> dict[str, Any]:
+def _compared(
+    first: _First, full: _First, converged: Float[np.ndarray, "height width 4"], integral: IntegralAt | None
+) -> dict[str, Any]:
     """How wrong an image is, how wrong it was said to be, and the work it took."""
-    error, away = (np.abs(first.layers - other).max(-1) for other in (truths.full.layers, truths.converged))
+    error, away = (np.abs(first.layers - other).max(-1) for other in (full.layers, converged))
     found = {
         "method": first.setting.method,
         "tolerance": first.setting.tolerance,
@@ -271,12 +271,12 @@ def _compared(first: _First, truths: _Truths) -> dict[str, Any]:
         "max_error_converged": float(away.max()),
         "mean_error_converged": float(away.mean()),
         "evaluations": first.image.stats["evaluations"],
-        "evaluations_full": truths.full.image.stats["evaluations"],
+        "evaluations_full": full.image.stats["evaluations"],
         "plan": first.plan_seconds,
         "compile": first.compile_seconds,
         "bytes": first.plan.bytes,
     }
-    return found | _kept(first, error, truths.integral) | _to_integral(first, truths.integral)
+    return found | _kept(first, error, integral) | _to_integral(first, integral)
 
 
 def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: IntegralAt | None) -> dict[str, float | None]:

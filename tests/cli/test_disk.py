@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
+from commanded import run
 from snapshots_made import particles, write
 
 from jaxsph import io
-from jaxsph.cli import main as cli
 
 TINY = ["--size", "24x32", "--samples", "16"]
-
-
-def run(capsys, *arguments):
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 @pytest.fixture

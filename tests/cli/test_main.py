@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
 from jaxsph import io
@@ -26,13 +27,6 @@ def file(tmp_path, monkeypatch):
     columns = {"temperature": position[:, 0], "pressure": position[:, 1] ** 2, "support": np.full(60, 0.8, np.float32)}
     np.savez(path, position=position, **columns)
     return path
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 def test_render_writes_an_exr_and_says_what_it_picked(file, tmp_path, capsys):

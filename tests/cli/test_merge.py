@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
-from jaxsph.cli import main as cli
 from jaxsph.cli import merge as cli_merge
 
 SCENE = ["scene:radial", "--particles", "300", "--size", "24x40", "--samples", "16"]
@@ -13,13 +13,6 @@ SCENE = ["scene:radial", "--particles", "300", "--size", "24x40", "--samples", "
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 @pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])

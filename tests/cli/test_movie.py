@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 
+import commanded
 import numpy as np
 import pytest
 from exec_after import HEARS_INTERRUPTS, exec_after
 
 import jaxsph as js
-from jaxsph.cli import cluster as cli_cluster
-from jaxsph.cli import main as cli
+from jaxsph.cli import movie as cli_movie
 
 TINY = ["--size", "24x16", "--samples", "16"]
 
@@ -30,10 +30,7 @@ def sequence(tmp_path, monkeypatch):
 
 
 def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main(["movie", *(str(argument) for argument in arguments)])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
+    return commanded.run(capsys, "movie", *arguments)
 
 
 def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence, tmp_path, capsys):
@@ -189,7 +186,7 @@ def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(
 
 
 def test_a_scheduler_that_does_not_answer_is_told_of_before_files_are_read(sequence, capsys, monkeypatch):
-    monkeypatch.setattr(cli_cluster, "ANSWER", 0.3)
+    monkeypatch.setattr(cli_movie, "ANSWER", 0.3)
     code, out, err = run(capsys, *sequence, "--client", "tcp://127.0.0.1:9", *TINY)
     assert (code, out, len(err)) == (1, "", 1) and "no scheduler answers there within 0.3 s" in err[0]
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.cli import look as cli_look
 from jaxsph.cli import main as cli
 from jaxsph.cli import movie as cli_movie
 from jaxsph.cli import project as cli_project
 from jaxsph.cli import sweep as cli_sweep
-from jaxsph.cli import transfer as cli_transfer
 
 SMALL = ["--size", "8x8"]
 RUNS = {
@@ -59,7 +59,7 @@ def asked(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "warnings_in_lines", lambda *given: names.clear() or begun(*given))  # the parser asks for all
     for module, name in ((js, "render"), (js, "project"), (cli_movie, "render_frames"), (cli_sweep, "sweep")):
         monkeypatch.setattr(module, name, enough)
-    monkeypatch.setattr(cli_transfer, "transfer_figure", enough)
+    monkeypatch.setattr(cli_look, "transfer_figure", enough)
     if hasattr(cli_project, "project"):
         monkeypatch.setattr(cli_project, "project", enough)
     return names

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli import main as cli
-from jaxsph.cli import points as cli_points
+from jaxsph.cli.parts import apart
+from jaxsph.model.camera.camera import BoundingBox
 
 DARK_TO_WHITE = [(32 / 255,) * 3, (1, 1, 1)]
 TINY = ["--size", "24x16", "--samples", "16"]
@@ -26,13 +27,6 @@ def files(tmp_path, monkeypatch):
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     np.savez("drop.npz", position=position, temperature=position[:, 0], support=np.full(60, 0.8, np.float32))
     return tmp_path
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 def layers(image):
@@ -74,7 +68,7 @@ def test_a_volume_and_points_share_a_picture_that_is_the_references(files, capsy
     gas, points = io.read_volume("gas.vti"), io.read_points("stars.csv")
     look = js.scenes.default_volume_transfer(gas)
     scene = js.Scene(volume=gas, volume_transfer=look, points=points)
-    camera = js.Camera.framing(cli_points.Together([("gas", gas), ("stars", points)]), width=24, height=16)
+    camera = js.Camera.framing(scene, width=24, height=16)
     truth = js.reference.render(scene, camera, js.Settings(samples=16))
     assert np.abs(layers(image) - layers(truth)).max() < 1e-4
     assert truth.alpha.max() > 0.5 and truth.color[..., 0].max() > 0.3
@@ -213,15 +207,14 @@ def test_failures_are_exit_code_1_and_one_line(files, capsys, arguments, message
 def test_empty_parts_are_not_framed_and_not_warned_of():
     none = js.Points.from_arrays([], 1.0, opacity=0.5)
     one = js.Points.from_arrays([(100.0, 0, 0)], 1.0, opacity=0.5)
-    both = cli_points.Together([("none", none), ("one", one)])
-    np.testing.assert_array_equal(both.bounds(), one.bounds())
-    assert not both.apart() and not cli_points.Together([("none", none)]).bounds()[1].any()
+    np.testing.assert_array_equal(BoundingBox.around([none, one]), one.bounds())
+    assert not apart([("none", none), ("one", one)]) and not BoundingBox.around([none]).upper.any()
 
 
 def test_only_boxes_farther_apart_than_they_are_large_are_warned_of():
     def ball(x, radius=1.0):
         return js.Points.from_arrays([(x, 0.0, 0.0)], radius, opacity=0.5)
 
-    assert not cli_points.Together([("a", ball(0.0)), ("b", ball(5.0))]).apart()  # 3 apart, diagonals of 3.46
-    assert not cli_points.Together([("a", ball(0.0)), ("b", ball(6.0, 1.5))]).apart()
-    assert len(cli_points.Together([("a", ball(0.0)), ("b", ball(6.0)), ("c", ball(20.0))]).apart()) == 3
+    assert not apart([("a", ball(0.0)), ("b", ball(5.0))])  # 3 apart, diagonals of 3.46
+    assert not apart([("a", ball(0.0)), ("b", ball(6.0, 1.5))])
+    assert len(apart([("a", ball(0.0)), ("b", ball(6.0)), ("c", ball(20.0))])) == 3

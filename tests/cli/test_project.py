@@ -1,11 +1,11 @@
 """The command `project`: what it projects, that it is what the library has, and how it refuses."""
 
+import commanded
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli import main as cli
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -28,10 +28,7 @@ def file(tmp_path, monkeypatch):
 
 
 def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main(["project", *(str(argument) for argument in arguments)])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
+    return commanded.run(capsys, "project", *arguments)
 
 
 def values(capsys, *arguments):

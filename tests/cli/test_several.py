@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from jaxsph.cli.console import UsageError
-from jaxsph.cli.several import outputs_of, render_each, stem_of
+from jaxsph.cli.options import stem_of
+from jaxsph.cli.render import outputs_of, render_each
 
 
 def options(*sources, output=None):

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
 from jaxsph.cli import main as cli
@@ -21,13 +22,6 @@ def file(tmp_path, monkeypatch):
     columns = {"density": rng.lognormal(0, 3, 60).astype(np.float32), "support": np.full(60, 0.8, np.float32)}
     np.savez(path, position=position, velocity=position, **columns)
     return path
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 def saved(capsys, file, *arguments):

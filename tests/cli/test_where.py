@@ -5,10 +5,10 @@ import types
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli import main as cli
 
 TINY = ["--size", "24x16", "--samples", "16"]
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -40,13 +40,6 @@ def seen(monkeypatch):
 
     monkeypatch.setattr(js, "render", render)
     return found
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and the lines of stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 def made(capsys, file, *arguments):

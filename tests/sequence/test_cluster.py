@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.sequence import cluster as frames_on_cluster
-from jaxsph.sequence import workers
-from jaxsph.sequence.workers import Share, local_client, share_of
+from jaxsph.sequence import cluster as workers
+from jaxsph.sequence.cluster import Share, local_client, share_of
 
 distributed = pytest.importorskip("distributed")
 
@@ -125,13 +124,13 @@ def test_no_more_sources_are_held_than_keep_workers_busy(client):
     frames = js.render_frames(scenes(), CAMERA, SETTINGS, client)
     assert drawn == []
     for done, _ in enumerate(frames, 1):
-        assert len(drawn) <= done + frames_on_cluster.AHEAD
+        assert len(drawn) <= done + workers.AHEAD
     assert len(drawn) == 12
 
 
 def test_a_scene_of_many_frames_is_sent_once(client, monkeypatch):
-    sent, kept = [], frames_on_cluster._Sequence._kept
-    monkeypatch.setattr(frames_on_cluster._Sequence, "_kept", lambda self, thing: sent.append(thing) or kept(self, thing))
+    sent, kept = [], workers._Sequence._kept
+    monkeypatch.setattr(workers._Sequence, "_kept", lambda self, thing: sent.append(thing) or kept(self, thing))
     cameras = js.CameraPath.orbit(CAMERA, 30, center=(0, 0, 0)).cameras(4)
     images = list(js.render_frames(cloud(), cameras, SETTINGS, client))
     assert len(images) == 4 and len(sent) == 1
@@ -170,14 +169,14 @@ def test_what_no_frame_would_escape_ends_all_at_once(client, tmp_path, monkeypat
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ValueError, match="frame 1 cannot be written"):
         list(js.render_frames(sources(3), CAMERA, SETTINGS, client, output=tmp_path / "file" / "{:02d}.png"))
-    monkeypatch.setattr(frames_on_cluster._Sequence, "_send", _as_of_another_version)
+    monkeypatch.setattr(workers._Sequence, "_send", _as_of_another_version)
     with pytest.raises(ImportError, match="but none is asked for"):
         list(js.render_frames(sources(3), CAMERA, SETTINGS, client))
 
 
 def _as_of_another_version(self, task, what):
     payload, shared = self._packed((task, self._lead))
-    return self._client.submit(frames_on_cluster._do, what, "none", False, payload, shared, pure=False)
+    return self._client.submit(workers._do, what, "none", False, payload, shared, pure=False)
 
 
 def test_an_image_that_cannot_be_made_raises_when_it_is_its_turn(client):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.trade.integral_error import IntegralAt, layers_of
+from jaxsph.trade.contenders import IntegralAt, layers_of
 
 WIDTH, HEIGHT = 9, 6
 

@@ -9,11 +9,11 @@ import types
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
-from jaxsph.cli import main as cli
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade import provenance
+from jaxsph.trade import measurement
 from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
 from jaxsph.trade.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
 
@@ -42,12 +42,6 @@ def rows(view, folder):
 
 def layers(image):
     return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.alpha, np.float64)[..., None]], -1)
-
-
-def run(capsys, *arguments):
-    code = cli.main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return code, out, err.splitlines()
 
 
 def test_there_is_a_row_for_every_setting_full_rate_first(rows):
@@ -215,8 +209,8 @@ def test_other_data_is_another_measurement(view):
     variants = [(scene, camera, settings, 8), (dataclasses.replace(scene, particles=moved), camera, settings, 8)]
     variants += [(scene, nearer, settings, 8), (scene, wider, settings, 8), (scene, camera, settings, 4)]
     variants += [(scene, camera, dataclasses.replace(SETTINGS, merge=False), 8)]
-    digests = [provenance.of_frame(*variant)["fingerprint"] for variant in variants]
-    assert len(set(digests)) == len(variants) and digests[0] == provenance.of_frame(*view, settings, 8)["fingerprint"]
+    digests = [measurement.of_frame(*variant)["fingerprint"] for variant in variants]
+    assert len(set(digests)) == len(variants) and digests[0] == measurement.of_frame(*view, settings, 8)["fingerprint"]
 
 
 def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(rows, tmp_path):
@@ -300,6 +294,8 @@ def test_bad_arguments_are_named(view, arguments, message):
         js.sweep(*view, **arguments)
     with pytest.raises(ValueError, match="must pair, got 2 and 1"):
         js.sweep([view[0]] * 2, view[1])
+    with pytest.raises(TypeError, match="`sweep` has no argument `turns`; others that it has are repeats, converged, integral"):
+        js.sweep(*view, turns=2)
 
 
 def test_the_front_holds_what_nothing_beats():

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -34,9 +34,9 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import Progress
 
 MANY = 4  # bands for each device, of which one more or less does not matter
-Progress = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)

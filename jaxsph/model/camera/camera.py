@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, Protocol
+from collections.abc import Iterable
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,26 @@ class Bounded(Protocol):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around it, (3,) and (3,), float64, length units."""
+
+
+class BoundingBox(NamedTuple):
+    """A box as something to frame."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @classmethod
+    def around(cls, parts: Iterable[Bounded]) -> BoundingBox:
+        """The box around several parts; those that are empty have none, and the box of nothing is that of zeros."""
+        boxes = [part.bounds() for part in parts]
+        filled = [(lower, upper) for lower, upper in boxes if (upper > lower).any()]
+        if not filled:
+            return cls(np.zeros(3), np.zeros(3))
+        return cls(np.min([lower for lower, _ in filled], 0), np.max([upper for _, upper in filled], 0))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `Bounded`."""
+        return self.lower, self.upper
 
 
 @dataclasses.dataclass(frozen=True)

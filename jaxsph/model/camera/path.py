@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.leg import Leg, made
 from jaxsph.numerics.given import plain
 
@@ -102,7 +102,10 @@ class CameraPath:
         if camera is None:
             if center is None or radius is None:
                 raise ValueError("`orbit` needs a `camera` to begin with, or `center` and `radius` of a ball to frame")
-            camera = Camera.framing(_Ball(np.asarray(center, np.float64), float(radius)), up=up, **size)
+            if not (np.isfinite(radius) and radius > 0):
+                raise ValueError(f"`radius` must be > 0 and finite, got {radius}")
+            middle_of_ball = np.asarray(center, np.float64)
+            camera = Camera.framing(BoundingBox(middle_of_ball - radius, middle_of_ball + radius), up=up, **size)
         elif size:
             raise ValueError(f"`{next(iter(size))}` is the camera's; leave it out")
         around = np.array(middle(camera) if center is None else _point(center))
@@ -172,19 +175,6 @@ def middle(camera: Camera) -> tuple[float, float, float]:
     """The point straight ahead in the middle of what a camera sees of depth."""
     x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (float(camera.near) + float(camera.far)) / 2
     return float(x), float(y), float(z)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Ball:
-    """A ball, as something to frame."""
-
-    center: np.ndarray
-    radius: float
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        if not (np.isfinite(self.radius) and self.radius > 0):
-            raise ValueError(f"`radius` must be > 0 and finite, got {self.radius}")
-        return self.center - self.radius, self.center + self.radius
 
 
 def _pair(key: Any) -> tuple[Any, Any]:

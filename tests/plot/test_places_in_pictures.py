@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.plot.projected import bounds_of, box_lines, pixels_per_length, round_length, to_pixels
+from jaxsph.plot.image_figure import box_lines, pixels_per_length, round_length, to_pixels
 
 
 def cameras():
@@ -74,6 +74,6 @@ def test_bounds_are_those_of_all_parts():
     points = js.Points.from_arrays(np.array([[4.0, 0, 0]], np.float32), 0.5, (1, 1, 1), opacity=0.5)
     volume = js.Volume.from_array(np.zeros((2, 2, 2), np.float32), (-1, -2, -3), 1.0)
     look = js.TransferFunction.from_colormap("heat", (0, 1))
-    lower, upper = bounds_of(js.Scene(volume=volume, volume_transfer=look, points=points))
+    lower, upper = js.Scene(volume=volume, volume_transfer=look, points=points).bounds()
     assert (lower <= [-1, -2, -3]).all() and upper[0] >= 4 and (np.abs(lower) < 10).all()
-    assert bounds_of(js.Scene(media=(js.IsoSurface.from_volume(volume, 0.5),))) is None
+    assert not js.Scene(media=(js.IsoSurface.from_volume(volume, 0.5),)).parts
