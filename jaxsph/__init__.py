@@ -1,5 +1,6 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
+import jaxsph.plot.methods  # noqa: F401 (images, paths, ... get their methods there)
 from jaxsph import io, reference, scenes
 from jaxsph.analysis.met import Met, met
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection

@@ -15,11 +15,11 @@ import numpy as np
 
 from jaxsph.cli.console import UsageError, say
 from jaxsph.io import Labels, ParticleTable, labels_of
-from jaxsph.io.labels import NEEDS, can_name
-from jaxsph.io.optional import require
-from jaxsph.io.quantities import LOG_PREFIX
+from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
-from jaxsph.io.unit_names import unit_of
+from jaxsph.io.settle.labels import NEEDS, can_name
+from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.settle.unit_names import unit_of
 from jaxsph.model import Camera, Image, Scene
 from jaxsph.plot.image_figure import image_figure
 

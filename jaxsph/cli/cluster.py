@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxsph.cli.console import UsageError, say
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
 
 ANSWER = 30.0
 """Seconds within which a scheduler must answer."""

@@ -69,7 +69,7 @@ def run(options: argparse.Namespace, settings: Settings, one_scene: OneScene) ->
     output = _checked(options)
     cli_cluster.check(options)
     cli_where.settle(options)
-    io.movie.encoder()
+    io.images.movie.encoder()
     _choose_size(options)
     with cli_cluster.client_of(options) as client:
         _run(options, settings, one_scene, output, client)
@@ -126,8 +126,8 @@ def _checked(options: argparse.Namespace) -> Path:
         raise UsageError(f"{output}: a movie must be .mp4; its frames may be EXR by --frame-format exr")
     if not output.parent.is_dir():
         raise ValueError(f"{output}: there is no folder {output.parent} to write it to; make it first")
-    if not 0 < options.fps <= io.movie.MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {io.movie.MAX_FPS:g}], got {options.fps:g}")
+    if not 0 < options.fps <= io.images.movie.MAX_FPS:
+        raise UsageError(f"--fps must lie in (0, {io.images.movie.MAX_FPS:g}], got {options.fps:g}")
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames must be at least 1, got {options.frames}")
     if (options.frames or 0) > MAX_FRAMES:

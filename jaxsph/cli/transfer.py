@@ -17,7 +17,7 @@ from jaxsph.cli import annotate as cli_annotate
 from jaxsph.cli.annotate import require_figure, write_figure
 from jaxsph.cli.console import UsageError, say, span
 from jaxsph.io import Labels
-from jaxsph.io.quantities import LOG_PREFIX
+from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.model import Camera, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.transfer.domains import DOMAINS, log_departure
 from jaxsph.model.transfer.presets import PRESETS

@@ -20,7 +20,7 @@ import numpy as np
 from jaxsph import io
 from jaxsph.analysis.slices import slice_of
 from jaxsph.cli.console import UsageError, say, span
-from jaxsph.io.slices import SUFFIXES
+from jaxsph.io.images.slices import SUFFIXES
 from jaxsph.model import Camera, Image, Particles, Scene
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import Clip

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.labels import CODE_UNITS
+from jaxsph.io.settle.labels import CODE_UNITS
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.scales import Scale
 

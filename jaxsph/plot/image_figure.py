@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.labels import CODE_UNITS, Labels
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
+from jaxsph.io.settle.labels import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -217,6 +217,3 @@ class _Page:
         axes.set_ylabel(bar.title if fits else bar.title.replace(" (", "\n(", 1), fontsize=self.points)
         extent = axes.get_tightbbox(self.canvas.get_renderer())
         self._fit(int(np.ceil((self.whole if extent is None else extent.x1) + 0.6 * self.letter)))
-
-
-Image.drawer = staticmethod(image_figure)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.io.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.settle.matching import Matched, agree, between, ids_of, match, runs, velocity_of, way_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles import capacity_class

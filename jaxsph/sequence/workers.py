@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
 
 distributed = require("distributed", "frames on several processes", "cluster")
 dask: Any = require("dask", "frames on several processes", "cluster")

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from jaxsph.io.regular import regular_file
+from jaxsph.io.damage import regular_file
 from jaxsph.io.replace import written_whole
 
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
