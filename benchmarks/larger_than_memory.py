@@ -29,8 +29,8 @@ import h5py
 import numpy as np
 
 import jaxsph as js
+from jaxsph.io.disk.sort import CELLS, Grid
 from jaxsph.io.replace import written_whole
-from jaxsph.io.snapshot_sort import CELLS, Grid
 from jaxsph.scale.from_disk import TooLittleMemoryError
 from jaxsph.trade.measurement import of_this_run
 

@@ -33,7 +33,7 @@ import jax
 import numpy as np
 
 import jaxsph as js
-from jaxsph.io.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.trade.measurement import of_this_run
 
 MASS, UNIFORM, PEER, HELD = 1e-3, 1e-4, 1e-3, 1e-3

@@ -1,13 +1,14 @@
 """jaxsph: volume rendering of SPH particles, in JAX."""
 
+import jaxsph.plot.methods  # noqa: F401 (images, paths, ... get their methods there)
 from jaxsph import io, reference, scenes
-from jaxsph.analysis.met import Met, met
+from jaxsph.analysis.met import met
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.analysis.projection.project import project
 from jaxsph.analysis.resample import resample
 from jaxsph.analysis.slices import Slice, slice_of
 from jaxsph.engine.access.morton import prepare
-from jaxsph.engine.frame.progressive import Progressive, progressive
+from jaxsph.engine.frame.progressive import progressive
 from jaxsph.engine.media.in_octree import in_octree, octree_plans
 from jaxsph.engine.media.iso_surface import IsoSurface
 from jaxsph.engine.media.within import Within
@@ -22,7 +23,6 @@ from jaxsph.model.projection import Projection
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.version import __version__
-from jaxsph.plot import image_figure, transfer_figure
 from jaxsph.scale.from_disk import render_from_disk
 from jaxsph.scale.on_disk import OnDisk
 from jaxsph.scale.parts import merge, render_tile
@@ -40,13 +40,11 @@ __all__ = [
     "FramesError",
     "Image",
     "IsoSurface",
-    "Met",
     "OnDisk",
     "Particles",
     "Plan",
     "Plane",
     "Points",
-    "Progressive",
     "Projection",
     "ProjectionPlan",
     "Scene",
@@ -61,7 +59,6 @@ __all__ = [
     "along_axis",
     "control_values",
     "emission",
-    "image_figure",
     "in_octree",
     "io",
     "merge",
@@ -81,5 +78,4 @@ __all__ = [
     "scenes",
     "slice_of",
     "sweep",
-    "transfer_figure",
 ]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.engine.render import render
-from jaxsph.io import slices as files
+from jaxsph.io.images import slices as files
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane

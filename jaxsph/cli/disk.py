@@ -17,9 +17,9 @@ from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, camera_line, progress, refuse, say, span, time_line
 from jaxsph.cli.options import SCENE
-from jaxsph.io.snapshot_index import index_path
-from jaxsph.io.snapshot_rows import Snapshot
-from jaxsph.io.snapshot_sort import sort_snapshot
+from jaxsph.io.disk.index import index_path
+from jaxsph.io.disk.rows import Snapshot
+from jaxsph.io.disk.sort import sort_snapshot
 from jaxsph.model import Image, Settings
 from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
 from jaxsph.scale.on_disk import OnDisk

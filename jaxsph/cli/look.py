@@ -15,11 +15,11 @@ import numpy as np
 from jaxsph import io, scenes
 from jaxsph.cli.console import UsageError, refuse, require_writable, say, span, wrong_usage
 from jaxsph.io import Labels, ParticleTable, labels_of
-from jaxsph.io.labels import NEEDS, can_name
-from jaxsph.io.optional import require
-from jaxsph.io.quantities import LOG_PREFIX
+from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
-from jaxsph.io.unit_names import unit_of
+from jaxsph.io.settle.labels import NEEDS, can_name
+from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.settle.unit_names import unit_of
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.transfer.domains import DOMAINS, log_departure
 from jaxsph.model.transfer.presets import PRESETS

@@ -35,7 +35,7 @@ from jaxsph.cli.console import (
     wrong_usage,
 )
 from jaxsph.cli.options import SCENE, replaced, require_support, settings_of
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
     """Say what is shown, render the frames that are not there, and write the movie."""
     settings, output = settings_of(options), _checked(options)
     options = cli_where.settled(options)
-    io.movie.encoder()
+    io.images.movie.encoder()
     sized, options = options.size is not None, replaced(options, size=options.size or (512, 512))
     with _client_of(options) as client:
         sources, camera, shown = _sequence(options) if len(options.source) > 1 else _still(options)
@@ -112,8 +112,8 @@ def _checked(options: argparse.Namespace) -> Path:
     if output.suffix.lower() != ".mp4":
         raise UsageError(f"{output}: a movie must be .mp4; its frames may be EXR by --frame-format exr")
     require_writable(output, "a movie must be", (".mp4",))
-    if not 0 < options.fps <= io.movie.MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {io.movie.MAX_FPS:g}], got {options.fps:g}")
+    if not 0 < options.fps <= io.images.movie.MAX_FPS:
+        raise UsageError(f"--fps must lie in (0, {io.images.movie.MAX_FPS:g}], got {options.fps:g}")
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames must be at least 1, got {options.frames}")
     if (options.frames or 0) > MAX_FRAMES:

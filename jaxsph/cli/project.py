@@ -22,10 +22,10 @@ from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, progress, refuse, say, say_notes, span, wrong_usage
 from jaxsph.cli.options import PLACE
 from jaxsph.engine.runtime.executors import Clock
-from jaxsph.io.projections import SUFFIXES
-from jaxsph.io.quantities import ROLES, choose_quantity
-from jaxsph.io.selection import chosen
-from jaxsph.io.stored import stored_density, without_placeholder
+from jaxsph.io.images.projections import SUFFIXES
+from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.selection import chosen
+from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS, along_axis
 from jaxsph.model.held import emission

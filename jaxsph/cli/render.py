@@ -36,7 +36,7 @@ from jaxsph.cli.console import (
 )
 from jaxsph.cli.options import devices_of, replaced, settings_of, stem_of
 from jaxsph.engine.frame.progressive import progressive
-from jaxsph.io.slices import SUFFIXES
+from jaxsph.io.images.slices import SUFFIXES
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.model.clips.shapes import Plane
 from jaxsph.scale import parts as tiles

@@ -10,30 +10,28 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.assemble import Report, particles_from_table
 from jaxsph.io.camera_paths import read_camera_path, write_camera_path
 from jaxsph.io.damage import DataError
+from jaxsph.io.disk.sort import sort_snapshot
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
-from jaxsph.io.labels import Labels, labels_of
-from jaxsph.io.movie import MovieInfo, movie_info, write_movie
-from jaxsph.io.points import PointsReport, points_from_table
-from jaxsph.io.projections import read_projection, write_projection
-from jaxsph.io.quantities import available_quantities
-from jaxsph.io.regular import regular_file
-from jaxsph.io.snapshot_sort import sort_snapshot
-from jaxsph.io.supports import kernel_sum, nearest_neighbour_supports
+from jaxsph.io.images.image_files import read_image, write_image
+from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
+from jaxsph.io.images.projections import read_projection, write_projection
+from jaxsph.io.settle.assemble import Report, particles_from_table
+from jaxsph.io.settle.labels import Labels, labels_of
+from jaxsph.io.settle.points import PointsReport, points_from_table
+from jaxsph.io.settle.quantities import available_quantities
+from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.transfers import read_transfer, write_transfer
-from jaxsph.io.volume_table import VolumeTable
-from jaxsph.io.volumes import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
-from jaxsph.io.where import ConditionError
-from jaxsph.model.image import Image
+from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
+from jaxsph.io.volumes.volume_table import VolumeTable
 from jaxsph.model.particles import Particles
 from jaxsph.model.points import Points
 
@@ -123,10 +121,12 @@ def read_particles(
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.
-        where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`.
+        where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`
+            (`jaxsph.io.settle.where`); what is derived (supports, volumes, densities) is of all particles.
         share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
-        opacity_by: a quantity for extinction alone; `"auto"` for log density where densities spread over a decade, see
-            `particles_from_table`.
+        opacity_by: name of the quantity that extinction is looked up by, if that is another; `"auto"` for the logarithm of the
+            density where densities spread over more than a decade, as the normalised field would show gas of any density at
+            full strength. `jaxsph.scenes.default_transfer` makes a transfer function that suits.
 
     Returns:
         Particles with quantity, support and volume; `particles_from_table` also tells how they were found.
@@ -155,7 +155,7 @@ def read_points(
     """Read points (stars, galaxies, tracers) from a file of any particle format, such as CSV with `x,y,z,radius,r,g,b,opacity`.
 
     Each of these is a number, or the name of a column; what is `None` is taken from the file where it is there
-    (`jaxsph.io.points` says under which names). Colours and opacities in whole numbers up to 255 are bytes.
+    (`jaxsph.io.settle.points` says under which names). Colours and opacities in whole numbers up to 255 are bytes.
 
     Args:
         path: the file; see `read_table` for formats.
@@ -178,43 +178,3 @@ def read_points(
     table = read_table(path, part_type=part_type)
     given = {"color": color, "radius": radius, "extinction": extinction, "opacity": opacity}
     return points_from_table(table, **given, profile=profile, colormap=colormap)[0]
-
-
-def write_image(path: str | os.PathLike[str], image: Image) -> None:
-    """Write `image` to `path`, whole or not at all: `.exr` (every layer) or `.png` (8 bit colours over black).
-
-    Both show the same: a PNG holds `image.color` as displayed, an EXR the linear light of it, see `jaxsph.io.scene_linear`.
-
-    Raises:
-        ValueError: another suffix, or a place that cannot be written to.
-    """
-    file = Path(path)
-    _image_format(file).write(file, image)
-
-
-Image.writer = staticmethod(write_image)
-
-
-def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read an image that `write_image` wrote, or another program. Layers that the file does not hold are NaN.
-
-    `image.color` is display-referred (sRGB), whatever the file holds: to 1e-6 what was written as EXR, to half of 1/255 as PNG.
-    Colours of an EXR file are linear light, and are encoded, unless its header says otherwise or an earlier jaxsph wrote it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another suffix, no regular file, a damaged one, or colours of a kind that is not known.
-    """
-    file = Path(path)
-    form = _image_format(file)
-    image: Image = form.read(regular_file(file))
-    return image
-
-
-def _image_format(path: Path) -> ModuleType:
-    from jaxsph.io import exr, png
-
-    known = {".exr": exr, ".png": png}
-    if path.suffix.lower() not in known:
-        raise ValueError(f"{path}: images are written and read as {' or '.join(known)}, not as {path.suffix!r}")
-    return known[path.suffix.lower()]

@@ -15,25 +15,22 @@ several legs have `"legs": [{"keys": [...]}, ...]` in place of `keys`.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxsph.io.damage import naming, regular_file
+from jaxsph.io.json_text import read_json, require_version, write_json
 from jaxsph.model.camera.camera import Bounded, Camera
 from jaxsph.model.camera.leg import Leg
 from jaxsph.model.camera.path import CameraPath
 
-from .json_text import read_json
-from .regular import regular_file
-from .replace import written_whole
-
 FORMAT, VERSION = "jaxsph camera path", 1
-SUFFIX = ".json"
 OF_PATH = "format", "version", "note", "width", "height", "legs", "keys", "around", "ease"
 OF_LEG = "keys", "around", "ease"
 OF_KEY = "time", "eye", "target", "up", "fov", "view_height", "near", "far"
@@ -50,15 +47,17 @@ def write_camera_path(path: str | os.PathLike[str], camera_path: CameraPath) -> 
     Raises:
         ValueError: another suffix, or a place that cannot be written to.
     """
-    file = Path(path)
-    if file.suffix.lower() != SUFFIX:
-        raise ValueError(f"{file}: a camera path is written as {SUFFIX}, not as {file.suffix!r}")
     first = camera_path.legs[0].cameras[0]
     head = {"format": FORMAT, "version": VERSION, "width": first.width, "height": first.height}
-    legs = [_written_leg(leg) for leg in camera_path.legs]
-    text = json.dumps(head | (legs[0] if len(legs) == 1 else {"legs": legs}), indent=1)
-    with written_whole(file) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    legs = [
+        {
+            "around": None if leg.around is None else list(leg.around),
+            "ease": leg.ease,
+            "keys": [_written_key(time, camera) for time, camera in zip(leg.times, leg.cameras, strict=True)],
+        }
+        for leg in camera_path.legs
+    ]
+    write_json(path, "camera path", json.dumps(head | (legs[0] if len(legs) == 1 else {"legs": legs}), indent=1))
 
 
 def read_camera_path(
@@ -78,18 +77,19 @@ def read_camera_path(
     """
     file = regular_file(path)
     found = read_json(file)
-    try:
-        return _path(found, width, height, None if shown is None else _corners(shown))
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+    corners = None
+    if shown is not None:
+        lower, upper = shown.bounds()
+        corners = np.array(list(itertools.product((0, 1), repeat=3))) * (upper - lower) + lower
+    with naming(file):
+        return _path(found, width, height, corners)
 
 
 def _path(found: Any, width: int | None, height: int | None, corners: np.ndarray | None) -> CameraPath:
     head = _known("a camera path", found, OF_PATH)
     if head.get("format", FORMAT) != FORMAT:
         raise ValueError(f'"format" must be "{FORMAT}", got {head["format"]!r}; `CameraPath.save` writes such files')
-    if isinstance(head.get("version"), bool) or head.get("version", VERSION) != VERSION:
-        raise ValueError(f'"version" is {head["version"]!r}, and this version of jaxsph reads {VERSION}')
+    require_version(head, VERSION)
     if ("legs" in head) == ("keys" in head):
         raise ValueError('must have "keys", or "legs" of which each has some')
     for name in ("width", "height"):
@@ -121,14 +121,10 @@ def _camera(what: str, key: Mapping[str, Any], size: tuple[int, int], corners: n
     near, far = _depths(what, key, np.asarray(eye), np.asarray(target), corners)
     if "fov" in key and "view_height" in key:
         raise ValueError(f"{what} has both `fov` and `view_height`; the one is of perspective, the other of parallel rays")
-    try:
-        if "view_height" in key:
-            opening = _number(what, "view_height", key)
-            return Camera.orthographic(eye, target, up, opening, *size, near=near, far=far)
-        opening = _number(what, "fov", key) if "fov" in key else FOV_DEGREES
-        return Camera.look_at(eye, target, up, opening, *size, near=near, far=far)
-    except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
+    kind, name = (Camera.orthographic, "view_height") if "view_height" in key else (Camera.look_at, "fov")
+    opening = _number(what, name, {"fov": FOV_DEGREES, **key})
+    with naming(what):
+        return kind(eye, target, up, opening, *size, near=near, far=far)
 
 
 def _depths(
@@ -150,11 +146,6 @@ def _depths(
     if not far > 0:
         raise ValueError(f"{what} looks away from all there is to see; turn it around, or give `near` and `far`")
     return max(near, NEAREST * far), far
-
-
-def _corners(shown: Bounded) -> np.ndarray:
-    lower, upper = shown.bounds()
-    return np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
 
 
 def _known(what: str, found: Any, names: tuple[str, ...]) -> Mapping[str, Any]:
@@ -185,11 +176,6 @@ def _vector(what: str, name: str, key: Mapping[str, Any]) -> tuple[float, float,
     return float(numbers[0]), float(numbers[1]), float(numbers[2])
 
 
-def _written_leg(leg: Leg) -> dict[str, Any]:
-    keys = [_written_key(time, camera) for time, camera in zip(leg.times, leg.cameras, strict=True)]
-    return {"around": None if leg.around is None else list(leg.around), "ease": leg.ease, "keys": keys}
-
-
 def _written_key(time: float, camera: Camera) -> dict[str, Any]:
     axes, eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
     near, far, half = (float(value) for value in (camera.near, camera.far, camera.half_height))
@@ -197,7 +183,3 @@ def _written_key(time: float, camera: Camera) -> dict[str, Any]:
     opening = {"fov": 2 * math.degrees(math.atan(half))} if camera.is_perspective else {"view_height": 2 * half}
     place = {"time": time, "eye": eye.tolist(), "target": target.tolist(), "up": axes[1].tolist()}
     return place | opening | {"near": near, "far": far}
-
-
-CameraPath.writer = staticmethod(write_camera_path)
-CameraPath.reader = staticmethod(read_camera_path)

@@ -1,13 +1,24 @@
-"""Turn whatever a parser stumbles over into one `ValueError` that names the file, the trouble and the remedy.
+"""What cannot be read is refused by one `ValueError` that names the file, the trouble and the remedy.
 
-Flow: file -> [damage] around every reader -> ParticleTable.
+Flow: path -> [damage: regular_file] -> [damage: explained] around every reader -> ParticleTable.
+
+Only regular files and folders are opened: pipes, sockets and devices wait for ever, or never end.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+
+KINDS = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+}
 
 UNENDED_NOTE = "its last line has no end: check that the file is complete"
 """Said of text whose last number may have lost digits, which nothing else would show."""
@@ -19,6 +30,16 @@ class DataError(ValueError):
 
 class NoParticlesError(DataError):
     """A file, of several of a snapshot perhaps, has no particles of the type that is asked for."""
+
+
+@contextlib.contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Have every `ValueError` inside the block begin with `path`, where that is not empty; what is no `DataError` becomes one."""
+    try:
+        yield
+    except ValueError as error:
+        kind = type(error) if isinstance(error, DataError) else DataError
+        raise kind(f"{path}: {error}" if path else str(error)) from error
 
 
 @contextlib.contextmanager
@@ -44,3 +65,29 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
             f"{path}: cannot be read as {source} ({type(error).__name__}: {reason}); the file is probably cut short, "
             f"damaged or of another format: copy it again, or write it again from its source"
         ) from error
+
+
+def regular_file(path: str | os.PathLike[str]) -> Path:
+    """`path`, if it names a regular file, links followed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a folder, a pipe, a socket or a device.
+    """
+    file = regular_file_or_folder(path)
+    if file.is_dir():
+        raise DataError(f"{path}: is a folder; give the name of a file in it")
+    return file
+
+
+def regular_file_or_folder(path: str | os.PathLike[str]) -> Path:
+    """`path`, if it names a regular file or a folder, links followed. Raises as `regular_file`."""
+    file = Path(path)
+    if not file.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    kind = stat.S_IFMT(file.stat().st_mode)
+    if kind not in (stat.S_IFREG, stat.S_IFDIR):
+        raise DataError(
+            f"{path}: is {KINDS.get(kind, 'no regular file')}, which may never end; write its content to a file first"
+        )
+    return file

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from . import nchilada, tipsy
-from .damage import DataError
-from .gadget_binary import looks_like
-from .regular import regular_file_or_folder
-from .snapshot_files import joined
-from .table import ParticleTable
+from jaxsph.io import readers
+from jaxsph.io.damage import DataError, regular_file_or_folder
+from jaxsph.io.disk.files import joined
+from jaxsph.io.readers import nchilada, tipsy
+from jaxsph.io.readers.gadget_binary import looks_like
+from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024
 READERS = "jaxsph.readers"
@@ -33,8 +33,8 @@ class Format:
     Attributes:
         name: what users call it.
         suffixes: file name endings, in lower case.
-        module: with its `read(path)`, or `read(path, part_type=...)` where `typed`, which gives a `ParticleTable`: of this
-            package, or a whole name with a dot in it.
+        module: with its `read(path)`, or `read(path, part_type=...)` where `typed`, which gives a `ParticleTable`: of `readers`,
+            or a whole name with a dot in it.
         sniff: whether a file with these first bytes is of this format; `None` where content does not tell.
         typed: whether its `read` takes `part_type`.
         folder: whether a folder is a snapshot of this format; `None` where snapshots are files.
@@ -51,15 +51,10 @@ class Format:
 def _is_bgeo(start: bytes) -> bool:
     if start[:2] == b"\x1f\x8b":
         try:
-            start = _gzip_start(start)
+            start = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, 16)
         except zlib.error:
             return False
     return start[:4] == b"Bgeo"
-
-
-def _gzip_start(start: bytes) -> bytes:
-    """The first bytes of gzipped data of which only the first bytes are given."""
-    return zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, 16)
 
 
 FORMATS = (
@@ -127,7 +122,7 @@ def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
     """Read `path` as `form`; `ValueError` when a format without particle types is asked for one."""
     if not form.typed and part_type is not None:
         raise DataError(f"{path}: {form.name} files have no particle types; leave out `part_type` (got {part_type})")
-    reader: Any = importlib.import_module(form.module if "." in form.module else f".{form.module}", __package__)
+    reader: Any = importlib.import_module(form.module if "." in form.module else f"{readers.__name__}.{form.module}")
 
     def read(file: Path, part_type: int | None) -> ParticleTable:
         file = regular_file_or_folder(file)

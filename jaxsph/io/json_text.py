@@ -1,16 +1,37 @@
 """JSON files that people write by hand: what is no JSON, or says a thing twice, is refused with the file's name.
 
-Flow: file -> [json_text] -> objects, lists and numbers -> camera_paths, transfers.
+Flow: camera_paths, transfers -> [write_json] -> file -> [read_json] -> objects, lists and numbers -> camera_paths, transfers.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
+from jaxsph.io.replace import written_whole
+
+SUFFIX = ".json"
 MAX_DIGITS = 300
 """Of a whole number: what float64 holds."""
+
+
+def write_json(path: str | os.PathLike[str], what: str, text: str) -> None:
+    """Write the text of `what` to a `.json`, whole or not at all; `ValueError` for another suffix, or where that cannot be."""
+    file = Path(path)
+    if file.suffix.lower() != SUFFIX:
+        raise ValueError(f"{file}: a {what} is written as {SUFFIX}, not as {file.suffix!r}")
+    with written_whole(file) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def require_version(found: Any, version: int) -> None:
+    """Raise where an object is of another version than this."""
+    stated = found.get("version", version)
+    if isinstance(stated, bool) or stated != version:
+        remedy = "update jaxsph" if isinstance(stated, int) and stated > version else "save it again"
+        raise ValueError(f'"version" is {stated!r}, and this version of jaxsph reads {version}; {remedy}')
 
 
 def read_json(file: Path) -> Any:

@@ -43,23 +43,21 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     _sweep(path)
     temporary = path.with_name(f"{_before(path)}jaxsph-{_host()}-{os.getpid():x}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        _make(temporary, path)
+        try:
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
         yield temporary
-        os.chmod(temporary, 0o666 & ~_umask())
+        mask = os.umask(0)  # the mask can only be read by setting it
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise ValueError(f"cannot write {path}: {reason}; choose another place") from error
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _make(temporary: Path, path: Path) -> None:
-    try:
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
 
 
 def _before(path: Path) -> str:
@@ -105,9 +103,3 @@ def _is_at_work(host: str, process: int) -> bool:
     except OSError:  # it is somebody else's
         return True
     return True
-
-
-def _umask() -> int:
-    mask = os.umask(0)  # the mask can only be read by setting it
-    os.umask(mask)
-    return mask

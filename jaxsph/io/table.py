@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxsph.io.damage import DataError
+from jaxsph.io.units import NO_UNITS, FileUnits
 from jaxsph.model.kernels import by_name
-
-from .damage import DataError
-from .units import NO_UNITS, FileUnits
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
@@ -78,7 +77,8 @@ class ParticleTable:
             raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
         if position.dtype not in (np.float32, np.float64):
             position = position.astype(np.float64)
-        _refuse_non_finite(position)
+        remedy = "remove these particles, or write the file again"
+        refuse_rows(~np.isfinite(position).all(axis=1), position, "positions must be finite", remedy, each="")
         columns = {str(name): _column(str(name), column, len(position)) for name, column in self.columns.items()}
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "columns", columns)
@@ -193,21 +193,15 @@ def _positive(name: str, value: np.ndarray, count: int) -> np.ndarray:
         raise DataError(f"`{name}` must have shape ({count},), got {value.shape}; give one number a particle")
     if value.dtype not in (np.float32, np.float64):
         value = value.astype(np.float64)
-    bad = ~(np.isfinite(value) & (value > 0))
-    if bad.any():
-        first = int(np.argmax(bad))
-        raise DataError(
-            f"`{name}` must be finite and positive, but {int(bad.sum())} of {count} values are not, "
-            f"the first at index {first}: {value[first]}; remove these particles or pass `{name}=` yourself"
-        )
+    remedy = f"remove these particles or pass `{name}=` yourself"
+    refuse_rows(~(np.isfinite(value) & (value > 0)), value, f"`{name}` must be finite and positive", remedy)
     return value
 
 
-def _refuse_non_finite(position: np.ndarray) -> None:
-    bad = ~np.isfinite(position).all(axis=1)
-    if bad.any():
-        first = int(np.argmax(bad))
-        raise DataError(
-            f"positions must be finite, but {int(bad.sum())} of {len(position)} are not, the first at index {first}: "
-            f"{position[first].tolist()}; remove these particles, or write the file again"
-        )
+def refuse_rows(wrong: np.ndarray, values: np.ndarray, must: str, remedy: str, each: str = "values ") -> None:
+    """Refuse values some of whose rows are `wrong`: how many, and which is the first."""
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        shown = values[first].tolist() if values.ndim > 1 else values[first]
+        number = f"{int(wrong.sum())} of {len(values)} {each}are not"
+        raise DataError(f"{must}, but {number}, the first at index {first}: {shown}; {remedy}")

@@ -15,21 +15,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxsph.io.damage import naming, regular_file
+from jaxsph.io.json_text import numbers_only, read_json, require_version, write_json
 from jaxsph.model.transfer.function import TransferFunction
-
-from .json_text import numbers_only, read_json
-from .regular import regular_file
-from .replace import written_whole
 
 FORMAT, VERSION = "jaxsph transfer function", 1
 REQUIRED = "values", "colors", "extinction"
 KNOWN = {"format", "version", "dtype", "note"}
-SUFFIX = ".json"
 
 
 def write_transfer(path: str | os.PathLike[str], transfer: TransferFunction) -> None:
@@ -38,15 +34,11 @@ def write_transfer(path: str | os.PathLike[str], transfer: TransferFunction) -> 
     Raises:
         ValueError: another suffix, or a place that cannot be written to.
     """
-    file = Path(path)
-    if file.suffix.lower() != SUFFIX:
-        raise ValueError(f"{file}: a transfer function is written as {SUFFIX}, not as {file.suffix!r}")
     head = {"format": FORMAT, "version": VERSION, "dtype": str(transfer.values.dtype)}
     fields = {field.name: getattr(transfer, field.name) for field in dataclasses.fields(transfer)}
     rows = [f'  "{name}": {_text(value)}' for name, value in fields.items() if value is not None]
     start = [f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in head.items()]
-    with written_whole(file) as temporary:
-        temporary.write_text("{\n" + ",\n".join(start + rows) + "\n}\n", encoding="utf-8")
+    write_json(path, "transfer function", "{\n" + ",\n".join(start + rows) + "\n}")
 
 
 def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
@@ -59,10 +51,8 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
     """
     file = regular_file(path)
     found = read_json(file)
-    try:
+    with naming(file):
         return TransferFunction.from_points(**_fields(found))
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
 
 
 def _fields(found: Any) -> dict[str, Any]:
@@ -70,11 +60,7 @@ def _fields(found: Any) -> dict[str, Any]:
         raise ValueError(
             f'is JSON, but no transfer function: "format" must be "{FORMAT}"; `TransferFunction.save` writes such files'
         )
-    version = found.get("version")
-    if isinstance(version, bool) or version != VERSION:
-        newer = isinstance(version, int) and version > VERSION
-        remedy = "update jaxsph" if newer else "save it again"
-        raise ValueError(f'"version" is {version!r}, and this version of jaxsph reads {VERSION}; {remedy}')
+    require_version({"version": None} | found, VERSION)
     names = {field.name for field in dataclasses.fields(TransferFunction)}
     missing = [name for name in REQUIRED if name not in found]
     unknown = sorted(set(found) - names - KNOWN)
@@ -103,7 +89,3 @@ def _text(value: Any) -> str:
     if rows.ndim > 1:
         return "[" + ",\n    ".join(_text(row) for row in rows) + "]"
     return "[" + ", ".join(str(number) for number in rows) + "]"
-
-
-TransferFunction.writer = staticmethod(write_transfer)
-TransferFunction.reader = staticmethod(read_transfer)

@@ -54,9 +54,9 @@ class Image:
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
 
     writer: ClassVar[Callable[[str | os.PathLike[str], Image], None]]
-    """How images become files: given by `jaxsph.io`, which knows the formats."""
+    """How images become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
     drawer: ClassVar[Callable[..., Any]]
-    """How images become figures: given by `jaxsph.plot.image_figure`."""
+    """How images become figures: given by `jaxsph.plot.methods`, from `jaxsph.plot.image_figure`."""
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""

@@ -50,7 +50,7 @@ class Projection:
     metadata: tuple[tuple[str, Any], ...] = ()
 
     writer: ClassVar[Callable[..., None]]
-    """How projections become files: given by `jaxsph.io`, which knows the formats."""
+    """How projections become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
 
     @property
     def shape(self) -> tuple[int, int]:

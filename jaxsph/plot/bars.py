@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.labels import CODE_UNITS
-from jaxsph.io.quantities import LOG_PREFIX
+from jaxsph.io.settle.labels import CODE_UNITS
+from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.scales import Scale
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsph.io.labels import CODE_UNITS, Labels
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
+from jaxsph.io.settle.labels import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -280,6 +280,3 @@ def round_length(most: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is at most `most`, > 0."""
     power = 10.0 ** np.floor(np.log10(most))
     return float(max((step * power for step in (1, 2, 5) if step * power <= most), default=power))
-
-
-Image.drawer = staticmethod(image_figure)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.registry import ESTIMATING
 from jaxsph.trade.contenders import ESTIMATORS, FULL_RATE

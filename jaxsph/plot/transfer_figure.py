@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.analysis.met import Met, met
-from jaxsph.io.labels import Labels
-from jaxsph.io.optional import require
+from jaxsph.io.libraries import require
+from jaxsph.io.settle.labels import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -167,6 +167,3 @@ def _legend(upper: Any, right: Any, with_bars: bool, height: float) -> None:
         bars = Patch(facecolor="#c8c8c8", edgecolor=DARK, linewidth=0.5)
         handles, labels = [bars, *more, *handles], ["seen: light absorbed, in its colours", *names, *labels]
     upper.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, height), ncols=3, frameon=False, fontsize="small")
-
-
-TransferFunction.drawer = staticmethod(transfer_figure)

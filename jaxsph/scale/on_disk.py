@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.io.assemble import in_box, kernel_of, opacity_of
-from jaxsph.io.quantities import ROLES, choose_quantity
-from jaxsph.io.snapshot_index import SnapshotIndex, index_of
-from jaxsph.io.snapshot_rows import Snapshot, needed_columns, supports_and_volumes, together
+from jaxsph.io.disk.index import SnapshotIndex, index_of
+from jaxsph.io.disk.rows import Snapshot, needed_columns, supports_and_volumes, together
+from jaxsph.io.settle.assemble import in_box, kernel_of, opacity_of
+from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.frusta import Planes, between_depths

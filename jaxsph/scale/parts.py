@@ -23,7 +23,7 @@ from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import choose, fitted, fitting
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
-from jaxsph.io.exr import FIRST_ROW, ROWS
+from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene

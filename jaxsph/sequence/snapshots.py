@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.io.matching import between, ids_of, velocity_of
+from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles import capacity_class

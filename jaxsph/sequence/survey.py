@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph import io
-from jaxsph.io.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
-from jaxsph.io.quantities import choose_quantity
-from jaxsph.io.selection import chosen
-from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
+from jaxsph.io.disk.sequence import Order, in_order, numbers_of, require_no_gap
+from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.settle.quantities import choose_quantity
+from jaxsph.io.settle.selection import chosen
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.colormaps import value_range

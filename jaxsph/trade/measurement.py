@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.io.regular import regular_file
+from jaxsph.io.damage import regular_file
 from jaxsph.io.replace import written_whole
 from jaxsph.model import Camera, Scene, Settings
 from jaxsph.numerics.digest import digest_of, fingerprint

@@ -5,7 +5,8 @@ import pytest
 from snapshots_made import particles, write
 
 import jaxsph as js
-from jaxsph.io import snapshot_index, snapshot_rows
+from jaxsph.io.disk import index as snapshot_index
+from jaxsph.io.disk import rows as snapshot_rows
 from jaxsph.scale import from_disk
 from jaxsph.scale.panes import Pane
 

@@ -41,7 +41,7 @@ class CameraPath:
 
     writer: ClassVar[Callable[..., None]]
     reader: ClassVar[Callable[..., CameraPath]]
-    """How paths become files: given by `jaxsph.io`."""
+    """How paths become files, and files paths: given by `jaxsph.plot.methods`, from `jaxsph.io`."""
 
     def __post_init__(self) -> None:
         if not self.legs:

@@ -170,6 +170,3 @@ def _usable(domain: str, quantity: np.ndarray, values: tuple[float, float] | Non
         return domain
     low, high = values or (np.percentile(quantity, TAILS) if quantity.size else (0.0, 0.0))
     return "log" if low > 0 and np.log10(high / low) >= MIN_DECADES else "linear"
-
-
-TransferFunction.presets = staticmethod(preset)

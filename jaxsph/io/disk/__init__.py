@@ -1,0 +1,1 @@
+"""Snapshots in many files, larger than memory, or in a sequence."""

@@ -1,0 +1,107 @@
+"""Snapshots in several files, as codes write them that run on many nodes: `snap_002.0.hdf5`, `snap_002.1.hdf5`, ... as one.
+
+Flow: path, reader -> [files] -> ParticleTable of all files.
+
+Any of the files stands for all. Files may lack a type of particles that others have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, NoParticlesError, regular_file
+from jaxsph.io.table import ParticleTable
+
+NAMED = 3
+"""Missing files that are named at most."""
+PART = re.compile(r"(.*\.)(\d+)(\.[A-Za-z]\w*)?")
+Reader = Callable[[Path, int | None], ParticleTable]
+
+
+def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader) -> ParticleTable:
+    """The particles of all files of a snapshot, in the order of their numbers; the table itself if it is in one file.
+
+    Args:
+        table: what `read` gave for `path`.
+        read: reads one file; `NoParticlesError` where it has none of the type.
+
+    Raises:
+        ValueError: a file is missing or damaged (which), or files have different columns.
+    """
+    if table.num_files == 1:
+        return table
+    files = files_of(path, table.num_files)
+    if files is None:
+        note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
+        return dataclasses.replace(table, conventions=(*table.conventions, note))
+    tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
+    chosen = min(found.part_type for found in tables if found.part_type is not None)
+    of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
+    return concatenated([found for found in of_type if found is not None], len(files))
+
+
+def files_of(path: Path, number: int) -> list[Path] | None:
+    """All files of the snapshot that a file is one of; None where its name does not say which it is.
+
+    Raises:
+        ValueError: some are not there, or no regular files. The folder is listed once: a header may ask for any number.
+    """
+    match = PART.fullmatch(path.name)
+    if match is None or int(match[2]) >= number:
+        return None
+    there = _numbers_beside(path, match[1], match[3] or "", number)
+    missing = (f"{match[1]}{nth}{match[3] or ''}" for nth in range(number) if nth not in there)
+    named, num_missing = list(itertools.islice(missing, NAMED)), number - len(there)
+    for name in named:
+        if path.with_name(name).exists():
+            regular_file(path.with_name(name))  # says what it is instead
+    if named:
+        more = f" and {num_missing - NAMED} more" if num_missing > NAMED else ""
+        raise DataError(f"{path}: is one of {number} files of a snapshot; beside it {', '.join(named)}{more} cannot be found")
+    return [path.with_name(f"{match[1]}{nth}{match[3] or ''}") for nth in range(number)]
+
+
+def _numbers_beside(path: Path, before: str, after: str, number: int) -> set[int]:
+    """Numbers below `number` of the regular files that are called as this one but for that."""
+    with os.scandir(path.parent) as entries:
+        matches = [(entry, PART.fullmatch(entry.name)) for entry in entries if entry.name.startswith(before)]
+        alike = [(entry, match[2]) for entry, match in matches if match and (match[1], match[3] or "") == (before, after)]
+        numbers = {int(text) for entry, text in alike if text == str(int(text)) and entry.is_file()}
+    return {nth for nth in numbers if nth < number}
+
+
+def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
+    """One table of the particles of several, with what the first says of all. Raises `ValueError`: columns differ."""
+    first = tables[0]
+    filled = [table for table in tables if len(table)] or [first]
+    for table in filled[1:]:
+        differ = set(filled[0].columns) ^ set(table.columns)
+        if differ or (table.support is None) != (filled[0].support is None):
+            what = ", ".join(sorted(differ)) or "supports"
+            raise DataError(f"{table.path}: {what} of the particles are in some files of the snapshot only; write it again")
+
+    def whole(arrays: Sequence[np.ndarray | None]) -> np.ndarray | None:
+        present = [array for array in arrays if array is not None]
+        return np.concatenate(present) if present else None
+
+    columns = {name: np.concatenate([table.columns[name] for table in filled]) for name in filled[0].columns}
+    position = np.concatenate([table.position for table in filled])
+    support, volume = whole([table.support for table in filled]), whole([table.volume for table in filled])
+    said = (*first.conventions, f"of {number} files")
+    more: dict[str, Any] = {"support": support, "volume": volume, "conventions": said, "num_files": 1}
+    return dataclasses.replace(first, position=position, columns=columns, **more)
+
+
+def _read(read: Reader, file: Path, part_type: int | None) -> ParticleTable | None:
+    try:
+        return dataclasses.replace(read(file, part_type), path=str(file))
+    except NoParticlesError:
+        return None

@@ -1,0 +1,1 @@
+"""Pictures, movies, slices and projections as files."""

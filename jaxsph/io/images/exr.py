@@ -1,0 +1,162 @@
+"""OpenEXR images with every layer of a render.
+
+| channel | meaning |
+|---|---|
+| `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color`, see `scene_linear` |
+| `A` | `1 - transmittance` |
+| `Z` | view depth where transmittance falls to 1/2, inf where it never does |
+| `error.bound` | largest difference to the reference image that a pixel can have |
+| `work.evaluations` | kernel evaluations spent on the pixel |
+
+An image whose metadata say `jaxsph.first_row` and `jaxsph.rows` is some rows of a larger one: its data window is their place in
+the display window, so that EXR tools show it where it belongs. Its colours are `image.color` itself, bit for bit, so that parts
+make the same picture as the whole.
+
+All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
+`jaxsph.version`, `jaxsph.color` (what the colours are), `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`,
+`jaxsph.estimator` (`segments` of that integrator) and `certified` (`true` or `false`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.images.scene_linear import COLOR_KEY, color_of, header_of, is_light, light_of
+from jaxsph.io.libraries import hushed, require
+from jaxsph.io.replace import written_whole
+from jaxsph.model.image import Image
+
+SOURCE = "OpenEXR"
+VERSION_KEY = "jaxsph.version"
+FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
+"""Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
+RESERVED = (
+    "channels", "chromaticities", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
+    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
+)  # fmt: skip
+WORDS = {"true": True, "false": False, "none": None}
+
+
+def write(path: Path, image: Image) -> None:
+    """Write every layer and the metadata of `image`; whole or not at all.
+
+    Raises:
+        ValueError: the path cannot be written to, or a metadata name is one that OpenEXR uses itself.
+        ImportError: OpenEXR is not installed.
+    """
+    windows = _windows(image)
+    color = np.asarray(image.color, np.float32) if windows else light_of(image.color)
+    layers = {
+        **{name: color[..., i] for i, name in enumerate("RGB")},
+        "A": 1 - np.asarray(image.transmittance, np.float32),
+        "Z": image.depth,
+        "error.bound": image.error_bound,
+        "work.evaluations": image.evaluations,
+    }
+    write_layers(path, layers, {**_attributes(image), **windows, **header_of(displayed=bool(windows))})
+
+
+def read(path: Path) -> Image:
+    """Read an image that `write` wrote, or any OpenEXR image with `R`, `G` and `B`.
+
+    Layers that the file lacks are NaN. `stats` is empty: the sums of a render are not in the file. Colours are as displayed: of
+    linear light its sRGB encoding, to 1e-6 what was written. See `scene_linear` for files that do not say what they have.
+
+    Raises:
+        ValueError: damaged, without colour, or with colours of an unknown kind.
+        ImportError: OpenEXR is not installed.
+    """
+    with explained(path, SOURCE):
+        layers, header = read_layers(path)
+        missing = [name for name in "RGB" if name not in layers]
+        if missing:
+            raise DataError(f"has no channel {' '.join(missing)}, only {' '.join(layers)}; a colour image is expected")
+        unknown = np.full_like(layers["R"], np.nan)
+        own = (*RESERVED, COLOR_KEY)
+        stored = {name: value for name, value in header.items() if name not in own and isinstance(value, str | int | float)}
+        metadata = {name: _value(value) for name, value in stored.items()}
+        color = np.stack([layers[name] for name in "RGB"], axis=-1)
+        return Image(
+            color=jnp.asarray(color_of(color) if is_light(header) else color),
+            transmittance=jnp.asarray(1 - layers.get("A", unknown)),
+            depth=jnp.asarray(layers.get("Z", unknown)),
+            error_bound=jnp.asarray(layers.get("error.bound", unknown)),
+            evaluations=jnp.asarray(layers.get("work.evaluations", unknown)),
+            certified=metadata.get("certified") is True,
+            faults=int(metadata.get("faults") or 0),
+            stats={},
+            metadata=tuple(metadata.items()),
+        )
+
+
+def write_layers(path: Path, layers: Mapping[str, Any], header: Mapping[str, Any]) -> None:
+    """Write layers as channels of float32, compressed without loss; whole or not at all. Raises as `write`."""
+    openexr = require("OpenEXR", "writing EXR images")
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    with written_whole(path) as temporary:
+        try:
+            header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **header}
+            openexr.File(header, channels).write(str(temporary))
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"cannot write {path}: {error}") from error
+
+
+def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The channels of a file, float32, and its header; `ValueError` where it does not begin as such files do."""
+    openexr = require("OpenEXR", "reading EXR images")
+    if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
+        raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
+    with hushed():  # of what is damaged the library says more, line by line
+        file = openexr.File(str(path), separate_channels=True)
+    return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}, dict(file.header())
+
+
+def _attributes(image: Image) -> dict[str, Any]:
+    """The metadata of `image` as EXR attributes."""
+    attributes = {str(name): _attribute(value) for name, value in dict(image.metadata).items()}
+    clash = [name for name in attributes if name in RESERVED]
+    if clash:
+        raise ValueError(f"`metadata` must not use the name {clash[0]!r}, which OpenEXR uses itself; rename it")
+    if VERSION_KEY not in attributes:
+        package = sys.modules[__name__.partition(".")[0]]  # looked up, as this room does not import the house
+        attributes[VERSION_KEY] = package.__version__
+    attributes.setdefault("certified", _attribute(bool(image.certified)))
+    attributes.setdefault("faults", int(image.faults))
+    return attributes
+
+
+def _windows(image: Image) -> dict[str, Any]:
+    """Where rows of a larger image belong; nothing of a whole one."""
+    metadata, (height, width) = dict(image.metadata), image.shape
+    if FIRST_ROW not in metadata or ROWS not in metadata:
+        return {}
+    first = int(metadata[FIRST_ROW])
+    tops_and_bottoms = {"dataWindow": (first, first + height - 1), "displayWindow": (0, int(metadata[ROWS]) - 1)}
+    return {
+        name: (np.array([0, top], np.int32), np.array([width - 1, bottom], np.int32))
+        for name, (top, bottom) in tops_and_bottoms.items()
+    }
+
+
+def _attribute(value: Any) -> str | int | float:
+    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+        value = value.item()
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int) and abs(value) < 2**31:
+        return value
+    return float(value) if isinstance(value, int | float) else str(value)
+
+
+def _value(value: str | int | float) -> str | int | float | bool | None:
+    """An attribute as it was before it was written: EXR holds single precision, so the shortest decimal is meant."""
+    if isinstance(value, str):
+        return WORDS.get(value, value)
+    return float(str(np.float32(value))) if isinstance(value, float) else value

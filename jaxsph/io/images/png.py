@@ -1,0 +1,54 @@
+"""PNG images: 8 bit RGB of the colours over black, for looking at.
+
+Colours come from a transfer function, which is made by eye on a display, so they are display-referred (sRGB): they are written
+as they are, clipped to [0, 1] and rounded to the nearest of 256 steps, with no further encoding. Layers other than
+colour are left out; write EXR to keep them. The metadata goes into text chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.io.damage import explained
+from jaxsph.io.libraries import require
+from jaxsph.io.replace import written_whole
+from jaxsph.model.image import Image
+
+SOURCE = "PNG"
+
+
+def write(path: Path, image: Image) -> None:
+    """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to."""
+    write_pixels(path, image.to_uint8(), dict(image.metadata))
+
+
+def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) -> None:
+    """Write (H, W, 3) uint8, whole or not at all, with metadata in text chunks."""
+    pillow = require("PIL.Image", "writing PNG images")
+    chunks = require("PIL.PngImagePlugin", "writing PNG images").PngInfo()
+    for name, value in metadata.items():
+        chunks.add_text(str(name), str(value))
+    with written_whole(path) as temporary:
+        pillow.fromarray(pixels).save(temporary, format="PNG", pnginfo=chunks)
+
+
+def read(path: Path) -> Image:
+    """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file, and NaN.
+
+    Raises:
+        ValueError: damaged or another format.
+    """
+    pillow = require("PIL.Image", "reading PNG images")
+    with explained(path, SOURCE):
+        with pillow.open(path, formats=["PNG"]) as opened:
+            opened.verify()  # the check sum of every chunk, which decoding does not compare
+        with pillow.open(path, formats=["PNG"]) as opened:
+            color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
+            metadata = tuple(getattr(opened, "text", {}).items())
+        unknown = jnp.full(color.shape[:2], jnp.nan, jnp.float32)
+        return Image(jnp.asarray(color), unknown, unknown, unknown, unknown, False, 0, {}, metadata)

@@ -1,0 +1,100 @@
+"""Projections as files: raw values in OpenEXR or NumPy arrays, or a picture of them.
+
+| suffix | what it holds |
+|---|---|
+| `.exr` | values as a float32 channel called as they are, such as `mass` or `column.density`; the channel `weight` of means |
+| `.npy` | values alone, in their own dtype |
+| `.png` | 8 bit colours of a colour map |
+
+The EXR header holds `jaxsph.of`, `jaxsph.unit`, `jaxsph.pixel_area` (length units squared; at depth 1 with perspective) and the
+metadata of the projection. Row 0 is the top.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.images.exr import read_layers, write_layers
+from jaxsph.io.images.png import write_pixels
+from jaxsph.io.replace import written_whole
+from jaxsph.model.projection import Projection
+
+SUFFIXES = (".exr", ".npy", ".png")
+WEIGHT = "weight"
+NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
+
+
+def write_projection(path: str | os.PathLike[str], projection: Projection, **look: Any) -> None:
+    """Write a projection, whole or not at all; `look` is that of `Projection.to_uint8`, for pictures.
+
+    Raises:
+        ValueError: another suffix, a place that cannot be written to, values that float32 cannot hold (EXR).
+        ImportError: OpenEXR is not installed.
+    """
+    file = Path(path)
+    if file.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{file}: projections are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
+    if look and file.suffix.lower() != ".png":
+        raise ValueError(f"{file}: `{next(iter(look))}` is for pictures (.png); raw values have no colours")
+    if file.suffix.lower() == ".exr":
+        _write_exr(file, projection)
+    elif file.suffix.lower() == ".npy":
+        with written_whole(file) as temporary, temporary.open("wb") as stream:
+            np.save(stream, np.asarray(projection.values), allow_pickle=False)
+    else:
+        log, (low, high) = projection.span(look.get("norm"), look.get("value_span"))
+        shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
+        more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
+        write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
+
+
+def read_projection(path: str | os.PathLike[str]) -> Projection:
+    """Read the raw values that `write_projection` wrote to an EXR file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: damaged, or not of a projection.
+        ImportError: OpenEXR is not installed.
+    """
+    file = regular_file(path)
+    with explained(file, "OpenEXR projection"):
+        layers, header = read_layers(file)
+        if NAME not in header or _channel(header[NAME]) not in layers:
+            raise DataError(f"holds no projection, only channels {' '.join(layers)}; read images by `read_image`")
+        known = {NAME, UNIT, AREA, PERSPECTIVE}
+        more = tuple((name, value) for name, value in header.items() if name.startswith("jaxsph.") and name not in known)
+        weight = layers.get(WEIGHT)
+        return Projection(
+            jnp.asarray(layers[_channel(header[NAME])]),
+            None if weight is None else jnp.asarray(weight),
+            jnp.float32(header[AREA]),
+            header[PERSPECTIVE] == "true",
+            name=header[NAME],
+            unit=header[UNIT],
+            metadata=more,
+        )
+
+
+def _write_exr(path: Path, projection: Projection) -> None:
+    layers = {_channel(projection.name): projection.values}
+    if projection.weight is not None:
+        layers[WEIGHT] = projection.weight
+    for name, layer in layers.items():
+        with np.errstate(over="ignore"):
+            if np.isinf(np.asarray(layer, np.float32)).any():
+                raise ValueError(f"`{name}` has values that float32 cannot hold, as EXR needs it; rescale them, or write .npy")
+    own = {NAME: projection.name, UNIT: projection.unit, AREA: float(projection.pixel_area)}
+    own[PERSPECTIVE] = str(bool(projection.perspective)).lower()
+    write_layers(path, layers, dict(projection.metadata) | own)
+
+
+def _channel(name: str) -> str:
+    """A name that channels can have, and that is none of those that viewers take for colours."""
+    plain = "".join(c if c.isalnum() or c in "._-" else "_" for c in name) or "values"
+    return f"of.{plain}" if plain in ("R", "G", "B", "A", "Z", WEIGHT) else plain

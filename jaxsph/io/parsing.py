@@ -1,0 +1,158 @@
+"""What parsers of several formats share: words to numbers, scalars to vectors, packed data to no more of it than is needed.
+
+Flow: file -> reader, with [parsing] -> ParticleTable or VolumeTable.
+
+A kilobyte may unpack to a megabyte, or say that it does. Bytes behind the data that a header announces say that data or header
+are damaged.
+"""
+
+from __future__ import annotations
+
+import functools
+import lzma
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import IO, Any
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, NoParticlesError
+
+TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
+SEPARATORS = " :._-["
+POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coords", "coord", "p", "r")
+
+DEFLATE_RATIO = 1032
+"""The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
+LZMA_RATIO = 2**13
+"""The same of LZMA: zeros, by far the best case, shrink 7000 times."""
+LZMA_MEMORY = 2**27
+"""Bytes that a stream may ask for its dictionary: twice those of the strongest preset."""
+CHUNK_BYTES = 2**18
+
+Decompressor = Callable[[], Any]
+"""Makes what unpacks one stream."""
+INFLATING: Decompressor = zlib.decompressobj
+UNLZMA: Decompressor = functools.partial(lzma.LZMADecompressor, memlimit=LZMA_MEMORY)
+
+
+def numbers(tokens: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndarray:
+    """One number a token, in the native order of `dtype`; integers keep all their digits.
+
+    Each is converted on its own, as an array of words would be as wide as the longest of them.
+
+    Raises:
+        ValueError: a token that is no number.
+        OverflowError: an integer that `dtype` cannot hold.
+    """
+    native = dtype.newbyteorder("=")
+    return np.fromiter(map(int if native.kind in "iu" else float, tokens), native, len(tokens))
+
+
+def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Positions (N, 3) and the other columns, with `a_x, a_y, a_z` or `a:0, a:1, a:2` joined to the vector `a`.
+
+    Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`.
+
+    Raises:
+        ValueError: no `x y z`, nor another triple that is named as a position; names that differ in their unit only.
+    """
+    columns: dict[str, np.ndarray] = {}
+    for full_name, values in fields.items():
+        name = full_name.partition(" [")[0].partition(" (")[0].strip()
+        if name in columns:
+            raise DataError(f"has the column `{name}` twice, but for its unit; give them two names")
+        columns[name] = values
+    positions: dict[str, np.ndarray] = {}
+    for name in list(columns):
+        for first, second, third in TRIPLES:
+            base, bracket = (name[:-2], "]") if name.endswith(f"{first}]") else (name[:-1], "")
+            members = [base + suffix + bracket for suffix in (first, second, third)]
+            if name == members[0] and all(member in columns for member in members):
+                vector = np.stack([columns.pop(member) for member in members], axis=1)
+                label = base.rstrip(SEPARATORS)
+                if label.lower() in POSITION_BASES:
+                    positions[label.lower()] = vector
+                else:
+                    columns[f"{label}_xyz" if label in columns else label] = vector
+                break
+    for base in POSITION_BASES:
+        if base in positions:
+            position = positions.pop(base)
+            return position, {**columns, **positions}
+    raise DataError(f"holds no positions: there are {', '.join(fields) or 'no columns'}; name three of them x, y and z")
+
+
+def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Of `.npy`: shape, whether the first index runs fastest, and dtype; the stream stands at the data then."""
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    version = np.lib.format.read_magic(stream)
+    if version not in read_header:
+        raise DataError(f"holds an array of `.npy` version {version}; write it again with numpy.save or numpy.savez")
+    return read_header[version](stream)
+
+
+def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompressor, need: int, what: str) -> bytes:
+    """All blocks unpacked, each a whole stream.
+
+    Raises:
+        ValueError: a block that does not end, or more than the `need` bytes of `what`; unpacking stops there.
+    """
+    parts, left = [], need
+    for block in blocks:
+        stream = decompressor()
+        part = stream.decompress(block, left + 1)  # one more than may come: at exactly `left` its end would not be seen
+        if len(part) > left:
+            raise DataError(f"unpacks to more than the {need} bytes that {what} need, so it is damaged; write it again")
+        if not stream.eof:
+            raise DataError(f"is cut short inside {what}: a compressed block does not end; copy it again")
+        parts.append(part)
+        left -= len(part)
+    return b"".join(parts)
+
+
+def read_up_to(stream: IO[bytes], size: int, begin: bytes = b"") -> bytearray:
+    """`begin` and what follows it, `size` bytes or all there are: memory is taken as bytes come, not as announced."""
+    content = bytearray(begin)
+    while len(content) < size and (part := stream.read(min(size - len(content), CHUNK_BYTES))):
+        content += part
+    return content
+
+
+def count_rest(stream: IO[bytes]) -> int:
+    """How many bytes follow in a stream, none of which is kept: at its end, gzip compares its check sum."""
+    left = 0
+    while part := stream.read(CHUNK_BYTES):
+        left += len(part)
+    return left
+
+
+def refuse_missing(count: int, available: int, what: str) -> None:
+    """Refuse a file that has fewer points than its header says."""
+    if available < count:
+        raise DataError(f"is cut short: {count} {what} are announced, {available} are there; copy it again")
+
+
+def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
+    """Refuse a file that goes on for `left` > 0 `unit` behind `what`, where its header lets nothing follow.
+
+    Raises:
+        ValueError: there is something left.
+    """
+    if left > 0:
+        raise DataError(
+            f"has {left} more {unit} than {what} and what its header announces: one of them is damaged, so that what is "
+            f"read may be shifted; copy it again, or write it again from its source"
+        )
+
+
+def choose_type(present: Sequence[int], part_type: int | None) -> int:
+    """The type of particles that is read: the one asked for, else gas (0) if there is any, else the first there is.
+
+    Raises:
+        ValueError: there are none of the type asked for.
+    """
+    if part_type is not None and part_type not in present:
+        there = ", ".join(map(str, present)) or "none: it has none at all"
+        raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")
+    return part_type if part_type is not None else next(iter(present), 0)

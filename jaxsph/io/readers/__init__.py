@@ -1,0 +1,1 @@
+"""Readers of particle files, one a format."""

@@ -1,0 +1,157 @@
+r"""Gadget binary snapshots, format 1 and 2, of either byte order. One type of particles is read.
+
+A snapshot is a sequence of Fortran records: the length of the data as uint32, the data, the length again. Format 2 puts
+a record of 8 bytes with a name before each block; format 1 relies on the order POS VEL ID MASS U RHO (NE NH) HSML.
+The support is HSML itself (Gadget convention). Units are left as stored; a box is taken to be periodic.
+Source: Springel, User guide for GADGET-2, section 6.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.parsing import choose_type
+from jaxsph.io.table import ParticleTable, box_of, time_of
+
+SOURCE = "Gadget binary"
+Order = Literal["<", ">"]
+HEADER_BYTES = 256
+NUM_TYPES = 6
+HEADER = [
+    ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
+    ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
+]  # fmt: skip
+MAX_RECORDS = 512
+"""More than any code writes; a tail of zeros reads as empty records, one every eight bytes."""
+GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
+COLUMN_NAMES = {
+    "VEL": "velocity", "ID": "id", "MASS": "mass", "U": "internal_energy", "RHO": "density", "POT": "potential",
+}  # fmt: skip
+
+
+def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+    """Read the particles of one type; without `part_type`, gas (0) or the first type there is.
+
+    Raises:
+        ValueError: damaged, cut short, blocks of sizes that fit no number of particles, or no such type.
+    """
+    with explained(path, SOURCE):
+        content = np.fromfile(path, dtype=np.uint8)
+        order = _byte_order(content[:4].tobytes())
+        if order is None:
+            raise DataError("does not begin with a Gadget record of 8 (format 2) or 256 bytes (format 1); it is another format")
+        blocks = _blocks(content, order)
+        header = _header(blocks.pop("HEAD"), order)
+        counts = header["count"].astype(np.int64)
+        chosen = choose_type(np.flatnonzero(counts).tolist(), part_type)
+        said = [f"particles of type {chosen}"]
+        mass = float(header["mass"][chosen])
+        if not 0 <= mass < np.inf:
+            raise DataError(f"has mass {mass:g} for particles of type {chosen} in its header; correct that number there")
+        columns: dict[str, np.ndarray] = {}
+        for name, raw in blocks.items():
+            values = _block(name, raw, counts, header["mass"], chosen, order)
+            if isinstance(values, str):
+                said.append(values)
+            elif values is not None:
+                columns[COLUMN_NAMES.get(name, name)] = values
+        if "POS" not in columns:
+            raise DataError(f"has no block POS among {', '.join(blocks)}; write the snapshot again with positions")
+        if "mass" not in columns and mass > 0:
+            columns["mass"] = np.full(counts[chosen], mass)
+            said.append(f"mass = {mass:g} for all (mass table in the header)")
+        support = columns.pop("HSML", None)
+        if support is not None:
+            said.append("support = HSML (Gadget convention: the kernel ends there)")
+        box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
+        said += notes
+        said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
+        more: dict[str, Any] = {"box_size": box_size, "time": time_of(header["time"]), "num_files": max(int(header["files"]), 1)}
+        more |= {"conventions": tuple(said), "part_type": chosen, "kernel": "cubic_spline"}
+        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
+
+
+def looks_like(start: bytes) -> bool:
+    """Whether a file that begins with `start` begins with a Gadget record."""
+    return _byte_order(start) is not None
+
+
+def _byte_order(start: bytes) -> Order | None:
+    """That in which a file begins with a record of such a length as its first has, of format 2 or 1."""
+    orders: tuple[Order, ...] = ("<", ">")
+    lengths = ((order, np.frombuffer(start[:4], f"{order}u4")) for order in orders if len(start) >= 4)
+    return next((order for order, (length,) in lengths if length in (8, HEADER_BYTES)), None)
+
+
+def _records(content: np.ndarray, order: Order) -> list[np.ndarray]:
+    records: list[np.ndarray] = []
+    at = 0
+    while at < len(content):
+        if len(records) == MAX_RECORDS:
+            raise DataError(f"has more than {MAX_RECORDS} records (at byte {at}), so it is damaged or was not written to its end")
+        length = int(content[at : at + 4].view(f"{order}u4")[0]) if at + 4 <= len(content) else 0
+        stop = at + 4 + length
+        if stop + 4 > len(content):
+            raise DataError(f"is cut short: a block at byte {at} is not complete; copy it again")
+        if content[stop : stop + 4].copy().view(f"{order}u4")[0] != length:
+            raise DataError(f"is damaged: the block at byte {at} begins with length {length} and ends with another one")
+        records.append(content[at + 4 : stop])
+        at = stop + 4
+    return records
+
+
+def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
+    """Blocks by name, `HEAD` first."""
+    records = _records(content, order)
+    if len(records[0]) == 8:
+        names = [record[:4].tobytes().decode("ascii", errors="replace").strip() for record in records[0::2]]
+        if any(len(record) != 8 for record in records[0::2]) or len(records) % 2:
+            raise DataError("is damaged: its block names (format 2) are not where they must be; copy it again")
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise DataError(f"has the block `{twice}` twice, so its data cannot be told apart; write each block once")
+        blocks = dict(zip(names, records[1::2], strict=True))
+    else:
+        header = _header(records[0], order)
+        names = ["HEAD", "POS", "VEL", "ID"]
+        names += ["MASS"] if ((header["count"] > 0) & (header["mass"] == 0)).any() else []
+        names += ["U", "RHO", *(["NE", "NH"] if header["cooling"] else []), "HSML"] if header["count"][0] > 0 else []
+        blocks = dict(zip(names, records, strict=False))  # what follows HSML differs between codes, and is not read
+        if len(blocks) < 4:
+            raise DataError("is cut short: format 1 has at least POS, VEL and ID after its header; copy it again")
+    if len(blocks.get("HEAD", ())) != HEADER_BYTES:
+        raise DataError("has no header of 256 bytes as its first block, so it is damaged or another format")
+    return blocks
+
+
+def _header(record: np.ndarray, order: Order) -> np.void:
+    dtype = np.dtype(HEADER).newbyteorder(order)
+    return record[: dtype.itemsize].view(dtype)[0]
+
+
+def _block(
+    name: str, raw: np.ndarray, counts: np.ndarray, masses: np.ndarray, chosen: int, order: Order
+) -> np.ndarray | str | None:
+    """The rows of the chosen type, `None` where there are none, or a sentence where the block is not understood."""
+    everyone, gas = np.ones(NUM_TYPES, bool), np.arange(NUM_TYPES) == 0
+    known_as = {"POS": (everyone, 3), "VEL": (everyone, 3), "ACCE": (everyone, 3), "MASS": ((counts > 0) & (masses == 0), 1)}
+    known_as |= dict.fromkeys(("ID", "POT", "TSTP"), (everyone, 1)) | dict.fromkeys(GAS_BLOCKS, (gas, 1))
+    known = name in known_as
+    candidates = [known_as[name]] if known else [(gas, 1), (gas, 3), (everyone, 1), (everyone, 3)]
+    for types, width in candidates:
+        rows = int(counts[types].sum())
+        for size in (4, 8) if known else (4,):
+            if rows * width * size == len(raw):
+                if not types[chosen]:
+                    return None
+                values = raw.copy().view(f"{order}{'u' if name == 'ID' else 'f'}{size}")
+                start = int(counts[:chosen][types[:chosen]].sum())
+                picked = values.reshape(rows, width)[start : start + int(counts[chosen])]
+                return picked if width > 1 else picked[:, 0]
+    if known:
+        raise DataError(f"has a block {name} of {len(raw)} bytes, which fits no number of its particles; copy it again")
+    return f"left out block {name}: its {len(raw)} bytes fit no number of particles"

@@ -1,0 +1,194 @@
+r"""Gadget-style HDF5 snapshots: GADGET-2/3/4, GIZMO, AREPO and SWIFT. One type of particles is read.
+
+What `SmoothingLength` means depends on the code:
+
+| code | support radius $H$ |
+|---|---|
+| GADGET, GIZMO | `SmoothingLength` itself |
+| SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel named in `HydroScheme` |
+
+Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
+`Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
+SWIFT in `Parameters`.
+The kernel is that which SWIFT (`HydroScheme`), GADGET-4 (`Config`) or GIZMO (`Kernel_Function_ID`) state; a cubic spline where
+nothing is said.
+Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.io.parsing import choose_type
+from jaxsph.io.readers.hdf5_links import holds, member
+from jaxsph.io.readers.hdf5_storage import columns_of, read_dataset, read_positions
+from jaxsph.io.readers.stated_units import number_of, of_gadget
+from jaxsph.io.table import ParticleTable, box_of, plain, time_of
+
+SOURCE = "Gadget HDF5"
+SWIFT_SOURCE = "SWIFT HDF5"
+SWIFT_KERNELS = {
+    "Cubic spline (M4)": ("cubic_spline", 1.825742),
+    "Quartic spline (M5)": ("quartic_spline", 2.018932),
+    "Quintic spline (M6)": ("quintic_spline", 2.195775),
+    "Wendland C2": ("wendland_c2", 1.936492),
+    "Wendland C4": ("wendland_c4", 2.207940),
+    "Wendland C6": ("wendland_c6", 2.449490),
+}
+"""Kernels, and support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
+GADGET4_KERNELS = {
+    "CUBIC_SPLINE_KERNEL": "cubic_spline",
+    "WENDLAND_C2_KERNEL": "wendland_c2",
+    "WENDLAND_C4_KERNEL": "wendland_c4",
+    "WENDLAND_C6_KERNEL": "wendland_c6",
+}
+"""What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
+GIZMO_KERNELS = {
+    3: "cubic_spline",
+    4: "quintic_spline",
+    5: "quartic_spline",
+    6: "wendland_c2",
+    7: "wendland_c4",
+    9: "wendland_c6",
+}
+"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
+the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
+MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
+CUBIC = "cubic_spline"
+SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
+
+
+def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
+    """The particles of one type of an open `h5py.File`.
+
+    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`. Of those, `rows` are read, and
+    besides positions `only` the columns of those names (`plain`).
+
+    Raises:
+        ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
+    """
+    chosen, group = _choose(file, part_type)
+    position = read_positions(group["Coordinates"], rows)
+    count = group["Coordinates"].shape[0]
+    header = file["Header"].attrs if "Header" in file else {}
+    _refuse_other_count(header, chosen, count)
+    said = [f"particles of PartType{chosen}"]
+    swift = _is_swift(file)
+    columns, dropped = {}, []
+    for name, dataset in columns_of(group).items():
+        if name == "Coordinates" or (only is not None and plain(name) not in only):
+            continue
+        if dataset.dtype.kind not in "fiub":
+            dropped.append(name)
+        elif dataset.shape[0] != count:
+            raise DataError(f"PartType{chosen}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
+        else:
+            columns[name] = read_dataset(dataset, rows)
+    if dropped:
+        said.append(f"left out {', '.join(dropped)}: not numbers")
+    masses = np.ravel(header.get("MassTable", ()))
+    if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
+        mass, where = float(masses[chosen]), "`MassTable` of its header; correct that number there"
+        if not 0 <= mass < np.inf:
+            raise DataError(f"has mass {mass:g} for particles of type {chosen} in {where}")
+        if mass:
+            columns["Masses"] = np.full(len(position), mass)
+            said.append(f"mass = {mass:g} for all (MassTable in the header)")
+    smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
+    support = None
+    if smoothing is not None:
+        support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
+        said.append(sentence)
+    kernel, sentence = _kernel(file, header, swift)
+    said.append(sentence)
+    edges = np.ravel(header.get("BoxSize", 0.0)).astype(np.float64)
+    box_size, notes = box_of(edges) if _is_periodic(file) and edges.any() else (None, [])
+    said += notes
+    source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
+    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
+    more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
+    return ParticleTable(position, columns, support, None, box_size, source, **more)
+
+
+def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:
+    found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
+    usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
+    if not usable:
+        raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
+    chosen = choose_type(usable, part_type)
+    member(found[chosen], "Coordinates")
+    return chosen, found[chosen]
+
+
+def _is_swift(file: Any) -> bool:
+    """SWIFT signs its snapshots in the header, and in the group `Code`."""
+    return any("SWIFT" in text(file[group].attrs.get("Code", "")) for group in ("Header", "Code") if group in file)
+
+
+def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
+    if not swift:
+        return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
+    kernel = _swift_kernel(file)
+    if kernel not in SWIFT_KERNELS:
+        raise DataError(
+            f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`); the support radius is known "
+            f"for {', '.join(SWIFT_KERNELS)}"
+        )
+    gamma = SWIFT_KERNELS[kernel][1]
+    return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {kernel} kernel)"
+
+
+def _swift_kernel(file: Any) -> str:
+    return text(file["HydroScheme"].attrs.get("Kernel function", "")) if "HydroScheme" in file else ""
+
+
+def _kernel(file: Any, header: Any, swift: bool) -> tuple[str, str]:
+    """The smoothing kernel, and one sentence on where that is said."""
+    if swift:
+        stated = _swift_kernel(file)
+        if stated in SWIFT_KERNELS:
+            return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
+    config = set(file["Config"].attrs) if "Config" in file else set()
+    if config & MOVING_MESH:
+        return CUBIC, f"kernel = {CUBIC}: the cells of a moving mesh (AREPO) have none, and are drawn as particles"
+    compiled = [name for name in GADGET4_KERNELS if name in config]
+    if compiled:
+        return GADGET4_KERNELS[compiled[0]], f"kernel = {GADGET4_KERNELS[compiled[0]]} ({compiled[0]}, Config)"
+    number = number_of(header, "Kernel_Function_ID")
+    if number is not None:
+        found = GIZMO_KERNELS.get(int(number))
+        if found is not None:
+            return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
+        return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number:g} is none that is known here"
+    return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
+
+
+def _refuse_other_count(header: Any, chosen: int, count: int) -> None:
+    """A file that was rewritten in part, or not to its end, says so here alone."""
+    told = np.ravel(np.asarray(header.get("NumPart_ThisFile", ())))
+    if chosen < len(told) and told.dtype.kind in "iuf" and told[chosen] != count:
+        raise DataError(
+            f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g}; copy it again, "
+            f"or correct that number if rows were added or left out on purpose"
+        )
+
+
+def _is_periodic(file: Any) -> bool:
+    """Whether the box of a snapshot is periodic, as far as it says: else it is."""
+    if "Config" in file and len(file["Config"].attrs):
+        return "PERIODIC" in file["Config"].attrs
+    told = file["Parameters"].attrs.get("InitialConditions:periodic") if "Parameters" in file else None
+    return told is None or text(told).strip() != "0"
+
+
+def text(value: Any) -> str:
+    """An HDF5 attribute as a string, whether it is stored as one, as bytes, or as an array of one of them."""
+    first = np.ravel(np.asarray(value, dtype=object))
+    if len(first) == 0:
+        return ""
+    return first[0].decode("utf-8", errors="replace") if isinstance(first[0], bytes) else str(first[0])

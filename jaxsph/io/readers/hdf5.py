@@ -1,0 +1,45 @@
+"""HDF5 files: find out by content which code wrote one, and hand it to that code's reader.
+
+| inside | read as |
+|---|---|
+| `PartType0`, `PartType1`, ... | Gadget, GADGET-4, SWIFT, GIZMO, AREPO (`gadget_hdf5`) |
+| `particles/xyz` and `header` | Phantom (`phantom`) |
+| `Coordinates` or `position` at the top | plain points, below |
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jaxsph.io.damage import DataError
+from jaxsph.io.readers import gadget_hdf5, phantom
+from jaxsph.io.readers.hdf5_links import opened
+from jaxsph.io.readers.hdf5_storage import numeric_datasets, read_positions
+from jaxsph.io.table import ParticleTable, plain, table_from_columns
+
+SOURCE = "HDF5 points"
+POSITION_NAMES = ("coordinates", "position", "positions", "pos", "points", "xyz")
+
+
+def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+    """Read an HDF5 file of any of the flavours at the top of this module.
+
+    Raises:
+        ValueError: damaged, or of none of these flavours; `part_type` for a file without types.
+        ImportError: h5py is not installed.
+    """
+    with opened(path) as file:
+        if any(name.startswith("PartType") for name in file):
+            return gadget_hdf5.from_hdf5(file, part_type)
+        if "header" in file and "particles" in file and "xyz" in file["particles"]:
+            return phantom.from_hdf5(file, part_type)
+        stored = next((name for want in POSITION_NAMES for name in file if plain(name) == want), None)
+        if stored is None:
+            raise DataError(
+                f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget, SWIFT), "
+                f"`particles` and `header` (Phantom), or a dataset `Coordinates`"
+            )
+        if part_type is not None:
+            raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
+        position = read_positions(file[stored])
+        return table_from_columns(position, numeric_datasets(file, len(position), skip=(stored,)), source=SOURCE)

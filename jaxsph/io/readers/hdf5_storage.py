@@ -1,0 +1,256 @@
+"""Whether the data of an HDF5 data set is there: what is not would be read as zeros.
+
+Flow: HDF5 data set -> [hdf5_storage: refuse_unwritten, read_dataset] -> the reader of a code -> ParticleTable.
+
+A data set has a shape before it has data. Its storage is allocated when data is written: whole where it is contiguous, chunk by
+chunk where it is chunked. So a run that was stopped, or a disk that was full, shows in what is allocated. Data may also lie in
+other files: as raw bytes (external storage), or in data sets of which this one is a view (a virtual data set). All of them are
+looked at, as HDF5 reads what it does not find as the fill value.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsph.io.damage import DataError
+from jaxsph.io.libraries import require
+from jaxsph.io.parsing import DEFLATE_RATIO
+from jaxsph.io.readers.hdf5_links import PURPOSE, check_links, file_of, inside, member, members
+
+DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
+BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
+"""Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
+MAX_PIECES = 2**24
+"""Of a view: about as many as parts of a snapshot, squared at worst."""
+COPY = "write its numbers into one file"
+
+
+class Source(NamedTuple):
+    """A data set that a view shows: its file, its name in it, and part of a sentence that names it."""
+
+    path: Path
+    name: str
+    said: str
+
+
+def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
+    """All of an `h5py.Dataset`, or some of its rows.
+
+    Raises:
+        ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold.
+    """
+    if shape_of(dataset) is None:
+        raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
+    refuse_unwritten(dataset)
+    return np.asarray(dataset[() if rows is None else rows])
+
+
+def read_positions(dataset: Any, rows: slice | None = None) -> np.ndarray:
+    """The positions (N, 3) of an `h5py.Dataset`, or some of them; other shapes are refused before they are read."""
+    position_shape(dataset)
+    return read_dataset(dataset, rows)
+
+
+def position_shape(dataset: Any) -> tuple[int, int]:
+    """The shape of positions, (N, 3); `ValueError` for any other."""
+    shape = shape_of(dataset)
+    if shape is None or len(shape) != 2 or shape[1] != 3 or dataset.dtype.kind not in "fiu":
+        raise DataError(f"`{dataset.name}` must hold numbers of shape (N, 3), got {shape}; write three coordinates a particle")
+    return shape[0], 3
+
+
+def columns_of(group: Any) -> dict[str, Any]:
+    """The data sets of `group` with one or two axes, not read.
+
+    Raises:
+        ValueError: a link that cannot be followed, a view of files that are missing or may not be opened.
+    """
+    return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
+
+
+def numeric_datasets(group: Any, count: int, skip: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+    """The data sets of `group` with `count` rows of one or more numbers."""
+    return {
+        name: read_dataset(dataset)
+        for name, dataset in columns_of(group).items()
+        if name not in skip and dataset.shape[0] == count and dataset.dtype.kind in "fiub"
+    }
+
+
+def shape_of(dataset: Any) -> tuple[int, ...] | None:
+    """The shape of a data set, which of some views HDF5 opens files to know; None of what is none, or has no data.
+
+    Raises:
+        ValueError: a view of files that are missing or may not be opened.
+    """
+    if getattr(dataset, "is_virtual", False):
+        _sources(dataset)
+    shape: tuple[int, ...] | None = getattr(dataset, "shape", None)
+    return shape
+
+
+def refuse_unwritten(dataset: Any) -> None:
+    """Refuse a data set some of whose data is not there.
+
+    Raises:
+        ValueError: never written, cut short, or a view of what is not there; what cannot be known.
+    """
+    needed = math.prod(shape_of(dataset) or ()) * dataset.dtype.itemsize
+    if needed == 0:
+        return
+    if dataset.is_virtual:
+        return _refuse_gaps(dataset)
+    if dataset.external:
+        return _refuse_short_storage(dataset, needed)
+    what, stored = f"`{dataset.name}` has shape {dataset.shape}", dataset.id.get_storage_size()
+    if dataset.chunks is not None:
+        written = dataset.id.get_num_chunks()
+        chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+        if written < chunks:
+            raise DataError(
+                f"{what}, but only {written} of its {chunks} chunks were ever written: "
+                f"the others would be read as {dataset.fillvalue}; write the file again, or copy it again"
+            )
+    if needed > stored * _most_per_byte(dataset):
+        again = "write the file again, or copy it again"
+        raise DataError(f"{what}, which needs {needed} bytes, but only {stored} were ever written; {again}")
+
+
+def _most_per_byte(dataset: Any) -> float:
+    """How many bytes one stored byte can become."""
+    pipeline = dataset.id.get_create_plist()
+    filters = {pipeline.get_filter(index)[0] for index in range(pipeline.get_nfilters())}
+    if not filters:
+        return 1
+    return DEFLATE_RATIO if filters <= BOUNDED_FILTERS else math.inf
+
+
+def _refuse_short_storage(dataset: Any, needed: int) -> None:
+    """Raw bytes in other files: as many as are needed, from each its part."""
+    left = needed
+    for name, offset, size in dataset.external:
+        path, part = _raw_file(dataset, name), min(size, left)
+        there = path.stat().st_size
+        if there < offset + part:
+            raise DataError(
+                f"`{dataset.name}` lies in `{name}`, which must have {offset + part} bytes and has {there}: the others would be "
+                f"read as zeros; copy that file again"
+            )
+        left -= part
+    if left > 0:
+        raise DataError(f"`{dataset.name}` needs {needed} bytes, {left} of which lie nowhere; write the file again")
+
+
+def _raw_file(dataset: Any, name: str) -> Path:
+    """Where HDF5 looks for raw bytes: unlike all other files from where the process was started, unless told otherwise."""
+    path = Path(os.path.abspath(dataset.file.filename))
+    folder = os.environ.get("HDF5_EXTFILE_PREFIX", ".").replace("${ORIGIN}", str(path.parent))
+    place, what = Path(os.path.abspath(folder)) / name, f"`{dataset.name}` lies in `{name}`"
+    if not os.path.lexists(place):
+        raise DataError(f"{what}, and there is no {place}; start the program in the folder of that file, or {COPY}")
+    return inside(place, (path.parent, path.resolve().parent), what)
+
+
+def _sources(dataset: Any) -> list[Source]:
+    """What a view shows, in files that are there and may be opened."""
+    names = [(source.file_name, source.dset_name) for source in dataset.virtual_sources()]
+    paths = {file: _source_file(dataset, file) for file in {file for file, _ in names}}
+    if any("%" in dset for _, dset in names):
+        raise DataError(f"`{dataset.name}` is a view of data sets by a pattern: how many there must be is not said; {COPY}")
+    return [Source(paths[file], dset, f"`{dataset.name}` is a view of `{dset}` in `{file}`") for file, dset in names]
+
+
+def _source_file(dataset: Any, name: str) -> Path:
+    what = f"`{dataset.name}` is a view of `{name}`"
+    if "%" in name:
+        raise DataError(f"{what}, a pattern of names: how many there must be is not said; {COPY}")
+    if name == ".":
+        return Path(dataset.file.filename)
+    path = file_of(dataset.file, name, what)
+    if path is None:
+        instead = f"its part would be read as {dataset.fillvalue}"
+        raise DataError(f"{what}, which is not there: {instead}; put that file beside this one")
+    check_links(path)
+    return path
+
+
+def _refuse_gaps(dataset: Any) -> None:
+    """A view is whole where all that it shows is there, and what it shows is all of it."""
+    if None in dataset.maxshape:
+        raise DataError(f"`{dataset.name}` is a view of what grows: how much there must be is not said; {COPY}")
+    mapped = dataset.virtual_sources()
+    for source, mapping in zip(_sources(dataset), mapped, strict=True):
+        known = source.path.stat()
+        there = _source_shape(source, known.st_mtime_ns, known.st_size, known.st_ino)
+        if not _has_all(there, mapping):
+            little = "too little for what is shown"
+            raise DataError(f"{source.said}, which has the shape {there} there: {little}; write the file again")
+    spaces = [mapping.vspace for mapping in mapped]
+    numbers = sum(space.get_select_npoints() for space in spaces)
+    if numbers < math.prod(dataset.shape):
+        told = f"has shape {dataset.shape}, but is a view of {numbers} numbers only"
+        raise DataError(f"`{dataset.name}` {told}; write the file again")
+    if not _all_covered([_block(dataset, space) for space in spaces if space.get_select_npoints()], dataset.shape):
+        raise DataError(
+            f"`{dataset.name}` is a view that shows some data sets twice, and has parts that show none: these would be read as "
+            f"{dataset.fillvalue}; write the file again"
+        )
+
+
+def _has_all(there: tuple[int, ...], mapping: Any) -> bool:
+    """Whether a data set of this shape has the numbers that a view shows of it; of one that is shown whole, just as many."""
+    space, numbers = mapping.src_space, mapping.vspace.get_select_npoints()
+    if space.get_select_type() == require("h5py", PURPOSE).h5s.SEL_ALL:
+        return math.prod(there) == numbers
+    last = space.get_select_bounds()[1]
+    inside = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
+    return inside and space.get_select_npoints() == numbers
+
+
+@functools.lru_cache(maxsize=65536)
+def _source_shape(source: Source, *_: int) -> tuple[int, ...]:
+    """Asked once of a file that does not change: a view of thousands of files is read part by part."""
+    h5py = require("h5py", PURPOSE)
+    with h5py.File(source.path, "r") as file:
+        if source.name not in file:
+            raise DataError(f"{source.said}, which is not there: it would be read as its fill value; copy that file again")
+        found = member(file, source.name)
+        if not isinstance(found, h5py.Dataset):
+            raise DataError(f"{source.said}, which is no data set; write the file again")
+        if found.is_virtual:
+            raise DataError(f"{source.said}, which is a view itself: views of views are not followed; {COPY}")
+        try:
+            refuse_unwritten(found)
+        except DataError as error:
+            raise DataError(f"{source.said}: there {error}") from error
+        return tuple(found.shape)
+
+
+def _block(dataset: Any, space: Any) -> tuple[np.ndarray, np.ndarray]:
+    """First and last index, plus one, along each axis of a part of a view that is one block."""
+    lower, upper = (np.array(edge, np.int64) for edge in space.get_select_bounds())
+    if math.prod((upper + 1 - lower).tolist()) != space.get_select_npoints():
+        raise DataError(f"`{dataset.name}` is a view by parts that are no blocks, and is not followed; {COPY}")
+    return lower, upper + 1
+
+
+def _all_covered(blocks: list[tuple[np.ndarray, np.ndarray]], shape: tuple[int, ...]) -> bool:
+    """Whether blocks leave out nothing of a shape: known of the pieces between their edges."""
+    lower, upper = (np.array(ends) for ends in zip(*blocks, strict=True))
+    edges = [np.unique([0, size, *lower[:, axis], *upper[:, axis]]) for axis, size in enumerate(shape)]
+    pieces = [len(ends) - 1 for ends in edges]
+    if math.prod(pieces) > MAX_PIECES:
+        raise DataError(f"is a view of {len(blocks)} parts that are cut too finely to be checked; {COPY}")
+    first, last = ([np.searchsorted(edge, ends[:, axis]) for axis, edge in enumerate(edges)] for ends in (lower, upper))
+    if np.prod(np.array(last) - np.array(first), axis=0, dtype=np.float64).sum() > 16 * MAX_PIECES:
+        raise DataError(f"is a view of {len(blocks)} parts that lie upon one another; {COPY}")
+    shown = np.zeros(pieces, bool)
+    for begin, end in zip(zip(*first, strict=True), zip(*last, strict=True), strict=True):
+        shown[tuple(map(slice, begin, end))] = True
+    return bool(shown.all())

@@ -1,0 +1,125 @@
+"""NumPy archives: `position` and any other array of N rows.
+
+| key | meaning |
+|---|---|
+| `position` (N, 3) | required |
+| `support_radius` or `support`, `volume` | one number, or (N,) |
+| `particle_mass` or `mass`, `density` | one number, or (N,) |
+| any other array of N rows | a column |
+| `time` or `t` | one number: when |
+
+Other single numbers (a rest density) are not particle data and are left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.parsing import DEFLATE_RATIO, array_header, read_up_to
+from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns, time_of
+
+SOURCE = "NumPy archive"
+SUFFIX = ".npy"
+POSITION_NAMES = ("position", "positions", "coordinates", "points", "xyz")
+BROADCAST_NAMES = (*SUPPORT_NAMES, *VOLUME_NAMES, *ROLES["mass"], *ROLES["density"])
+NUMBERS = "fiub"
+TIME_NAMES = ("time", "t")
+
+
+def read(path: Path) -> ParticleTable:
+    """Read an `.npz` file; `ValueError` when it is damaged or holds no positions. Pickled objects are not loaded."""
+    with explained(path, SOURCE):
+        if not zipfile.is_zipfile(path):
+            raise DataError("is not a complete .npz archive (a zip file); copy it again, or write it with numpy.savez")
+        with zipfile.ZipFile(path) as archive:
+            arrays = _arrays(archive, os.path.getsize(path))
+            stored = next((name for want in POSITION_NAMES for name in arrays if plain(name) == want), None)
+            if stored is None:
+                raise DataError(f"holds no `position`, only {', '.join(arrays) or 'nothing'}; name the (N, 3) array so")
+            position = arrays.pop(stored)
+            if position.dtype.kind not in "fiu":
+                raise DataError(f"`{stored}` must hold numbers, got dtype {position.dtype}")
+            if len(position.shape) != 2 or position.shape[1] != 3:
+                raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
+            table = table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
+            moment = next((arrays[name] for want in TIME_NAMES for name in arrays if plain(name) == want), None)
+            is_one = moment is not None and moment.shape in ((), (1,)) and moment.dtype.kind in NUMBERS
+            return dataclasses.replace(table, time=time_of(moment.load()) if moment is not None and is_one else None)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Array:
+    """An array of the archive, of which only the header was read."""
+
+    name: str
+    archive: zipfile.ZipFile
+    entry: zipfile.ZipInfo
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype
+
+    def load(self) -> np.ndarray:
+        with self.archive.open(self.entry) as stream:
+            array_header(stream)
+            content = read_up_to(stream, self.entry.file_size)
+        values = np.frombuffer(content, self.dtype)
+        return values.reshape(self.shape, order="F" if self.is_fortran else "C")
+
+
+def _columns(arrays: dict[str, _Array], count: int) -> dict[str, np.ndarray]:
+    """What belongs to `count` particles; all else stays packed."""
+    columns = {}
+    for name, array in arrays.items():
+        stands_for_all = plain(name) in map(plain, BROADCAST_NAMES)
+        if array.dtype.kind not in NUMBERS:
+            continue
+        if array.shape in ((), (1,)) and stands_for_all:
+            columns[name] = np.full(count, array.load().reshape(()))
+        elif len(array.shape) in (1, 2) and array.shape[0] == count:
+            columns[name] = array.load()
+        elif array.shape and stands_for_all:
+            raise DataError(f"`{name}` has shape {array.shape}, but there are {count} particles; give 1 or N")
+    return columns
+
+
+def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
+    """The headers of all arrays by name; refused where sizes cannot be those of a file of `file_bytes`."""
+    arrays: dict[str, _Array] = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(SUFFIX)
+        if not entry.filename.endswith(SUFFIX):
+            continue
+        if name in arrays:
+            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; write it once")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise DataError(f"`{name}` is packed by a method that numpy.savez does not use; write it with numpy.savez")
+        arrays[name] = _array(archive, entry, name)
+        file_bytes -= entry.compress_size
+    if file_bytes < 0:
+        raise DataError("has entries that overlap, so it is damaged; write it again with numpy.savez")
+    return arrays
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Array:
+    most = entry.compress_size * (1 if entry.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO)
+    if entry.file_size > most:
+        raise DataError(
+            f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can; "
+            f"it is damaged: copy it again"
+        )
+    with archive.open(entry) as stream:
+        shape, is_fortran, dtype = array_header(stream)
+        held = entry.file_size - stream.tell()
+    if dtype.hasobject:
+        raise DataError(f"`{name}` holds Python objects, which are not loaded; write it as numbers, or leave it out")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != held:
+        raise DataError(f"`{name}` has shape {shape} of {dtype}, but its entry holds {held} bytes; write it again")
+    return _Array(name, archive, entry, shape, is_fortran, dtype)

@@ -1,0 +1,176 @@
+"""Text tables: CSV (`,` `;` or tab), columns parted by spaces, and XYZ, with or without names.
+
+Names come from a first line of words, or from a `#` comment right above the numbers; without names the first three
+columns are x, y, z. An XYZ file begins with the number of particles and a comment, and each line with the name of an
+element or its number; extended XYZ names its columns in the comment (`Properties=species:S:1:pos:R:3:...`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
+from jaxsph.io.parsing import gather_vectors
+from jaxsph.io.table import ParticleTable, table_from_columns
+
+SOURCE = "text table"
+DELIMITERS = (",", ";", "\t")
+WHOLE = re.compile(r"[+-]?[0-9]{1,400}")
+"""Of more digits than any float64 has."""
+MAX_COLUMNS = 2**16
+"""Columns that a comment of a few bytes may ask for."""
+ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
+
+
+def read(path: Path) -> ParticleTable:
+    """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits.
+
+    Raises:
+        ValueError: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded, fewer
+            than three columns, or an XYZ file with another number of rows than it announces.
+    """
+    with explained(path, SOURCE):
+        content = path.read_bytes()
+        if b"\0" in content:
+            raise DataError("is not text: it holds zero bytes; check its format, or rename it to its proper suffix")
+        text = content.decode("utf-8-sig")
+        lines = text.splitlines()
+        if not text.strip():
+            raise DataError("is empty; an empty set of particles needs a line of column names")
+        ended = text.endswith(("\n", "\r"))
+        names, rows, delimiter = _names(lines)
+        if not rows and not ended:
+            raise DataError("is cut short: its first line has no end; copy it again")
+        said = [] if ended else [UNENDED_NOTE]
+        first = rows[0].split() if rows and names is None and _is_counted(lines) else []
+        if first and all(map(_is_number, first)) and all(map(_begins_with_element, rows)):
+            said.append(ELEMENT_NOTE)
+            names = ["element", "x", "y", "z", *(f"column{index}" for index in range(5, len(first) + 1))]
+        fields, left_out = _fields(rows, names, delimiter)
+        if left_out:
+            said.append(f"left out {', '.join(left_out)}: not numbers")
+        position, columns = gather_vectors(fields)
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
+    """Column names if there are any, the rows of data, and the delimiter (`None` for spaces)."""
+    if _is_counted(lines):
+        count, comment = int(lines[0]), "".join(lines[1:2])
+        rows = [line for line in lines[2:] if line.strip()]
+        if len(rows) != count:
+            raise DataError(f"announces {count} particles, but {len(rows)} lines follow; it is cut short or damaged")
+        return _extended_names(comment), rows, None
+    rows = [line for line in lines if line.strip()]
+    comments = 0
+    while comments < len(rows) and rows[comments].lstrip().startswith("#"):
+        comments += 1
+    data = [row for row in rows[comments:] if not row.lstrip().startswith("#")]
+    if not data:
+        last = rows[comments - 1].lstrip("# ") if comments else ""
+        delimiter = _delimiter(last)
+        return (_split(last, delimiter) if last else ["x", "y", "z"]), [], delimiter
+    delimiter = _delimiter(data[0])
+    first = _split(data[0], delimiter)
+    if not any(_is_number(word) for word in first):
+        return first, data[1:], delimiter
+    above = rows[comments - 1].lstrip("# ") if comments else ""
+    named = _split(above, delimiter if delimiter and delimiter in above else None)
+    fits = len(named) == len(first) and not any(map(_is_number, named))
+    return (named if fits else None), data, delimiter
+
+
+def _is_counted(lines: list[str]) -> bool:
+    """Whether the first line is a number of particles, as in XYZ files."""
+    return lines[0].strip().isdecimal()
+
+
+def _begins_with_element(row: str) -> bool:
+    """Whether a row of four or more numbers begins with a whole one, written as such: XYZ has the element there."""
+    first, *rest = row.split(maxsplit=4)
+    return first.isdecimal() and len(rest) >= 3
+
+
+def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of numbers by name, and the names of the columns that hold words; whole numbers keep all their digits."""
+    if not rows:
+        return {name: np.zeros(0) for name in names or ("x", "y", "z")}, []
+    first = _split(rows[0], delimiter)
+    numeric = [index for index, word in enumerate(first) if _is_number(word)]
+    if names is None:
+        labels = ["x", "y", "z"] + [f"column{index}" for index in range(4, len(numeric) + 1)]
+        names = [f"column{index + 1}" for index in range(len(first))]
+        for index, label in zip(numeric, labels, strict=False):
+            names[index] = label
+    if len(names) != len(first):
+        raise DataError(f"names {len(names)} columns, but its first row has {len(first)}; name each column once")
+    if len(set(names)) != len(names):
+        raise DataError(f"has columns of the same name among {', '.join(names)}; name each column once")
+    widths = {len(_split(row, delimiter)) for row in rows}
+    if len(widths) > 1:
+        raise DataError(f"has rows of {' and '.join(map(str, sorted(widths)))} columns; all must have the same number")
+    clean = [row.replace('"', "") for row in rows] if '"' in rows[0] else rows
+    values = np.loadtxt(clean, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None)
+    fields = {names[index]: values[:, column] for column, index in enumerate(numeric)}
+    for column, index in enumerate(numeric):
+        if (abs(values[:, column]) >= 2.0**53).any():
+            fields[names[index]] = _exact([_split(row, delimiter)[index] for row in clean], values[:, column], names[index])
+    return fields, [name for index, name in enumerate(names) if index not in numeric]
+
+
+def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:
+    """The numbers of a column where some are too large for float64 to hold every whole number: whole ones keep their digits.
+
+    Raises:
+        ValueError: whole numbers that neither 64 bits nor float64 hold, or that stand among others.
+    """
+    whole = [int(word) if WHOLE.fullmatch(word) else None for word in words]
+    numbers = [number for number in whole if number is not None]
+    for kind in (np.int64, np.uint64) if len(numbers) == len(words) else ():
+        if np.iinfo(kind).min <= min(numbers) and max(numbers) <= np.iinfo(kind).max:
+            return np.array(numbers, kind)
+    kept = [value.is_integer() and int(value) == number for number, value in zip(whole, values.tolist(), strict=True)]
+    lost = next((words[row] for row, number in enumerate(whole) if number is not None and not kept[row]), None)
+    if lost is not None:
+        raise DataError(
+            f"has the whole number {lost[:40]} in the column `{name}`, which float64 cannot hold and 64 bits only in a column of "
+            f"whole numbers: write ids as such, and quantities with a decimal point"
+        )
+    return values
+
+
+def _extended_names(comment: str) -> list[str] | None:
+    """Column names from an extended XYZ comment."""
+    match = re.search(r"Properties=([\w:]+)", comment)
+    if match is None:
+        return None
+    parts = match[1].split(":")
+    if len(parts) % 3 or not all(width.isdecimal() for width in parts[2::3]):
+        raise DataError(f"has `{match[0][:80]}`, which is not a sequence of name:type:width; write its comment again")
+    widths = [int(width) for width in parts[2::3]]
+    if sum(widths) > MAX_COLUMNS:
+        raise DataError(f"names {sum(widths)} columns in its comment, at most {MAX_COLUMNS} are read; write it again")
+    names = []
+    for name, width in zip(parts[0::3], widths, strict=True):
+        suffixes = [""] if width == 1 else [f"_{c}" for c in ("xyz" if width == 3 else map(str, range(width)))]
+        names += [name + suffix for suffix in suffixes]
+    return names
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in DELIMITERS if mark in line), None)
+
+
+def _split(line: str, delimiter: str | None) -> list[str]:
+    return [word.strip().strip('"').strip() for word in line.split(delimiter)]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

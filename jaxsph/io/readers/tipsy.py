@@ -1,0 +1,154 @@
+"""Tipsy files, of Gasoline, PKDGRAV and ChaNGa: one kind of particles is read.
+
+A header (time, numbers of bodies, dimensions, gas, dark matter, stars), then records of gas, dark matter and stars, all of four
+bytes a number; big-endian as the standard has it, or in the order of the machine that wrote it. Types are numbered as in Gadget
+files: 0 gas, 1 dark matter, 4 stars. The length `hsmooth` of gas records is a softening in some codes and a smoothing length in
+others; arrays beside the file, `FILE.smoothlength` and `FILE.den`, may hold smoothing lengths and densities. Lengths are half of
+the support where a sample of neighbours shows that (`stored`), else supports are found from neighbours. Units are those of a file
+of parameters beside it (`stated_units`). Source: the documentation of TIPSY, University of Washington N-Body Shop.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.parsing import choose_type, refuse_leftover
+from jaxsph.io.readers.stated_units import units_beside
+from jaxsph.io.settle.stored import with_stored_lengths
+from jaxsph.io.table import ParticleTable
+
+SOURCE = "Tipsy"
+Order = Literal["<", ">"]
+ORDERS: tuple[Order, Order] = (">", "<")
+HEADER = np.dtype([("time", "f8"), ("bodies", "i4"), ("dimensions", "i4"), ("gas", "i4"), ("dark", "i4"), ("stars", "i4")])
+SMOOTHING = "smoothlength", "hsmooth"
+PLACE = ("mass", "x", "y", "z", "vx", "vy", "vz")
+RECORDS = {
+    0: ("gas", (*PLACE, "rho", "temp", "hsmooth", "metals", "phi")),
+    1: ("dark", (*PLACE, "eps", "phi")),
+    4: ("stars", (*PLACE, "metals", "tform", "eps", "phi")),
+}
+"""Number of a type -> its count in the header, and the numbers of a record."""
+NAMES = "smoothlength", "den"
+"""Suffixes of arrays beside a file that are looked for, and names of their columns."""
+MAX_DIGITS = 64
+"""Bytes of a number as text."""
+
+
+def looks_like(start: bytes) -> bool:
+    """Whether a file that begins with `start` begins with a Tipsy header: three dimensions, and numbers that add up."""
+    return _header(start) is not None
+
+
+def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+    """Read the particles of one type: gas if there is any, else the first that there is.
+
+    Raises:
+        ValueError: damaged; no particles of that type.
+    """
+    with explained(path, SOURCE):
+        with path.open("rb") as file:
+            found = _header(file.read(HEADER.itemsize))
+            if found is None:
+                raise DataError("does not begin with a Tipsy header of three dimensions; it is another format, or damaged")
+            order, header = found
+            counts = {number: int(header[name]) for number, (name, _) in RECORDS.items()}
+            sizes = {number: 4 * len(fields) for number, (_, fields) in RECORDS.items()}
+            records = sum(counts[number] * sizes[number] for number in RECORDS)
+            begin = os.path.getsize(path) - records
+            if begin not in (HEADER.itemsize, HEADER.itemsize + 4):
+                stated = ", ".join(f"{counts[number]} {name}" for number, (name, _) in RECORDS.items())
+                raise DataError(f"is damaged or cut short: its header states {stated}, but its size is another; copy it again")
+            padding = file.read(begin - HEADER.itemsize)
+            if order == ">":  # that of the standard is zero; machines leave what they have between header and records
+                refuse_leftover(len(padding.strip(b"\0")), "its header and its records")
+            present = [number for number in RECORDS if counts[number]]
+            chosen = choose_type(present, part_type)
+            file.seek(begin + sum(counts[number] * sizes[number] for number in RECORDS if number < chosen))
+            fields = RECORDS[chosen][1]
+            values = np.frombuffer(file.read(counts[chosen] * sizes[chosen]), f"{order}f4").reshape(-1, len(fields))
+        rows = slice(first := sum(counts[number] for number in RECORDS if number < chosen), first + counts[chosen])
+        beside, said = arrays_beside(path, sum(counts.values()), counts[0], rows)
+        values = values.astype(np.float32)
+        columns = {name: values[:, nth] for nth, name in enumerate(fields) if name not in PLACE[1:]}
+        columns |= {"velocity": values[:, 4:7], **beside}
+        said = [f"particles of type {chosen} ({RECORDS[chosen][0]})", *said]
+        return table_of_changa(path, values[:, 1:4], columns, chosen, said, float(header["time"]), SOURCE, SMOOTHING)
+
+
+def table_of_changa(
+    path: Path,
+    position: np.ndarray,
+    columns: dict[str, np.ndarray],
+    part_type: int,
+    said: list[str],
+    time: float,
+    source: str,
+    smoothing: tuple[str, ...],
+) -> ParticleTable:
+    """Particles of ChaNGa or Gasoline, with units of the file of parameters, and supports from `smoothing` columns that fit."""
+    units, told = units_beside(path, columns, time)
+    kernel = "kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)"
+    more: dict[str, Any] = {"conventions": (*said, *told, kernel), "units": units, "time": time, "part_type": part_type}
+    return with_stored_lengths(ParticleTable(position, columns, source=source, kernel="cubic_spline", **more), *smoothing)
+
+
+def _header(start: bytes) -> tuple[Order, np.void] | None:
+    """The header and its byte order, where it has three dimensions and numbers that add up in either."""
+    for order in ORDERS if len(start) >= HEADER.itemsize else ():
+        header = np.frombuffer(start[: HEADER.itemsize], HEADER.newbyteorder(order))[0]
+        counts = [int(header[name]) for name in ("gas", "dark", "stars")]
+        if int(header["dimensions"]) == 3 and min(counts) >= 0 and sum(counts) == int(header["bodies"]) > 0:
+            return order, header
+    return None
+
+
+def arrays_beside(path: Path, bodies: int, gas: int, rows: slice) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns of the particles in `rows`, of so many bodies of which the first are gas; and sentences on what is not used.
+
+    A file has a number for each particle of the snapshot, or for gas alone: as text, their count in the first line and then one
+    a line; as bytes, the count in four and then floats of four, in either order of bytes.
+    """
+    columns, said = {}, []
+    for name in NAMES:
+        file = path.with_name(f"{path.name}.{name}")
+        if not file.is_file():
+            continue
+        values, trouble = _values(file, {bodies, gas})
+        if values is not None and len(values) < rows.stop:
+            values, trouble = None, "holds gas alone"
+        if values is None:
+            said.append(f"{file.name} is not used: it {trouble}")
+        else:
+            columns[name] = values[rows]
+            said.append(f"column `{name}` is of {file.name}")
+    return columns, said
+
+
+def _values(file: Path, counts: set[int]) -> tuple[np.ndarray | None, str]:
+    """The numbers of a file of one of these lengths, or what is wrong with it."""
+    try:
+        size = os.path.getsize(file)
+        if size > max(counts) * MAX_DIGITS + MAX_DIGITS:
+            return None, f"has {size} bytes, too many for {max(counts)} numbers"
+        stored = file.read_bytes()
+    except OSError as error:
+        return None, f"cannot be read ({error.strerror})"
+    for order in (">", "<"):
+        count = int(np.frombuffer(stored[:4], f"{order}i4")[0]) if size >= 4 else -1
+        if count in counts and size == 4 + 4 * count:
+            return np.frombuffer(stored[4:], f"{order}f4").astype(np.float32), ""
+    try:
+        first, *numbers = stored.split()
+        values = np.array(numbers, np.float64)
+        count = int(first)
+    except ValueError:
+        return None, "is neither text of numbers nor floats of four bytes"
+    if count not in counts or len(values) != count:
+        return None, f"states {count} numbers and has {len(values)}, but there are {max(counts)} particles"
+    return values.astype(np.float64), ""

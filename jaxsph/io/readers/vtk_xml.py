@@ -1,0 +1,207 @@
+"""VTK XML point sets: unstructured grids (`.vtu`) and polydata (`.vtp`); points and point data, cells are not read.
+
+Data may be ASCII, base64 or appended (raw or base64), plain or compressed by zlib or LZMA, of both byte orders, in any
+number of pieces. Point sets without a single cell are common among particle codes, and are read like others.
+Source: VTK File Formats, Kitware, "XML File Formats"; the layout of blocks after vtkXMLDataParser.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.parsing import DEFLATE_RATIO, INFLATING, LZMA_RATIO, UNLZMA, Decompressor, numbers, refuse_leftover, unpack_blocks
+from jaxsph.io.table import ParticleTable, table_from_columns
+
+SOURCE = "VTK XML"
+DATASETS = ("UnstructuredGrid", "PolyData")
+TYPES = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
+    "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+COMPRESSORS: dict[str | None, tuple[Decompressor | None, int]] = {
+    None: (None, 4),  # a number of eight bytes is a digit and a space, where it is text
+    "vtkZLibDataCompressor": (INFLATING, DEFLATE_RATIO),
+    "vtkLZMADataCompressor": (UNLZMA, LZMA_RATIO),
+}
+"""How data is unpacked, and the most bytes that one byte of the file can hold."""
+
+
+def read(path: Path) -> ParticleTable:
+    """Read points and point data of all pieces; columns of words are left out, and said so.
+
+    Raises:
+        ValueError: damaged, cut short, another type of data set, or a compressor that is not known.
+    """
+    with explained(path, SOURCE):
+        root, decoder = parsed(path, DATASETS, ".vtu, .vtp")
+        pieces = [_piece(piece, decoder) for piece in root.iter("Piece")]
+        if not pieces:
+            raise DataError("has no Piece, so it is cut short or damaged; copy it again")
+        columns = {
+            name: np.concatenate([columns[name] for _, columns in pieces])
+            for name in pieces[0][1]
+            if all(name in columns for _, columns in pieces)
+        }
+        partial = {name for _, columns in pieces for name in columns} - set(columns)
+        said = [f"left out {', '.join(sorted(partial))}: not in every piece"] if partial else []
+        if decoder.words:
+            said.append(f"left out {', '.join(dict.fromkeys(decoder.words))}: not numbers")
+        position = np.concatenate([position for position, _ in pieces])
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[ElementTree.Element, Decoder]:
+    """The XML of a file of one of those types of data set, and what reads its arrays."""
+    content = path.read_bytes()
+    start, stop = content.find(b"<AppendedData"), content.rfind(b"</AppendedData>")
+    if stop < start:
+        raise DataError("is cut short inside its data: `<AppendedData>` has no end; copy it again")
+    root = ElementTree.fromstring(content if start < 0 else content[:start] + b"</VTKFile>")
+    kind = root.get("type", "unknown")
+    if root.tag != "VTKFile" or kind not in datasets:
+        raise DataError(f"is XML of type {kind}; save it as {' or '.join(datasets)} ({suffixes})")
+    mark = content.find(b"_", max(start, 0), max(stop, 0))
+    tag, appended = (b"", b"") if mark < 0 else (content[start:mark], memoryview(content)[mark + 1 : stop])
+    decoder = Decoder(root, tag, appended, len(content))
+    decoder.refuse_leftover_data(root)
+    return root, decoder
+
+
+def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    stated = piece.get("NumberOfPoints")
+    if stated is None:
+        raise DataError("has a Piece that does not say its NumberOfPoints, so it is damaged; copy it again, or write it again")
+    count = int(stated)
+    if count < 0:
+        raise DataError(f"announces {count} points, so it is damaged; copy it again")
+    points = piece.find("Points/DataArray")
+    if points is None and count:
+        raise DataError("has a Piece without Points, so it is cut short or damaged; copy it again")
+    position = np.zeros((0, 3)) if points is None else decoder.array(points, count, 3)
+    if position is None or position.shape != (count, 3):
+        raise DataError("has points that are not three numbers each; write it again")
+    columns = {}
+    for array in piece.iterfind("PointData/DataArray"):
+        name = array.get("Name", "unnamed")
+        values = decoder.array(array, count, 1)
+        if name in columns:
+            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
+        if values is not None:
+            columns[name] = values
+    return position, columns
+
+
+class Decoder:
+    """What all data arrays of a file share: byte order, compression, and the appended data."""
+
+    def __init__(self, root: ElementTree.Element, tag: bytes, appended: bytes | memoryview, file_bytes: int) -> None:
+        order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
+        self.order = order
+        self.length = np.dtype(order + TYPES[root.get("header_type", "UInt32")])
+        compressor = root.get("compressor") or None
+        if compressor not in COMPRESSORS:
+            raise DataError(f"is compressed by {compressor}, which is not supported; save it with zlib")
+        self.decompressor, ratio = COMPRESSORS[compressor]
+        self.file_bytes, self.room = file_bytes, ratio * file_bytes
+        self.appended = memoryview(appended)
+        self.appended_is_text = b"base64" in tag
+        self.words: list[str] = []
+
+    def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:
+        """(count, width) numbers of one `DataArray`, or `None` where it holds words."""
+        name, kind = element.get("Name", "points"), element.get("type", "")
+        if kind not in TYPES:
+            self.words.append(name)
+            return None
+        width = int(element.get("NumberOfComponents") or default_width)
+        dtype = np.dtype(self.order + TYPES[kind])
+        need = count * max(width, 0) * dtype.itemsize
+        self.room -= need
+        if self.room < 0:
+            raise DataError(f"announces more data than its {self.file_bytes} bytes can hold, so it is damaged; write it again")
+        values = self._values(element, dtype, need, name) if count else np.zeros(0, dtype)
+        if width < 1 or len(values) != count * width:
+            raise DataError(
+                f"has {len(values)} numbers of `{name}`, but {count} points of {width} components each; "
+                f"it is cut short or damaged: copy it again"
+            )
+        return values.reshape(count, width)
+
+    def _values(self, element: ElementTree.Element, dtype: np.dtype, need: int, name: str) -> np.ndarray:
+        encoding, text = element.get("format", "ascii"), element.text or ""
+        if encoding == "ascii":
+            return numbers(text.split(), dtype)
+        if encoding == "binary":
+            stored = memoryview("".join(text.split()).encode("ascii"))
+            refuse_leftover(len(stored) - self._span_of(stored, True), f"`{name}`", "characters")
+            return np.frombuffer(self._decode(stored, True, need, name), dtype)
+        if encoding == "appended":
+            offset = int(element.get("offset", "0"))
+            if offset < 0:
+                raise DataError(f"has `{name}` at the offset {offset} of its appended data; it is damaged: copy it again")
+            return np.frombuffer(self._decode(self.appended[offset:], self.appended_is_text, need, name), dtype)
+        raise DataError(f"has data of format {encoding!r}; known are ascii, binary and appended")
+
+    def refuse_leftover_data(self, root: ElementTree.Element) -> None:
+        """Refuse appended data whose last array does not end where all of it does, but for white space."""
+        offsets = [int(each.get("offset", "0")) for each in root.iter() if each.get("format") == "appended"]
+        last = self.appended[max(offsets, default=0) :]
+        if not offsets or not bytes(last[: self.length.itemsize]).strip():
+            return
+        stop = self._span_of(last, self.appended_is_text)
+        refuse_leftover(len(bytes(last[stop:]).strip()), "its appended arrays")
+        if stop > len(last) or (stop == len(last) and bytes(last[-1:]).isspace()):
+            raise DataError(
+                "is cut short inside its data: the last array reaches into the end of `<AppendedData>`; copy it again"
+            )
+
+    def _span_of(self, data: memoryview, is_text: bool) -> int:
+        """How many bytes of the file one array takes that begins with `data`."""
+        start, sizes = self._header(data, is_text)
+        size = self.length.itemsize
+        if self.decompressor is None and start == 0:
+            return _span(size + sizes[0], is_text)
+        return start + _span(sum(sizes), is_text)
+
+    def _decode(self, data: memoryview, is_text: bool, need: int, name: str) -> bytes | memoryview:
+        """The bytes of one array: a header of lengths, then the data, in blocks if compressed."""
+        start, sizes = self._header(data, is_text)
+        if self.decompressor is None and start == 0:
+            size = self.length.itemsize
+            return _take(data, 0, size + sizes[0], is_text)[size:]
+        packed = _take(data, start, sum(sizes), is_text)
+        if self.decompressor is None:
+            return packed
+        ends = itertools.accumulate(sizes, initial=0)
+        blocks = (packed[a:b] for a, b in itertools.pairwise(ends))
+        return unpack_blocks(blocks, self.decompressor, need, f"`{name}`")
+
+    def _header(self, data: memoryview, is_text: bool) -> tuple[int, list[int]]:
+        """Where the data of an array begins, and the bytes of its blocks; at 0 where header and data are encoded as one."""
+        size = self.length.itemsize
+        first = int(np.frombuffer(_take(data, 0, size, is_text), self.length)[0])
+        if self.decompressor is None:
+            apart = is_text and b"=" in bytes(data[: _span(size, True)])  # padding inside: the header was encoded alone
+            return _span(size, True) if apart else 0, [first]
+        header_size = (3 + first) * size
+        sizes = np.frombuffer(_take(data, 0, header_size, is_text), self.length)[3:].tolist()
+        return _span(header_size, is_text), sizes
+
+
+def _span(size: int, is_text: bool) -> int:
+    """How many bytes of the file hold `size` bytes of data."""
+    return 4 * -(-size // 3) if is_text else size
+
+
+def _take(data: memoryview, start: int, size: int, is_text: bool) -> bytes | memoryview:
+    """`size` bytes of data that begin at `start` in the file."""
+    stored = data[start : start + _span(size, is_text)]
+    if len(stored) < _span(size, is_text):
+        raise DataError("is cut short inside its data; copy it again")
+    return base64.b64decode(stored, validate=True)[:size] if is_text else stored

@@ -1,0 +1,291 @@
+"""From a table to particles: settle quantity, supports and volumes, and report what was settled.
+
+Flow: ParticleTable -> [assemble] -> Particles, Report.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.io.damage import DataError, naming
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
+from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
+from jaxsph.io.settle.supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.where import select
+from jaxsph.io.table import ParticleTable
+from jaxsph.model.particles import Particles
+from jaxsph.numerics.given import plain
+
+ROUNDING_NOTED = 1e-3
+"""Rounding of positions to float32, in units of the smallest support, from which it is worth a note."""
+FROM_FILE = "file"
+OF_FILE = "lengths are numbers in the unit of the file"
+OUTSIDE = 1e-3
+"""Of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then."""
+ROUNDING_REFUSED = 0.25
+"""The same in units of the median support, from which a picture would show the rounding instead of the particles."""
+AUTO = "auto"
+SETTLED = "support =", "kernel ="
+"""How conventions begin that are told where supports and kernels are."""
+DEFAULT_KERNEL = "poly6"
+DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
+"""Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What was read and how it was understood; `str(report)` is for people.
+
+    Attributes:
+        source: file format.
+        path: the file, or an empty string.
+        num_particles: number of particles.
+        quantity: name of the quantity.
+        quantity_range: its smallest and largest value; NaN for an empty set.
+        opacity_by: name of the quantity that extinction is looked up by, where that was asked for, or chosen; it may be the same.
+        support: one sentence on where the supports come from.
+        support_range: smallest and largest support radius, length units; NaN for an empty set.
+        volume: one sentence on where the volumes come from.
+        kernel: the smoothing kernel, and why it is that one.
+        notes: further sentences: what was left out, periodic boxes, rounding.
+    """
+
+    source: str
+    path: str
+    num_particles: int
+    quantity: str
+    quantity_range: tuple[float, float]
+    support: str
+    support_range: tuple[float, float]
+    volume: str
+    notes: tuple[str, ...]
+    opacity_by: str | None = None
+    kernel: str = ""
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.path or 'particles'}: {self.num_particles} particles ({self.source})",
+            f"quantity  {self.quantity}: {self.quantity_range[0]:.6g} .. {self.quantity_range[1]:.6g}",
+            *([] if self.opacity_by is None else [f"opacity   by {self.opacity_by}"]),
+            f"support   {self.support_range[0]:.6g} .. {self.support_range[1]:.6g}: {self.support}",
+            f"volume    {self.volume}",
+            f"kernel    {self.kernel}",
+        ]
+        return "\n".join([*lines, *(f"note      {note}" for note in self.notes)])
+
+
+def particles_from_table(
+    table: ParticleTable,
+    quantity: str | None = None,
+    support: float | Float[np.ndarray, " particles"] | None = None,
+    kernel: str | None = None,
+    *,
+    progress: bool = False,
+    box: Any = FROM_FILE,
+    where: str | None = None,
+    share: float | None = None,
+    opacity_by: str | None = None,
+) -> tuple[Particles, Report]:
+    r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
+
+    Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
+    those of the table, else mass over density where a sample shows that to be the density (`jaxsph.io.settle.stored`), else
+    $1 / \sum_j W(|x_i - x_j|, H_i)$.
+
+    Args:
+        table: what was read.
+        quantity: name of a quantity (`jaxsph.io.settle.quantities`), or `None` for the most telling one.
+        support: one support radius, or one a particle, in the table's length unit; overrides the table's.
+        kernel: for the particles and for kernel sums; `None` for the table's own, else poly6.
+        box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the table, `None` for none.
+        progress, where, share, opacity_by: as for `jaxsph.io.read_particles`.
+
+    Returns:
+        The particles, and the report on what was settled. Particles are float32 unless the positions are float64 and
+        x64 is enabled in JAX.
+
+    Raises:
+        ValueError: an unknown quantity; values that are not finite; supports that are not positive; positions whose
+            float32 rounding exceeds a quarter of a support; a condition that is not understood, or that no particle meets.
+    """
+    with naming(table.path):
+        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share, opacity_by))
+
+
+def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
+    """The table with the periodic box asked for, and a note on that."""
+    box = plain("box", box, OF_FILE)
+    sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
+    if sides is None:
+        return dataclasses.replace(table, box_size=None), []
+    edges = " x ".join(f"{side:g}" for side in sides)
+    if not (len(sides) == 3 and all(np.isfinite(side) and side > 0 for side in sides)):
+        raise DataError(f"`box` must be three lengths > 0, got {edges}; give the sides of the period")
+    low, high = (table.position.min(0), table.position.max(0)) if len(table) else (np.zeros(3), np.zeros(3))
+    outside = (low < -OUTSIDE * np.array(sides)).any() or (high > (1 + OUTSIDE) * np.array(sides)).any()
+    if isinstance(box, str) and outside:
+        return dataclasses.replace(table, box_size=None), [f"not periodic: positions are outside of the file's box of {edges}"]
+    return dataclasses.replace(table, box_size=sides), [f"periodic box of {edges}: supports reach across its faces"]
+
+
+def _assemble(
+    table: ParticleTable,
+    notes: list[str],
+    quantity: str | None,
+    support: float | np.ndarray | None,
+    kernel: str | None,
+    progress: bool,
+    wanted: tuple[str | None, float | None, str | None],
+) -> tuple[Particles, Report]:
+    supports, support_origin = _supports(table, support, progress)
+    kernel, kernel_origin = kernel_of(table, kernel)
+    stored = stored_density(table)
+    table = without_placeholder(table, stored)
+    notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
+    notes += [stored.told] if stored.told else []
+    mass_name = table.named(*ROLES["mass"])
+    mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
+    summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
+    number_density = functools.cache(summed)
+
+    def density() -> np.ndarray:
+        if mass is None:
+            return number_density()
+        if len(mass) and mass.min() == mass.max():
+            return mass * number_density()
+        return summed(mass)
+
+    values, name = choose_quantity(table, quantity, density=density)
+    volumes, volume_origin = _volumes(table, mass_name, stored, number_density)
+    if name.endswith("density") and table.named(*ROLES["density"]) is None:
+        notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
+    rounding = rounding_note(table.position, supports)
+    if rounding:
+        notes.append(rounding)
+    dtype = table.position.dtype
+    kept, told = select(table, *wanted[:2], density=density)
+    notes += told
+    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, mass), density)
+    own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
+    with np.errstate(over="ignore"):
+        columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
+        if second is not None:
+            columns["quantity"] = columns["quantity"], columns.pop("second")
+        particles = Particles.from_arrays(table.position[kept], **columns, kernel=kernel, box=table.box_size)
+    report = Report(
+        source=table.source,
+        path=table.path,
+        num_particles=int(kept.sum()),
+        quantity=name,
+        quantity_range=range_of(values[kept]),
+        support=support_origin,
+        support_range=range_of(supports[kept]),
+        volume=volume_origin,
+        notes=tuple(notes),
+        opacity_by=opacity_by,
+        kernel=kernel_origin,
+    )
+    return particles, report
+
+
+def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
+    """The smoothing kernel of a table's particles, and one sentence on why it is that one."""
+    if asked is not None:
+        return asked, f"{asked}, given by the caller"
+    if table.kernel is None:
+        return DEFAULT_KERNEL, f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
+    sentence = next((c for c in table.conventions if c.startswith("kernel =")), f"kernel = {table.kernel}")
+    return table.kernel, sentence.removeprefix("kernel = ")
+
+
+def _volumes(
+    table: ParticleTable, mass_name: str | None, stored: StoredDensity, number_density: Callable[[], np.ndarray]
+) -> tuple[np.ndarray, str]:
+    """Volumes, and one sentence on where they come from."""
+    if table.volume is not None:
+        return table.volume.astype(np.float64), "as the file has it"
+    if mass_name is None or stored.column is None:
+        return 1 / number_density(), "1 / sum of kernels within the particle's own support"
+    mass, density = (table.columns[name].astype(np.float64) for name in (mass_name, stored.column))
+    measured = f" (the stored density is {stored.measured})" if stored.measured else ""
+    return mass / density, f"{mass_name} / {stored.column}{measured}"
+
+
+def _thinness(table: ParticleTable, volumes: np.ndarray, mass: np.ndarray | None) -> np.ndarray:
+    """1 / density: that which would be looked up, where the table holds one, whatever volumes are of."""
+    name = table.named(*ROLES["density"])
+    if mass is None or name is None or table.volume is not None or not is_positive(table.columns[name]):
+        return volumes if mass is None else volumes / mass
+    thinness: np.ndarray = 1 / table.columns[name].astype(np.float64)
+    return thinness
+
+
+def opacity_of(
+    table: ParticleTable, color_by: str, wanted: str | None, thinness: np.ndarray, density: Gather | None
+) -> tuple[np.ndarray | None, str | None]:
+    """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
+    if wanted == AUTO:
+        usable = thinness[np.isfinite(thinness) & (thinness > 0)]
+        low, high = np.percentile(usable, SPREAD_BETWEEN) if len(usable) else (1.0, 1.0)
+        if not high > DENSITY_SPREAD * low:
+            return None, None
+        wanted = LOG_PREFIX + (table.named(*ROLES["density"]) or "density")
+    if wanted is None:
+        return None, None
+    values, name = choose_quantity(table, wanted, density=density)
+    return None if name == color_by else values, name
+
+
+def _supports(table: ParticleTable, support: float | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
+    if support is not None:
+        given = np.asarray(plain("support", support, OF_FILE), np.float64)
+        if given.ndim and given.shape != (len(table),):
+            raise DataError(f"`support` must be a number or have shape ({len(table)},), got shape {given.shape}")
+        bad = ~(np.isfinite(given) & (given > 0))
+        if bad.any():
+            raise DataError(f"`support` must be finite and > 0, got {given[bad].flat[0]}; give a radius")
+        return np.broadcast_to(given, (len(table),)), "given by the caller"
+    if table.support is not None:
+        sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
+        return table.support.astype(np.float64), sentence
+    origin = f"distance to neighbour {NEIGHBOURS}"
+    if len(table) == 1:
+        origin = "1, as a single particle has no neighbours"
+    elif 0 < len(table) <= NEIGHBOURS:
+        origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
+    return nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
+
+
+def _scaled(volumes: np.ndarray) -> np.ndarray:
+    """Volumes over their median where float32 could not hold them: only their ratios matter."""
+    limits = np.finfo(np.float32)
+    if len(volumes) == 0 or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny)):
+        return volumes
+    return volumes / np.median(volumes)
+
+
+def rounding_note(position: np.ndarray, support: np.ndarray, called: str = "supports") -> str | None:
+    """A note on what float32 has done to the positions; `ValueError` where it has destroyed them. float64 ones stay whole."""
+    if len(position) == 0 or position.dtype == np.float64:
+        return None
+    rounding = float(np.abs(position).max()) * float(np.finfo(np.float32).eps) / 2
+    typical = float(np.median(support))
+    if rounding > ROUNDING_REFUSED * typical:
+        raise DataError(
+            f"positions reach {np.abs(position).max():.6g} with {called} of {typical:.6g}: float32 has rounded them by "
+            f"{rounding / typical:.2g} of them; give them in float64, or subtract a common offset before they become float32"
+        )
+    if rounding > ROUNDING_NOTED * float(support.min()):
+        return f"float32 has rounded positions by up to {rounding / float(support.min()):.2g} of the smallest of the {called}"
+    return None
+
+
+def range_of(values: np.ndarray) -> tuple[float, float]:
+    """Smallest and largest; NaN of nothing."""
+    return (float(values.min()), float(values.max())) if len(values) else (float("nan"), float("nan"))

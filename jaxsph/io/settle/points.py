@@ -1,0 +1,264 @@
+"""From a file to points: settle radii, colours and extinctions, and report what was settled.
+
+Flow: file -> [read_table] -> ParticleTable -> [points] -> Points, PointsReport.
+
+| of a point | taken from, in this order |
+|---|---|
+| radius | `radius`, `rad`, `r` (not beside `g` and `b`), `size`, a stored support, a smoothing length |
+| colour | `r g b`, `red green blue`, `color_r ...`, a vector `color` or `rgb`; else white |
+| strength | `extinction`, `opacity`, `alpha`; else an opacity of 0.8 |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, naming
+from jaxsph.io.settle.assemble import OF_FILE, range_of, rounding_note
+from jaxsph.io.settle.quantities import choose_quantity
+from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, plain
+from jaxsph.model.points import Points
+from jaxsph.model.transfer.colormaps import colormap as colors_of_map
+from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.numerics import given
+
+RADIUS_NAMES = ("radius", "radii", "rad", "r", "size")
+COLOR_TRIPLES = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g", "color_b"))
+COLOR_NAMES = ("color", "colour", "colors", "colours", "rgb", "rgba")
+EXTINCTION_NAMES = ("extinction",)
+OPACITY_NAMES = ("opacity", "alpha")
+OPACITY = 0.8
+"""Of a point through its centre, where nobody says."""
+OPAQUE = 0.999
+"""What stands for an opacity of 1, which no extinction has."""
+BYTE = 255
+
+
+@dataclasses.dataclass(frozen=True)
+class PointsReport:
+    """What was read and how it was understood; `str(report)` is for people.
+
+    Attributes:
+        source, path, notes: as of `Report` of particles.
+        num_points: number of points.
+        radius: one sentence on where the radii come from.
+        radius_range: smallest and largest radius, length units; NaN for an empty set.
+        color: one sentence on where the colours come from.
+        strength: one sentence on where extinctions or opacities come from.
+        strength_range: smallest and largest of them; NaN for an empty set.
+    """
+
+    source: str
+    path: str
+    num_points: int
+    radius: str
+    radius_range: tuple[float, float]
+    color: str
+    strength: str
+    strength_range: tuple[float, float]
+    notes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.path or 'points'}: {self.num_points} points ({self.source})",
+            f"radius    {self.radius_range[0]:.6g} .. {self.radius_range[1]:.6g}: {self.radius}",
+            f"colour    {self.color}",
+            f"strength  {self.strength_range[0]:.6g} .. {self.strength_range[1]:.6g}: {self.strength}",
+        ]
+        return "\n".join([*lines, *(f"note      {note}" for note in self.notes)])
+
+
+def points_from_table(
+    table: ParticleTable,
+    *,
+    color: Any = None,
+    radius: Any = None,
+    extinction: Any = None,
+    opacity: Any = None,
+    profile: Any = "gaussian",
+    colormap: str = "viridis",
+) -> tuple[Points, PointsReport]:
+    """The points of a table, and the report on what was settled.
+
+    Args:
+        table: what was read.
+        color: as for `jaxsph.io.read_points`; the name of a column of three or four numbers is that of colours, and of one
+            number a point of what is shown by the colour map over its range.
+        radius, extinction, opacity: a number, one a point, or the name of a quantity (`jaxsph.io.settle.quantities`); `None`
+            for the table's own, else an opacity of 0.8. At most one of the last two is given.
+        profile: as for `Points.from_arrays`. Of a function of the offset, the scalar columns are the attributes.
+        colormap: name of a colour map.
+
+    Raises:
+        ValueError: no radius is given and none is there; an unknown column; numbers that are not finite, or out of range.
+    """
+    with naming(table.path):
+        radius, color = (given.plain(name, value, OF_FILE) for name, value in (("radius", radius), ("color", color)))
+        strength = {"extinction": extinction, "opacity": opacity}
+        strength = {name: given.plain(name, value, OF_FILE) for name, value in strength.items()}
+        radii, radius_origin = _radii(table, radius)
+        colors, color_origin = _colors(table, color, colormap)
+        kind, strengths, strength_origin, noted = _strengths(table, strength)
+        notes = [one for one in table.conventions if not one.startswith("support =") and "pass `support=`" not in one]
+        rounding = rounding_note(table.position, radii, "radii")
+        notes += [*noted, *([rounding] if rounding else [])]
+        own = [name for name in table.scalars if name not in ("position", "radius", "color", "extinction", "opacity")]
+        attributes = {name: _finite(name, table.columns[name]) for name in own} if callable(profile) else {}
+        shown: dict[str, Any] = {kind: strengths}
+        points = Points.from_arrays(table.position, radii, colors, profile=profile, attributes=attributes, **shown)
+        report = PointsReport(
+            source=table.source,
+            path=table.path,
+            num_points=len(table),
+            radius=radius_origin,
+            radius_range=range_of(radii),
+            color=color_origin,
+            strength=strength_origin,
+            strength_range=range_of(strengths),
+            notes=tuple(notes),
+        )
+        return points, report
+
+
+def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
+    if given is not None and not isinstance(given, str):
+        return _positive(_one_each(table, "radius", given), "radius"), "given by the caller"
+    if given is None:
+        names = [name for name in RADIUS_NAMES if name != "r" or not _named_all(table, COLOR_TRIPLES[0])]
+        given = next((name for name in (table.named(one) for one in names) if name and table.columns[name].ndim == 1), None)
+    if table.support is not None and (given is None or plain(given) in map(plain, SUPPORT_NAMES)):
+        sentence = next((one for one in table.conventions if one.startswith("support =")), "the support of the file")
+        return table.support.astype(np.float64), sentence
+    if given is None:
+        given = table.named(*SMOOTHING_NAMES)
+    if given is None:
+        raise DataError(
+            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (--point-radius), or the name of a column"
+        )
+    values, name = _values(table, "radius", given)
+    return _positive(values, name), f"column `{name}`"
+
+
+def _positive(values: np.ndarray, name: str) -> np.ndarray:
+    wrong = ~(values > 0)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(
+            f"`{name}` is a radius and must be > 0, but {int(wrong.sum())} of {len(values)} are not, "
+            f"the first in row {row + 1}: {values[row]:g}; remove these points, or give `radius=NUMBER`"
+        )
+    return values
+
+
+def _colors(table: ParticleTable, given: Any, colormap: str) -> tuple[Any, str]:
+    if given is not None and not isinstance(given, str):
+        return given, "given by the caller"
+    if isinstance(given, str):
+        name = given if given in table.columns else table.named(given)
+        if name is None or table.columns[name].ndim == 1 or table.columns[name].shape[1] not in (3, 4):
+            return _mapped(table, given, colormap)
+        return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
+    for triple in COLOR_TRIPLES:
+        names = _named_all(table, triple)
+        if names:
+            columns = np.stack([table.columns[name] for name in names], 1)
+            return _unit(", ".join(names), columns), f"columns {', '.join(f'`{name}`' for name in names)}"
+    for name in (table.named(one) for one in COLOR_NAMES):
+        if name is not None and table.columns[name].ndim == 2 and table.columns[name].shape[1] in (3, 4):
+            return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
+    return (1.0, 1.0, 1.0), "white, as there are no colours"
+
+
+def _mapped(table: ParticleTable, given: str, colormap: str) -> tuple[np.ndarray, str]:
+    """Colours of a quantity by a colour map over nearly all of its range."""
+    values, name = _values(table, "color", given)
+    (low, high), rows = value_range(values), colors_of_map(colormap)
+    places = np.linspace(low, high, len(rows))
+    colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
+    return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
+
+
+def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.ndarray, str, list[str]]:
+    """Whether extinction or opacity, which, where it comes from, and what else is to be said."""
+    asked = {name: value for name, value in given.items() if value is not None}
+    if len(asked) > 1:
+        raise DataError("`extinction` and `opacity` are two names for one thing; give one of them")
+    if not asked:
+        stored = table.named(*EXTINCTION_NAMES)
+        asked = {"opacity": table.named(*OPACITY_NAMES)} if stored is None else {"extinction": stored}
+    ((kind, value),) = asked.items()
+    if value is None:
+        note = (
+            f"neither extinction nor opacity is there: {OPACITY} through the centre of each; `opacity=` or `extinction=` sets it"
+        )
+        return kind, np.full(len(table), OPACITY), f"opacity {OPACITY}", [note]
+    if not isinstance(value, str):
+        return kind, _one_each(table, kind, value), f"{kind} given by the caller", []
+    values, name = _values(table, kind, value)
+    if kind == "extinction":
+        return kind, values, f"extinction, column `{name}`", []
+    column = table.columns.get(name)
+    values = _unit(name, values if column is None else column)
+    notes = [f"opacities above {OPAQUE} are taken for {OPAQUE}"] if (values > OPAQUE).any() else []
+    return kind, np.minimum(values, OPAQUE), f"opacity, column `{name}`", notes
+
+
+def _values(table: ParticleTable, role: str, name: str) -> tuple[np.ndarray, str]:
+    """A quantity by its name, all of it finite."""
+    column = name if name in table.columns else table.named(name)
+    if column is not None and table.columns[column].ndim == 1:
+        return _finite(column, table.columns[column]), column
+    try:
+        return choose_quantity(table, name)
+    except DataError as error:
+        unknown = "there is no quantity" in str(error)
+        said = f"there is no column {name!r}: {_there_is(table)}; choose one of them" if unknown else str(error)
+        raise DataError(f"`{role}`: {said}") from error
+
+
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    values = values.astype(np.float64)
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        row = int(np.argwhere(wrong)[0, 0])
+        raise DataError(
+            f"column `{name}` must be finite, but {int(wrong.sum())} of {values.size} values are not, "
+            f"the first in row {row + 1}: {values[wrong].flat[0]}; repair or remove these points"
+        )
+    return values
+
+
+def _unit(name: str, column: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1]; whole ones up to 255 are bytes."""
+    values = _finite(name, column)
+    are_bytes = column.dtype == np.uint8 or (1 < values.max(initial=0) <= BYTE and (values == np.round(values)).all())
+    wrong = (values < 0) | (values > (BYTE if are_bytes else 1))
+    if wrong.any():
+        row = int(np.argwhere(wrong)[0, 0])
+        raise DataError(
+            f"column `{name}` must be in [0, 1], or whole numbers from 0 to {BYTE}, "
+            f"got {values[wrong].flat[0]:g} in row {row + 1}"
+        )
+    return values / BYTE if are_bytes else values
+
+
+def _one_each(table: ParticleTable, name: str, given: Any) -> np.ndarray:
+    values = np.asarray(given)
+    if values.dtype.kind not in "fiu" or values.shape not in ((), (len(table),)):
+        raise DataError(
+            f"`{name}` must be a number, one for each of the {len(table)} points or the name of a column, got {given!r}"
+        )
+    return np.broadcast_to(values.astype(np.float64), (len(table),))
+
+
+def _named_all(table: ParticleTable, names: tuple[str, ...]) -> list[str]:
+    """The scalar columns of these names where all of them are there."""
+    found = [table.named(name) for name in names]
+    return [name for name in found if name is not None and table.columns[name].ndim == 1] if None not in found else []
+
+
+def _there_is(table: ParticleTable) -> str:
+    return f"there are {', '.join(table.columns)}" if table.columns else "there are positions alone"

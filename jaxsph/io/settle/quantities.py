@@ -1,0 +1,178 @@
+r"""Choose, or derive, the scalar that the transfer function sees.
+
+Flow: ParticleTable -> [quantities] -> Particles.
+
+| name | what it gives |
+|---|---|
+| a scalar column | that column; case and punctuation do not matter |
+| `velocity.x`, `vx`, `B.2` | a component of a vector column |
+| `density` | the stored density, else $\rho_i = \sum_j m_j W(\|x_i - x_j\|, H_i)$ (without masses: number density) |
+| `speed` | $\|v\|$ |
+| `x`, `y`, `z` | a coordinate |
+| `log10:NAME` | decimal logarithm of any of these; values $\le 0$ become the smallest positive one |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.io.damage import DataError
+from jaxsph.io.table import ParticleTable, plain, refuse_rows
+
+ROLES: dict[str, tuple[str, ...]] = {
+    "density": ("density", "densities", "rho", "gas_density", "den"),
+    "mass": ("mass", "masses", "particle_mass", "m"),
+    "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
+    "temperature": ("temperature", "temperatures", "temp"),
+    "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
+}
+"""What codes call the same thing."""
+
+LOG_PREFIX = "log10:"
+LOG_DECADES = 2.0
+"""Positive quantities that span more decades than this are shown by their logarithm when nobody chose."""
+
+Gather = Callable[[], Float[np.ndarray, " particles"]]
+
+
+def choose_quantity(
+    table: ParticleTable, name: str | None = None, *, density: Gather | None = None
+) -> tuple[Float[np.ndarray, " particles"], str]:
+    """The quantity called `name`, or the most telling one when `name` is `None`.
+
+    Without a name, the first of these that the table has and that is not the same for all particles: a concentration
+    or dye, temperature, internal energy, stored density, speed, summed density if it spans more than two decades, the
+    coordinate along the longest extent. Temperature, internal energy and density become `log10:...` when they are
+    positive and span more than two decades.
+
+    Args:
+        table: the particles.
+        name: see the table at the top of this module.
+        density: gives the summed density when the table holds none; `None` means that it cannot be derived.
+
+    Returns:
+        (N,) float64 values, all finite, and the full name of what they are.
+
+    Raises:
+        ValueError: no such quantity (the message lists those there are); a vector without a component; a logarithm of
+            nothing positive; values that are not finite.
+    """
+    if name is None:
+        return _default(table, density)
+    values, full_name = _named(table, name.strip(), density)
+    return _finite(values, full_name), full_name
+
+
+def quantity_named(table: ParticleTable, name: str, *, density: Gather | None = None) -> Float[np.ndarray, " particles"]:
+    """The same of one that has a name, as it is: values need not be finite.
+
+    Raises:
+        ValueError: no such quantity, or a vector without a component; the message lists those there are.
+    """
+    return _named(table, name.strip(), density)[0]
+
+
+def available_quantities(table: ParticleTable) -> tuple[str, ...]:
+    """Every name that `choose_quantity` takes for this table, `log10:` aside."""
+    components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table.columns[name]))
+    derived: tuple[str, ...] = () if table.named(*ROLES["density"]) else ("density",)
+    derived += ("speed",) if velocity_name(table) else ()
+    return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
+
+
+def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:
+    if name.lower().startswith(LOG_PREFIX):
+        values, inner = _named(table, name[len(LOG_PREFIX) :].strip(), density)
+        return _log10(_finite(values, inner), inner), LOG_PREFIX + inner
+    if name in table.columns:
+        return _scalar(table, name), name
+    column = table.named(name)
+    if column is not None:
+        return _scalar(table, column), column
+    component = _component(table, name)
+    if component is not None:
+        return component
+    wanted = plain(name)
+    if wanted in ("x", "y", "z"):
+        return table.position[:, "xyz".index(wanted)].astype(np.float64), wanted
+    velocity = velocity_name(table)
+    if wanted == "speed" and velocity:
+        return np.linalg.norm(table.columns[velocity].astype(np.float64), axis=1), "speed"
+    role = next((role for role, names in ROLES.items() if wanted in map(plain, names)), None)
+    stored = table.named(*ROLES[role]) if role else None
+    if stored is not None:
+        return _scalar(table, stored), stored
+    if role == "density" and density is not None:
+        return density(), "density"
+    raise DataError(
+        f"there is no quantity {name!r}; there are {', '.join(available_quantities(table))}, and `log10:` before any of them"
+    )
+
+
+def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:
+    dyes = [c for c in table.scalars if any(word in plain(c) for word in ("concentration", "dye"))]
+    telling = [table.named(*ROLES[role]) for role in ("temperature", "internal_energy", "density")]
+    scaled = [name for name in telling if name is not None and table.columns[name].ndim == 1]
+    extent = np.ptp(table.position, axis=0) if len(table) else np.zeros(3)
+    longest = "xyz"[int(np.argmax(extent))]
+    candidates = [*dyes, *scaled, *(["speed"] if velocity_name(table) else []), longest]
+    if candidates == [longest] and density is not None and _spans_decades(density()):
+        return choose_quantity(table, LOG_PREFIX + "density", density=density)
+    for candidate in candidates:
+        values, full_name = choose_quantity(table, candidate, density=density)
+        if len(values) == 0 or values.min() < values.max():
+            if candidate in scaled and _spans_decades(values):
+                return choose_quantity(table, LOG_PREFIX + candidate, density=density)
+            return values, full_name
+    return choose_quantity(table, candidates[0], density=density)
+
+
+def _spans_decades(values: np.ndarray) -> bool:
+    return bool(len(values) and values.min() > 0 and np.log10(values.max()) - np.log10(values.min()) > LOG_DECADES)
+
+
+def _log10(values: np.ndarray, name: str) -> np.ndarray:
+    positive = values[values > 0]
+    if len(values) and len(positive) == 0:
+        raise DataError(f"`{LOG_PREFIX}{name}` needs positive values, but the largest is {values.max()}; use `{name}`")
+    return np.log10(np.maximum(values, positive.min())) if len(values) else values
+
+
+def _scalar(table: ParticleTable, name: str) -> np.ndarray:
+    column = table.columns[name]
+    if column.ndim == 1:
+        return column.astype(np.float64)
+    choices = [f"{name}.{c}" for c in _component_names(column)]
+    if name == velocity_name(table):
+        choices.append("speed")
+    raise DataError(f"{name!r} has {column.shape[1]} components; choose one: {', '.join(choices)}")
+
+
+def _component(table: ParticleTable, name: str) -> tuple[np.ndarray, str] | None:
+    wanted = plain(name)
+    for vector in table.vectors:
+        column = table.columns[vector]
+        spellings = {plain(vector), *(map(plain, ROLES["velocity"]) if vector == velocity_name(table) else ())}
+        for index, component in enumerate(_component_names(column)):
+            if any(wanted in (base + component, f"{base}{index}") for base in spellings):
+                return column[:, index].astype(np.float64), f"{vector}.{component}"
+    return None
+
+
+def _component_names(column: np.ndarray) -> tuple[str, ...]:
+    width = column.shape[1]
+    return tuple("xyz"[:width]) if width <= 3 else tuple(map(str, range(width)))
+
+
+def velocity_name(table: ParticleTable) -> str | None:
+    """The column of velocities, where there is one."""
+    return next((n for n in table.vectors if plain(n) in map(plain, ROLES["velocity"])), None)
+
+
+def _finite(values: np.ndarray, name: str) -> np.ndarray:
+    remedy = "choose another quantity or repair the file"
+    refuse_rows(~np.isfinite(values), values, f"the quantity {name!r} must be finite", remedy)
+    return values

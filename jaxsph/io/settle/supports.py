@@ -1,0 +1,197 @@
+r"""Support radii from nearest neighbours, and kernel sums for volumes and densities, on the host.
+
+Flow: ParticleTable -> [supports] -> Particles.
+
+Many files hold points and nothing more. A support radius that reaches a fixed number of neighbours, and the volume
+$V_i = 1 / \sum_j W(|x_i - x_j|, H_i)$ that goes with it, turn such a set into an SPH field.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from jaxsph.io.damage import DataError
+from jaxsph.model import kernels
+
+Sides = tuple[float, float, float]
+NEIGHBOURS = 32
+"""Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
+
+PAIR_BUDGET = 2**22
+"""Pairs looked at in one go: about 100 MB of distances, indices and weights."""
+
+MAX_PAIRS = 2**36
+"""Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit."""
+SAMPLED_PARTICLES = 256
+
+SHOW_PROGRESS_FROM = 100_000
+"""Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
+
+
+def nearest_neighbour_supports(
+    position: Float[np.ndarray, "particles 3"],
+    neighbours: int = NEIGHBOURS,
+    *,
+    box: Sides | None = None,
+    progress: bool = False,
+) -> Float[np.ndarray, " particles"]:
+    r"""Distance to the `neighbours`-th nearest other particle.
+
+    With only $m <$ `neighbours` others, the distance $d$ to the farthest is scaled as in a uniform set,
+    $H = d \, (k / m)^{1/3}$. Coincident particles count as one place where the distance would be 0 otherwise. Where
+    there is only one place, no length is known and every support is 1.
+
+    Args:
+        position: (N, 3), any length unit; distances are computed in float64.
+        neighbours: $k \ge 1$.
+        box: sides of a periodic box, across whose faces neighbours are found; None for none.
+        progress: show a progress bar; on a terminal large sets show one anyway.
+
+    Returns:
+        (N,) float64 supports, positive, in the unit of `position`.
+
+    Raises:
+        ValueError: `neighbours < 1`.
+    """
+    if neighbours < 1:
+        raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
+    position = in_period(position, box)
+    count = len(position)
+    if count == 0:
+        return np.zeros(0)
+    places, place_of = _distinct(position)
+    if len(places) == 1:
+        return np.ones(count)
+    points, multiplicity = position[places], np.bincount(place_of)
+    tree = scipy.spatial.KDTree(points, boxsize=box)
+    reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
+    support = np.empty(len(places))
+    for rows in _slices(np.full(len(places), nearest), progress, "supports"):
+        distance, place = tree.query(points[rows], k=nearest, workers=-1)
+        others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
+        found = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
+        among_particles = found * (neighbours / reach) ** (1 / 3)
+        among_places = distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3)
+        support[rows] = np.where(found > 0, among_particles, among_places)
+    return support[place_of]
+
+
+def kernel_sum(
+    position: Float[np.ndarray, "particles 3"],
+    support: Float[np.ndarray, " particles"],
+    weight: Float[np.ndarray, " particles"] | None = None,
+    *,
+    kernel: str = "poly6",
+    box: Sides | None = None,
+    progress: bool = False,
+) -> Float[np.ndarray, " particles"]:
+    r"""The gather sum $\sum_j w_j W(|x_i - x_j|, H_i)$ at every particle, itself included.
+
+    With masses as weights this is the SPH density, as codes with varying supports define and store it (each particle
+    uses its own $H_i$); without weights it is the number density, whose inverse is a volume.
+
+    Args:
+        position: (N, 3); distances are computed in float64.
+        support: (N,) support radii $H > 0$, same unit as `position`.
+        weight: (N,) weights $w$; `None` means 1.
+        kernel: name of a kernel of `jaxsph.model.kernels`.
+        box: sides of a periodic box, across whose faces sums go, to the nearest image of each particle; None for none.
+        progress: show a progress bar; on a terminal large sets show one anyway.
+
+    Returns:
+        (N,) float64 sums, positive where weights are, in units of `weight` over a volume.
+
+    Raises:
+        ValueError: supports that reach so many particles that the sum would take hours.
+    """
+    chosen = kernels.by_name(kernel)
+    position = in_period(position, box)
+    support = np.asarray(support, dtype=np.float64)
+    if len(position) == 0:
+        return np.zeros(0)
+    places, place_of = _distinct(position)
+    askers, asker_of = _distinct(np.column_stack([position, support]))
+    weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
+    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), position[askers], support[askers]
+    _refuse_too_many_pairs(tree, points, radii)
+    total = np.empty(len(askers))
+    reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
+    order = np.argsort(reached, kind="stable")  # correlation_length counts together, so that a block has little padding
+    for block in _slices(reached[order], progress, "kernel sums"):
+        rows = order[block]
+        most, farthest = max(2, int(reached[rows].max())), float(radii[rows].max())  # k = 1 would drop an axis
+        distance, neighbour = tree.query(points[rows], k=most, distance_upper_bound=farthest, workers=-1)
+        q = distance / radii[rows, None]
+        q[~np.isfinite(q)] = 1.0
+        shape = chosen.of_square(q * q, np)
+        total[rows] = (shape * weights[neighbour]).sum(axis=1)
+    return chosen.norm * total[asker_of] / support**3
+
+
+def in_period(position: np.ndarray, box: Sides | None) -> np.ndarray:
+    """Positions in float64, in a periodic box if there is one."""
+    position = np.asarray(position, dtype=np.float64)
+    if box is None:
+        return position
+    wrapped = np.mod(position, box)
+    return np.where(wrapped >= box, 0.0, wrapped)
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The index of one of each group of equal rows, and for every row the number of its group.
+
+    A tree cannot part points that coincide, and would compare each with all others. Rows that all differ keep their order.
+    """
+    order = np.lexsort(rows.T)
+    ordered = rows[order]
+    is_first = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    if is_first.all():
+        every = np.arange(len(rows))
+        return every, every
+    group = np.empty(len(rows), np.int64)
+    group[order] = np.cumsum(is_first) - 1
+    return order[is_first], group
+
+
+def _refuse_too_many_pairs(tree: scipy.spatial.KDTree, points: np.ndarray, radii: np.ndarray) -> None:
+    """Refuse supports that a sample of the particles shows to reach too far."""
+    some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
+    reached = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
+    if reached * len(points) > MAX_PAIRS:
+        raise DataError(
+            f"supports reach about {reached:.0f} particles each, {reached * len(points):.0f} pairs in all, and a kernel sum "
+            f"over them would take hours; give smaller supports, or check their unit"
+        )
+
+
+def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:
+    """Consecutive blocks of rows whose largest entry of ascending `pairs`, times their number, fits `PAIR_BUDGET`."""
+    bar = _progress_bar(len(pairs), progress, what)
+    start = 0
+    while start < len(pairs):
+        stop = min(len(pairs), start + max(1, PAIR_BUDGET // int(pairs[start])))
+        while stop - start > 1 and (stop - start) * int(pairs[stop - 1]) > PAIR_BUDGET:
+            stop = start + max(1, (stop - start) // 2)
+        yield slice(start, stop)
+        if bar is not None:
+            bar.update(stop - start)
+        start = stop
+    if bar is not None:
+        bar.close()
+
+
+def _progress_bar(count: int, asked: bool, what: str) -> Any:
+    """A tqdm bar when it is asked for, or when the wait is worth one and a person watches; else `None`."""
+    if not asked and (count < SHOW_PROGRESS_FROM or not sys.stderr.isatty()):
+        return None
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return None  # a bar is a comfort, not a need
+    return tqdm(total=count, desc=what, unit=" particles", unit_scale=True, leave=False)

@@ -1,0 +1,1 @@
+"""Volumes on regular grids: formats, and what a file holds."""

@@ -1,0 +1,108 @@
+"""VTK XML images (`.vti`): point data on a regular grid; cell data is not read.
+
+Encodings are those of `vtk_xml`. Written files hold one array, appended and raw.
+Source: VTK File Formats, Kitware, "XML File Formats", ImageData.
+"""
+
+from __future__ import annotations
+
+import collections
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained
+from jaxsph.io.readers.vtk_xml import TYPES, Decoder, parsed
+from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
+
+SOURCE = "VTK XML image"
+NAMES = {kind: name for name, kind in TYPES.items()}
+
+
+def read(path: Path) -> VolumeTable:
+    """Read the point data of all pieces.
+
+    Raises:
+        ValueError: damaged, cut short, another type of data set, values of cells only, or oblique axes.
+    """
+    with explained(path, SOURCE):
+        root, decoder = parsed(path, ("ImageData",), ".vti")
+        image = root.find("ImageData")
+        if image is None:
+            raise DataError("has no ImageData, so it is cut short or damaged; copy it again")
+        whole = _extent(image.get("WholeExtent"))
+        shape = tuple(whole[:, 1] - whole[:, 0] + 1)
+        arrays: dict[str, np.ndarray] = {}
+        filled: collections.Counter[str] = collections.Counter()
+        for piece in image.iter("Piece"):
+            filled.update(_put(piece, whole, shape, decoder, arrays))
+        if not arrays:
+            raise DataError("holds no values of points; turn values of cells into values of points, or copy the file again")
+        for name, points in filled.items():
+            if points < np.prod(shape):
+                raise DataError(f"has {points} points of `{name}` in its pieces, but a grid of {np.prod(shape)}; copy it again")
+        arrays = {name: values[..., 0] if values.shape[3] == 1 else values for name, values in arrays.items()}
+        spacing = _numbers(image.get("Spacing", "1 1 1"), 3)
+        steps = _numbers(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3) * spacing
+        said = tuple(f"left out {name}: not numbers" for name in dict.fromkeys(decoder.words))
+        return along_axes(arrays, _numbers(image.get("Origin", "0 0 0"), 3) + steps @ whole[:, 0], steps, SOURCE, said)
+
+
+def _put(
+    piece: ElementTree.Element, whole: np.ndarray, shape: tuple[int, ...], decoder: Decoder, arrays: dict[str, np.ndarray]
+) -> dict[str, int]:
+    """Put a piece's values where they belong, and tell how many points each of its arrays has."""
+    own = _extent(piece.get("Extent"))
+    size = own[:, 1] - own[:, 0] + 1
+    if (own[:, 0] < whole[:, 0]).any() or (own[:, 1] > whole[:, 1]).any():
+        raise DataError(f"has a piece of extent {own.tolist()} outside of the whole, {whole.tolist()}; it is damaged")
+    place = tuple(slice(low, low + points) for low, points in zip(own[:, 0] - whole[:, 0], size, strict=True))
+    found = {}
+    for element in piece.iterfind("PointData/DataArray"):
+        values = decoder.array(element, int(np.prod(size)), 1)
+        if values is None:
+            continue
+        name = element.get("Name", "unnamed")
+        grid = values.reshape(*size[::-1], -1).transpose(2, 1, 0, 3)
+        if (size == shape).all():
+            arrays[name] = grid
+        else:
+            into = arrays.setdefault(name, np.zeros((*shape, grid.shape[3]), grid.dtype))
+            into[place] = grid
+        found[name] = int(np.prod(size))
+    return found
+
+
+def write(path: Path, values: np.ndarray, lower: np.ndarray, spacing: np.ndarray, name: str) -> None:
+    """Write one array as appended raw data."""
+    kind = NAMES[values.dtype.str[1:]]
+    extent = " ".join(f"0 {points - 1}" for points in values.shape)
+    numbers = {"Origin": lower, "Spacing": spacing}
+    where = " ".join(f'{key}="{" ".join(repr(float(x)) for x in vector)}"' for key, vector in numbers.items())
+    head = (
+        '<?xml version="1.0"?>\n<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<ImageData WholeExtent="{extent}" {where}>\n<Piece Extent="{extent}"><PointData Scalars="{name}">\n'
+        f'<DataArray type="{kind}" Name="{name}" format="appended" offset="0"/>\n'
+        '</PointData></Piece></ImageData>\n<AppendedData encoding="raw">\n_'
+    )
+    data = np.ascontiguousarray(values.T, values.dtype.newbyteorder("<"))
+    with path.open("wb") as file:
+        file.write(head.encode("ascii") + np.uint64(data.nbytes).astype("<u8").tobytes())
+        file.write(data.data)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _extent(text: str | None) -> np.ndarray:
+    """First and last index along x, y and z, (3, 2)."""
+    extent = _numbers(text or "", 6).astype(np.int64).reshape(3, 2)
+    if (extent[:, 1] < extent[:, 0]).any():
+        raise DataError(f"has the extent {text!r}, which is empty; write it again")
+    return extent
+
+
+def _numbers(text: str, count: int) -> np.ndarray:
+    found = np.array([float(word) for word in text.split()])
+    if len(found) != count or not np.isfinite(found).all():
+        raise DataError(f"has {text!r} where {count} numbers should be; it is damaged: copy it again")
+    return found

@@ -1,0 +1,111 @@
+"""Snapshots in several files are read as one."""
+
+import os
+
+import h5py
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.io.disk.files import files_of
+from jaxsph.io.disk.rows import Snapshot
+
+
+def write(path, nth, total, gas, dark=2):
+    rng = np.random.default_rng(nth)
+    with h5py.File(path, "w") as file:
+        header = file.create_group("Header").attrs
+        header["NumFilesPerSnapshot"], header["Time"], header["BoxSize"] = total, 0.5, 1.0
+        for kind, count in ((0, gas), (1, dark)):
+            if count:
+                group = file.create_group(f"PartType{kind}")
+                group["Coordinates"] = rng.random((count, 3))
+                group["Masses"] = np.full(count, 1.0 + nth)
+                if kind == 0:
+                    group["Density"], group["SmoothingLength"] = rng.random(count) + 1, np.full(count, 0.1)
+
+
+def snapshot(folder, counts=(5, 0, 7)):
+    for nth, gas in enumerate(counts):
+        write(folder / f"snap_002.{nth}.hdf5", nth, len(counts), gas)
+    return [folder / f"snap_002.{nth}.hdf5" for nth in range(len(counts))]
+
+
+@pytest.mark.parametrize("given", range(3))
+def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, given):
+    table = js.io.read_table(snapshot(tmp_path)[given])
+    assert len(table) == 12 and table.part_type == 0
+    np.testing.assert_array_equal(table.columns["Masses"], [1.0] * 5 + [3.0] * 7)
+    assert "of 3 files" in " ".join(table.conventions)
+
+
+def test_a_type_can_be_asked_for_of_all_files(tmp_path):
+    assert len(js.io.read_table(snapshot(tmp_path)[0], part_type=1)) == 6
+
+
+def test_a_missing_file_is_named(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].unlink()
+    with pytest.raises(ValueError, match=r"one of 3 files.*beside it snap_002\.2\.hdf5 cannot be found"):
+        js.io.read_table(files[0])
+
+
+def test_a_half_written_file_among_many_is_named(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].write_bytes(files[2].read_bytes()[:600])
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: cannot be read"):
+        js.io.read_table(files[0])
+
+
+def test_columns_that_some_files_lack_are_named(tmp_path):
+    files = snapshot(tmp_path)
+    with h5py.File(files[2], "a") as file:
+        del file["PartType0/Density"]
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: Density"):
+        js.io.read_table(files[0])
+
+
+def test_a_name_without_its_number_is_read_alone_and_says_so(tmp_path):
+    write(tmp_path / "alone.hdf5", 0, 4, 5)
+    table = js.io.read_table(tmp_path / "alone.hdf5")
+    assert len(table) == 5 and "only its particles are read" in " ".join(table.conventions)
+
+
+def test_names_of_files_of_a_snapshot_keep_their_suffix(tmp_path):
+    for number in range(2):
+        (tmp_path / f"snap.{number}").touch()
+    assert [file.name for file in files_of(tmp_path / "snap.1", 2)] == ["snap.0", "snap.1"]
+    assert files_of(tmp_path / "snap.hdf5", 2) is None
+    assert files_of(tmp_path / "snap.7.hdf5", 2) is None
+
+
+@pytest.mark.parametrize("number", [5, 10**7, 2**31 - 1])
+def test_a_header_may_ask_for_any_number_of_files(number, tmp_path, measured):
+    write(tmp_path / "snap_002.0.hdf5", 0, number, 5)
+    for read in (js.io.read_table, Snapshot):
+        with measured() as memory, pytest.raises(ValueError) as caught:
+            read(tmp_path / "snap_002.0.hdf5")
+        missing = "snap_002.1.hdf5, snap_002.2.hdf5, snap_002.3.hdf5"
+        assert f"is one of {number} files of a snapshot; beside it {missing} and {number - 4} more cannot be" in str(caught.value)
+        assert memory.peak < 2**22
+
+
+def test_a_gadget_header_may_ask_for_any_number_of_files(samples, tmp_path, measured):
+    samples.write_gadget_binary(tmp_path / "snap_002.0.gadget", samples.particles(), form=1)
+    content = bytearray((tmp_path / "snap_002.0.gadget").read_bytes())
+    content[4 + 124 : 4 + 128] = (2**31 - 1).to_bytes(4, "little")  # `files` of the header
+    (tmp_path / "snap_002.0.gadget").write_bytes(content)
+    with measured() as memory, pytest.raises(ValueError, match=r"one of 2147483647 files .* snap_002\.1\.gadget"):
+        js.io.read_table(tmp_path / "snap_002.0.gadget")
+    assert memory.peak < 2**22
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")
+def test_what_is_no_regular_file_is_no_file_of_a_snapshot(tmp_path):
+    files = snapshot(tmp_path)
+    files[2].unlink()
+    os.mkfifo(files[2])
+    (tmp_path / "snap_002.02.hdf5").touch()
+    (tmp_path / "snap_002.2.hdf5.bak").touch()
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: is a named pipe"):
+        js.io.read_table(files[0])

@@ -1,0 +1,128 @@
+"""The index has true boxes and supports, is kept, is made again where a file changed, and is written whole or not at all."""
+
+import os
+
+import numpy as np
+import pytest
+from snapshots_made import particles, write
+
+from jaxsph.io.disk import index as snapshot_index
+from jaxsph.io.disk import rows as snapshot_rows
+from jaxsph.io.disk.index import index_of, index_path
+from jaxsph.io.disk.rows import Snapshot
+
+
+@pytest.fixture(autouse=True)
+def short_runs(monkeypatch):
+    for module in (snapshot_index, snapshot_rows):
+        monkeypatch.setattr(module, "RUN", 64)
+
+
+def test_every_particle_lies_in_the_box_of_its_run_and_none_is_wider(tmp_path):
+    columns = particles(300)
+    index = index_of(Snapshot(write(tmp_path, columns, files=1)))
+    for run in range(len(index.file)):
+        rows = slice(index.begin[run], index.end[run])
+        position, support = columns["Coordinates"][rows].astype(float), columns["SmoothingLength"][rows]
+        assert (position >= index.lower[run]).all() and (position <= index.upper[run]).all()
+        assert support.max() == np.float32(index.support[run]) and support.min() == np.float32(index.least[run])
+        assert columns["SmoothingLength"][index.widest[run]] == support.max()
+    lower, upper = index.bounds()
+    assert (lower <= 0).all() and (upper >= 1).all() and len(index) == 300
+
+
+def test_it_is_read_once_and_again_where_a_file_has_changed(tmp_path):
+    snapshot, read = Snapshot(write(tmp_path, particles(300))), []
+    index_of(snapshot, progress=lambda done, total: read.append(done))
+    assert read == list(range(1, len(read) + 1)) and index_path(snapshot).exists()
+    read.clear()
+    index_of(Snapshot(snapshot.files[0]), progress=lambda done, total: read.append(done))
+    assert read == []
+    os.utime(snapshot.files[1], ns=(1, 1))
+    index_of(Snapshot(snapshot.files[0]), progress=lambda done, total: read.append(done))
+    assert read
+
+
+def test_a_damaged_index_is_made_again(tmp_path):
+    snapshot = Snapshot(write(tmp_path, particles(100)))
+    index_of(snapshot)
+    index_path(snapshot).write_bytes(b"PK\x03\x04 cut short")
+    assert len(index_of(snapshot)) == 100
+
+
+def test_where_the_disk_is_full_it_is_used_but_not_kept(tmp_path, monkeypatch):
+    snapshot = Snapshot(write(tmp_path, particles(100)))
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    before = sorted(tmp_path.iterdir())
+    with pytest.warns(UserWarning, match="No space left"):
+        assert len(index_of(snapshot)) == 100
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def rewrite(snapshot, change):
+    """The kept index, with other content that is written as it writes it."""
+    with np.load(index_path(snapshot)) as kept:
+        arrays = dict(kept)
+    arrays.update(change(arrays))
+    np.savez(index_path(snapshot), **arrays)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("end", lambda array: array + 1000),
+        ("begin", lambda array: array[:0]),
+        ("file", lambda array: array + 7),
+        ("file", lambda array: array.astype(str)),
+        ("lower", lambda array: np.full_like(array, np.nan)),
+        ("lower", lambda array: array + 10),
+        ("outer_upper", lambda array: array[:, :2]),
+        ("support", lambda array: -array),
+        ("least", lambda array: 0 * array),
+        ("widest", lambda array: array + 1000),
+        ("strength", lambda array: array * np.inf),
+        ("volume", lambda array: array[:, ::-1] - 1),
+    ],
+)
+def test_an_index_that_cannot_be_of_these_rows_is_made_again(name, change, tmp_path):
+    snapshot = Snapshot(write(tmp_path, particles(300)))
+    made = index_of(snapshot)
+    rewrite(snapshot, lambda arrays: {f"run_{name}": change(arrays[f"run_{name}"])})
+    again = index_of(snapshot)
+    for each in snapshot_index.ARRAYS:
+        np.testing.assert_array_equal(getattr(again, each), getattr(made, each))
+
+
+def test_a_file_that_was_written_over_with_its_old_size_and_time_is_noticed(tmp_path):
+    snapshot = Snapshot(write(tmp_path, particles(300)))
+    before, stood = index_of(snapshot), [path.stat() for path in snapshot.files]
+    write(tmp_path, particles(300, seed=1))
+    for path, known in zip(snapshot.files, stood, strict=True):
+        os.utime(path, ns=(known.st_atime_ns, known.st_mtime_ns))
+        assert path.stat().st_size == known.st_size
+    assert not np.array_equal(index_of(Snapshot(snapshot.files[0])).lower, before.lower)
+
+
+def test_an_index_packed_as_none_is_or_that_is_no_file_is_made_again(tmp_path):
+    snapshot = Snapshot(write(tmp_path, particles(100)))
+    index_of(snapshot)
+    content = bytearray(index_path(snapshot).read_bytes())
+    content[content.index(b"PK\x01\x02") + 10] = 99  # the method of compression of its first array
+    index_path(snapshot).write_bytes(content)
+    assert len(index_of(snapshot)) == 100
+    if hasattr(os, "mkfifo"):
+        index_path(snapshot).unlink()
+        os.mkfifo(index_path(snapshot))
+        assert len(index_of(snapshot)) == 100 and index_path(snapshot).is_file()
+
+
+def test_of_no_particles_there_is_an_index_that_is_kept(tmp_path):
+    snapshot, read = Snapshot(write(tmp_path, particles(1), files=1)), []
+    empty = write(tmp_path, {name: column[:0] for name, column in particles(1).items()}, files=1)
+    snapshot = Snapshot(empty)
+    assert len(index_of(snapshot)) == 0
+    assert len(index_of(snapshot, progress=lambda *_: read.append(1))) == 0 and not read

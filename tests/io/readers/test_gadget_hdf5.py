@@ -1,0 +1,203 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+import jaxsph.io as io
+from jaxsph.io.readers.gadget_hdf5 import GADGET4_KERNELS, GIZMO_KERNELS, SWIFT_KERNELS
+from jaxsph.model import kernels
+
+h5py = pytest.importorskip("h5py")
+
+
+def test_the_smoothing_length_of_gadget_is_the_support(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    table = io.read_table(tmp_path / "a.hdf5")
+    np.testing.assert_array_equal(table.support, np.full(len(table), 0.5))
+    assert any("support = SmoothingLength (Gadget convention" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("kernel", list(SWIFT_KERNELS))
+def test_the_support_of_swift_is_gamma_smoothing_lengths_of_its_kernel(kernel, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel=kernel)
+    table = io.read_table(tmp_path / "a.hdf5")
+    np.testing.assert_allclose(table.support, SWIFT_KERNELS[kernel][1] * 0.5)
+    assert table.source == "SWIFT HDF5"
+    assert any(str(SWIFT_KERNELS[kernel][1]) in sentence and kernel in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize(("kernel", "gamma"), SWIFT_KERNELS.values())
+def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel, gamma):
+    q = np.linspace(0, 1, 100_001)
+    weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].of_square(q**2, np)
+    deviation = np.sqrt(np.trapezoid(weight * q**4, q) / 3)
+    assert gamma == pytest.approx(1 / (2 * deviation), rel=1e-6)
+
+
+STATED = [
+    *((name, "swift", stated) for stated, (name, _) in SWIFT_KERNELS.items()),
+    *((name, "Config", stated) for stated, name in GADGET4_KERNELS.items()),
+    *((name, "Kernel_Function_ID", stated) for stated, name in GIZMO_KERNELS.items()),
+    ("cubic_spline", "Kernel_Function_ID", 2),
+    ("cubic_spline", "Config", "PERIODIC"),
+    ("cubic_spline", "Config", "VORONOI"),
+    ("cubic_spline", None, None),
+]
+
+
+def write(path, samples, place, stated):
+    """A snapshot whose code says its kernel somewhere."""
+    samples.write_gadget_hdf5(path, samples.particles(), **({"swift_kernel": stated} if place == "swift" else {}))
+    with h5py.File(path, "a") as file:
+        if place == "Config":
+            file.require_group("Config").attrs[stated] = ""
+        if place == "Kernel_Function_ID":
+            file["Header"].attrs[place] = stated
+    return path
+
+
+@pytest.mark.parametrize(("name", "place", "stated"), STATED)
+def test_the_kernel_is_the_one_that_the_file_states_and_that_is_said(name, place, stated, samples, tmp_path):
+    table = io.read_table(write(tmp_path / "a.hdf5", samples, place, stated))
+    assert table.kernel == name
+    particles, report = io.particles_from_table(table, "x", 0.5, box=None)
+    assert particles.kernel == name and report.kernel.startswith(name) and f"kernel    {report.kernel}" in str(report)
+    particles, report = io.particles_from_table(table, "x", 0.5, "poly6", box=None)
+    assert particles.kernel == "poly6" and report.kernel == "poly6, given by the caller"
+    assert not any(note.startswith("kernel") for note in report.notes)
+
+
+@pytest.mark.parametrize("name", sorted(kernels.KERNELS))
+def test_files_are_drawn_with_the_kernel_that_they_state(name, samples, tmp_path, frames, compare):
+    """Against float64 brute force, each kernel once: as SWIFT, GADGET-4, GIZMO or a code that says nothing state it."""
+    place, stated = next(((place, stated) for kernel, place, stated in STATED if kernel == name), (None, None))
+    path = write(tmp_path / "a.hdf5", samples, place, stated)
+    given = io.read_particles(path, "x", 0.6, box=None, **({"kernel": name} if place is None else {}))
+    columns = given.to_numpy()
+    middle = columns["position"].mean(0)
+    columns["position"] = ((columns["position"] - middle) / np.ptp(columns["position"])).astype(np.float32)
+    particles = js.Particles.from_arrays(**columns, kernel=given.kernel, capacity=frames.capacity)
+    values = np.linspace(columns["quantity"].min(), columns["quantity"].max(), 5)
+    transfer = js.TransferFunction.from_points(values, np.eye(5, 3), np.full(5, 3.0))
+    scene, camera = js.Scene(particles=particles, transfer=transfer), frames.camera(np.random.default_rng(3))
+    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    compare(image, js.reference.render(scene, camera, frames.settings), 1e-4, 0.999)
+    assert particles.kernel == name and float(image.alpha.max()) > 0.1
+
+
+def test_an_unknown_swift_kernel_is_refused(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel="Tophat")
+    with pytest.raises(ValueError, match="kernel 'Tophat'"):
+        io.read_table(tmp_path / "a.hdf5")
+
+
+def test_masses_come_from_the_header_where_there_is_no_data_set(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.hdf5").columns["Masses"], np.full(7, 2.0))
+
+
+def test_stored_masses_win_over_the_header(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), masses=np.arange(1.0, 8))
+    np.testing.assert_array_equal(io.read_table(tmp_path / "a.hdf5").columns["Masses"], np.arange(1.0, 8))
+
+
+def test_the_periodic_box_is_noted(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert table.box_size == (16, 16, 16)
+    _, report = io.particles_from_table(dataclasses.replace(table, position=np.mod(table.position, 16)))
+    assert "periodic box of 16 x 16 x 16: supports reach across its faces" in report.notes
+
+
+def test_without_gas_the_first_type_with_positions_is_read(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), part_type=1)
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert len(table) == 7 and table.support is None
+    assert "particles of PartType1" in table.conventions
+
+
+def test_a_type_that_is_not_there_is_answered_with_those_that_are(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), part_type=1)
+    with pytest.raises(ValueError, match=r"a\.hdf5: has no particles of type 0; `part_type` can be 1"):
+        io.read_table(tmp_path / "a.hdf5", part_type=0)
+
+
+def test_a_data_set_of_another_length_is_refused_by_name(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), masses=np.ones(3))
+    with pytest.raises(ValueError, match="PartType0/Masses has 3 rows, but there are 7 particles"):
+        io.read_table(tmp_path / "a.hdf5")
+
+
+def test_big_endian_data_sets_become_native(samples, tmp_path):
+    p = samples.particles()
+    p.position = p.position.astype(">f4")
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", p)
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert table.position.dtype.isnative
+    np.testing.assert_array_equal(table.position, p.position)
+
+
+def test_an_hdf5_file_of_no_known_flavour_is_answered_with_what_it_holds(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["spectrum"] = np.zeros(4)
+    with pytest.raises(ValueError, match=r"a\.h5: is HDF5 with spectrum at its top"):
+        io.read_table(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("value", [h5py.Empty("i4"), np.zeros(0, np.int32), "many", np.nan])
+def test_a_snapshot_that_does_not_say_of_how_many_files_it_is_one_is_read(value, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["Header"].attrs["NumFilesPerSnapshot"] = value
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert len(table) == 7 and not any("files of the snapshot" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("stored", [0.25, [0.25]])
+def test_the_time_in_the_header_is_that_of_the_snapshot(stored, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "r+") as file:
+        file["Header"].attrs["Time"] = stored
+    assert io.read_table(tmp_path / "a.hdf5").time == 0.25
+
+
+def with_header(path, samples, **attributes):
+    samples.write_gadget_hdf5(path, samples.particles())
+    with h5py.File(path, "r+") as file:
+        file["Header"].attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize("told", [[90, 0, 0, 0, 0, 0], [3], 6, np.array([8, 0], np.uint64)])
+def test_another_number_of_particles_in_the_header_is_refused(told, samples, tmp_path):
+    path = with_header(tmp_path / "a.hdf5", samples, NumPart_ThisFile=told)
+    number = np.ravel(told)[0]
+    with pytest.raises(
+        ValueError, match=rf"has 7 particles of type 0, but `NumPart_ThisFile` in its header says {number}; copy it"
+    ):
+        io.read_table(path)
+
+
+@pytest.mark.parametrize("told", [[7, 1, 0], [7], [], "seven"])
+def test_a_header_that_says_the_same_number_or_none_is_read(told, samples, tmp_path):
+    assert len(io.read_table(with_header(tmp_path / "a.hdf5", samples, NumPart_ThisFile=told))) == 7
+
+
+@pytest.mark.parametrize("mass", [-1.0, np.nan, np.inf])
+def test_a_mass_in_the_header_that_is_none_is_refused(mass, samples, tmp_path):
+    path = with_header(tmp_path / "a.hdf5", samples, MassTable=[mass, 1.0])
+    with pytest.raises(ValueError, match=rf"has mass {mass:g} for particles of type 0 in `MassTable` of its header; correct"):
+        io.read_table(path)
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf, -1.0, [1.0, 1.0, 0.0], [1.0, 2.0]])
+def test_a_box_that_is_none_is_said(size, samples, tmp_path):
+    table = io.read_table(with_header(tmp_path / "a.hdf5", samples, BoxSize=size))
+    assert table.box_size is None and any("not periodic: a box of" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize("size", [0.0, [0.0, 0.0, 0.0]])
+def test_of_no_box_nothing_is_said(size, samples, tmp_path):
+    table = io.read_table(with_header(tmp_path / "a.hdf5", samples, BoxSize=size))
+    assert table.box_size is None and not any("box" in sentence for sentence in table.conventions)

@@ -1,0 +1,202 @@
+"""Units: what files state, and nothing that they do not."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from jaxsph import io
+from jaxsph.io.settle.labels import Labels, labels_of, moment_of
+from jaxsph.io.settle.unit_names import named, unit_of
+from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import LENGTH, TIME, VELOCITY, CodeUnit, FileUnits
+
+h5py = pytest.importorskip("h5py")
+
+KPC, MYR = 3.0857e21, 3.15576e13
+SWIFT_NAMES = "U_L exponent", "U_M exponent", "U_t exponent", "U_T exponent", "U_I exponent"
+CGS = "Conversion factor to CGS (not including cosmological corrections)"
+
+
+def gadget(path, header=(), parameters=(), density=None):
+    """A small snapshot; `density` are the attributes of its data set."""
+    with h5py.File(path, "w") as file:
+        file.create_group("Header").attrs.update({"MassTable": np.ones(6), **dict(header)})
+        file.create_group("Parameters").attrs.update(dict(parameters))
+        group = file.create_group("PartType0")
+        group["Coordinates"], group["SmoothingLength"] = np.eye(3), np.ones(3)
+        group["Density"], group["Velocities"] = np.arange(1.0, 4), np.ones((3, 3))
+        group["Density"].attrs.update(density or {})
+        if density:
+            scalings = {"length_scaling": 1.0, "mass_scaling": 0.0, "velocity_scaling": 0.0, "a_scaling": 1.0, "h_scaling": -1.0}
+            group["Coordinates"].attrs.update(scalings | {"to_cgs": KPC})
+    return path
+
+
+STATED = {
+    "length_scaling": -3.0,
+    "mass_scaling": 1.0,
+    "velocity_scaling": 0.0,
+    "to_cgs": 6.77e-22,
+    "a_scaling": -3.0,
+    "h_scaling": 2.0,
+}
+
+
+def test_gadget_attributes_give_units_with_their_powers_of_a_and_h(tmp_path):
+    units = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.5, "Redshift": 1.0}, density=STATED)).units
+    assert units.columns == {"Density": CodeUnit(6.77e-22, (-3, 1, 0, 0), -3, 2)}
+    assert units.length == CodeUnit(KPC, LENGTH, 1, -1)
+    assert units.time is None and units.redshift == 1  # GADGET's time is the scale factor there
+
+
+def test_a_file_that_states_no_units_has_none(tmp_path):
+    table = io.read_table(gadget(tmp_path / "x.hdf5"))
+    assert table.units == FileUnits()
+    assert labels_of(table, "Density") == Labels("Density") and unit_of(table, "density") is None
+
+
+def test_a_zero_or_broken_factor_is_no_unit(tmp_path):
+    for cgs in (0.0, -1.0, np.nan):
+        table = io.read_table(gadget(tmp_path / "x.hdf5", density=STATED | {"to_cgs": cgs}))
+        assert "Density" not in table.units.columns
+
+
+@pytest.mark.parametrize(("hubble", "known"), [(None, True), (1.0, True), (0.7, False)])
+def test_gadget_time_has_a_unit_where_no_hubble_parameter_can_be_in_it(tmp_path, hubble, known):
+    parameters = {"UnitLength_in_cm": KPC, "UnitVelocity_in_cm_per_s": 1e5, "ComovingIntegrationOn": 0}
+    parameters |= {} if hubble is None else {"HubbleParam": hubble}
+    units = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.25, "Redshift": 0.0}, parameters)).units
+    assert units.time == 0.25 and units.redshift is None
+    assert units.time_unit == (CodeUnit(KPC / 1e5, TIME) if known else None)
+
+
+def test_swift_attributes_give_units(tmp_path):
+    with h5py.File(tmp_path / "x.hdf5", "w") as file:
+        file.create_group("Header").attrs.update({"Code": "SWIFT", "Time": [0.125], "Redshift": [0.0]})
+        file.create_group("HydroScheme").attrs["Kernel function"] = "Cubic spline (M4)"
+        file.create_group("Units").attrs["Unit time in cgs (U_t)"] = [MYR]
+        group = file.create_group("PartType0")
+        group["Coordinates"], group["SmoothingLengths"], group["Temperatures"] = np.eye(3), np.ones(3), np.ones(3)
+        group["Temperatures"].attrs.update({key: [0.0] for key in SWIFT_NAMES} | {"U_T exponent": [1.0], CGS: [2.0]})
+        group["Coordinates"].attrs.update(
+            {key: [0.0] for key in SWIFT_NAMES} | {"U_L exponent": [1.0], CGS: [KPC], "a-scale exponent": [1.0]}
+        )
+    units = io.read_table(tmp_path / "x.hdf5").units
+    assert units.columns == {"Temperatures": CodeUnit(2.0, (0, 0, 0, 1))}
+    assert units.length == CodeUnit(KPC, LENGTH, 1.0)
+    assert (units.time, units.time_unit) == (0.125, CodeUnit(MYR, TIME))
+
+
+def phantom(path, **header):
+    with h5py.File(path, "w") as file:
+        for name, value in {"hfact": 1.2, "massoftype": [1.0], **header}.items():
+            file[f"header/{name}"] = value
+        file["particles/xyz"], file["particles/h"], file["particles/vxyz"] = np.eye(3), np.ones(3), np.ones((3, 3))
+    return path
+
+
+def test_phantom_units_are_those_of_its_header(tmp_path):
+    table = io.read_table(phantom(tmp_path / "x.h5", udist=1e16, umass=2e33, utime=1e10, time=3.0))
+    assert unit_of(table, "density") == CodeUnit(2e33 / 1e16**3, (-3, 1, 0, 0))
+    assert unit_of(table, "speed") == unit_of(table, "vxyz.x") == CodeUnit(1e6, VELOCITY)
+    assert unit_of(table, "log10:density") == unit_of(table, "density") and unit_of(table, "x") == CodeUnit(1e16, LENGTH)
+    assert unit_of(table, "itype") is None and table.units.time == 3
+    assert io.read_table(phantom(tmp_path / "y.h5", udist=1e16, time=3.0)).units == FileUnits(time=3.0)
+
+
+def test_a_summed_density_has_the_unit_of_masses_over_volumes():
+    units = FileUnits(CodeUnit(10.0, LENGTH, a=1), {"Masses": CodeUnit(5.0, (0, 1, 0, 0), h=-1)})
+    table = ParticleTable(np.eye(3), {"Masses": np.ones(3)}, units=units)
+    assert unit_of(table, "density") == CodeUnit(5e-3, (-3, 1, 0, 0), -3, -1)
+    assert unit_of(ParticleTable(np.eye(3), {"Masses": np.ones(3)}, units=FileUnits(units.length)), "density") is None
+
+
+class Amount:
+    """What of `unyt` is called, for a few units: a value in CGS, and its powers of length and time."""
+
+    KNOWN = {
+        "cm": (1, "L"), "m": (1e2, "L"), "km": (1e5, "L"), "AU": (1.496e13, "L"), "Rsun": (6.96e10, "L"),
+        "pc": (3.0857e18, "L"), "kpc": (KPC, "L"), "Mpc": (3.0857e24, "L"), "Gpc": (3.0857e27, "L"), "s": (1, "T"),
+        "hr": (3600, "T"), "day": (86400, "T"),
+        "yr": (3.15576e7, "T"), "kyr": (3.15576e10, "T"), "Myr": (MYR, "T"), "Gyr": (3.15576e16, "T"),
+    }  # fmt: skip
+
+    def __init__(self, value, unit):
+        self.value, self.kind = value, {"cm": "L", "s": "T"}.get(unit, unit)
+
+    def to_value(self, name):
+        if name not in self.KNOWN:
+            raise sys.modules["unyt"].exceptions.UnitParseError(name)
+        if self.KNOWN[name][1] != self.kind:
+            raise sys.modules["unyt"].exceptions.UnitConversionError(name)
+        return self.value / self.KNOWN[name][0]
+
+
+@pytest.fixture
+def unyt(monkeypatch):
+    """A stand-in with the few names that are called, so that choices are tested where the library is not installed."""
+    module = types.ModuleType("unyt")
+    failures = {name: type(name, (Exception,), {}) for name in ("UnitConversionError", "UnitParseError")}
+    module.exceptions, module.unyt_quantity = types.SimpleNamespace(**failures), Amount
+    monkeypatch.setitem(sys.modules, "unyt", module)
+    monkeypatch.setattr("jaxsph.io.settle.labels.can_name", lambda: True)
+    return module
+
+
+def test_names_are_the_largest_of_which_there_is_at_least_one(unyt):
+    length = CodeUnit(KPC, LENGTH)
+    assert named(length, 20.0) == (pytest.approx(1), "kpc") and named(length, 3000.0) == (pytest.approx(1e-3), "Mpc")
+    assert named(length, 1e-30)[1] == "cm" and named(CodeUnit(MYR, TIME), 0.5) == (pytest.approx(1000), "kyr")
+
+
+def test_powers_of_a_and_h_that_are_left_in_are_said(unyt):
+    assert named(CodeUnit(KPC, LENGTH, 1, -1), 5.0)[1] == "kpc a h^-1"
+    assert named(CodeUnit(6.77e-22, (-3, 1, 0, 0), -3, 2), 5.0) == (6.77e-22, "g cm^-3 h^2 a^-3")
+
+
+def test_a_unit_that_does_not_agree_or_exist_is_refused_by_name(unyt):
+    with pytest.raises(ValueError, match=r"'s' does not agree .* cm"):
+        named(CodeUnit(KPC, LENGTH), 1.0, "s")
+    with pytest.raises(ValueError, match="'parsnip' is no unit"):
+        named(CodeUnit(KPC, LENGTH), 1.0, "parsnip")
+
+
+def test_labels_have_units_where_the_file_states_them(unyt, tmp_path):
+    table = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.5, "Redshift": 1.0}, density=STATED))
+    made = labels_of(table, "log10:Density", 1e-7)
+    assert (made.quantity, made.unit, made.factor, made.moment) == ("log10:Density", "g cm^-3 h^2 a^-3", 6.77e-22, "z = 1")
+    assert made.length_as(2000.0)[1] == "Mpc a h^-1" and labels_of(table, "Velocities.x").unit == "code units"
+    with pytest.raises(ValueError, match=r"does not state that of `Velocities.x`"):
+        labels_of(table, "Velocities.x", unit="kpc")
+    with pytest.raises(ValueError, match="does not agree"):
+        labels_of(table, "x", length_unit="s")
+
+
+def test_times_are_told_in_words(unyt):
+    assert moment_of(FileUnits(time=2.5, time_unit=CodeUnit(MYR, TIME))) == "t = 2.5 Myr"
+    assert moment_of(FileUnits(time=2.5)) == "t = 2.5 (code units)"
+    assert moment_of(FileUnits(redshift=2.02)) == "z = 2.02" and moment_of(FileUnits()) == ""
+
+
+def test_without_unyt_labels_are_in_code_units_and_a_unit_asked_for_says_how_to_install_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "unyt", None)
+    monkeypatch.setattr("jaxsph.io.settle.labels.can_name", lambda: False)
+    table = io.read_table(gadget(tmp_path / "x.hdf5", density=STATED))
+    assert labels_of(table, "Density") == Labels("Density")
+    with pytest.raises(ImportError, match=r"jaxsph\[units\]"):
+        labels_of(table, "Density", unit="g/cm**3")
+
+
+def test_the_library_itself_names_units_as_the_stand_in_does():
+    pytest.importorskip("unyt")
+    assert named(CodeUnit(KPC, LENGTH), 3000.0) == (pytest.approx(1e-3, rel=1e-4), "Mpc")
+    assert named(CodeUnit(1e5, VELOCITY), 3.0) == (pytest.approx(1), "km/s")
+    assert named(CodeUnit(0.018, (-0.5, 0.5, -1, 0)), 1.0) == (pytest.approx(0.018), "G")
+    assert named(CodeUnit(6.77e-22, (-3, 1, 0, 0)), 1.0, "Msun/kpc**3") == (pytest.approx(1e10, rel=1e-2), "Msun/kpc^3")
+    assert named(CodeUnit(1.0, (0, 0, 0, 0)), 1.0) == (1.0, "")
+    with pytest.raises(ValueError, match="does not agree"):
+        named(CodeUnit(KPC, LENGTH), 1.0, "Myr")
+    with pytest.raises(ValueError, match="is no unit"):
+        named(CodeUnit(KPC, LENGTH), 1.0, "parsnip")
