@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io import ParticleTable
-from jaxsph.model import Camera, Image, Settings
-from jaxsph.model.registry import ESTIMATING
+from jaxsph.model import Camera, Image, Settings, registry
 
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 OPTIONS = {
@@ -186,7 +185,7 @@ def camera_line(camera: Camera, options: argparse.Namespace | None = None) -> st
 def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:
     """Largest error of any pixel, how it is known, and what it is measured against where that is not full rate."""
     error = f"at most {largest(image.error_bound):.2g}"
-    if settings.integrator in ESTIMATING and settings.screen != "quadtree" and not by_quadtree:
+    if registry.estimates(settings.integrator) and settings.screen != "quadtree" and not by_quadtree:
         return f"{error.replace('most', 'most about')} (estimated against the light integral)"
     return f"{error} ({'certified' if image.certified else 'estimated'})"
 

@@ -19,9 +19,8 @@ from jaxsph.cli.console import UsageError, say, span
 from jaxsph.io import Labels
 from jaxsph.io.quantities import LOG_PREFIX
 from jaxsph.model import Camera, Particles, Scene, TransferFunction, Volume
-from jaxsph.model.transfer.domains import DOMAINS, log_departure
-from jaxsph.model.transfer.presets import PRESETS
-from jaxsph.model.transfer.scales import Scale
+from jaxsph.model.transfer.domains import DOMAINS, Scale, log_departure
+from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.plot.transfer_figure import transfer_figure
 
 LOOKS = "colormap", "range", "opacity", "transfer", "domain", "preset"

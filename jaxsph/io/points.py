@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.points import Points
-from jaxsph.model.transfer.colormaps import colormap as colors_of_map
-from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.model.transfer.maps import colormap as colors_of_map
+from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import given
 
 from .assemble import OF_FILE, rounding_note

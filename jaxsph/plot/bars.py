@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.labels import CODE_UNITS
+from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.scales import Scale
 
 LOG_PREFIX = "log10:"
 STEPS = 256

@@ -19,7 +19,7 @@ from jaxsph.io.quantities import choose_quantity
 from jaxsph.io.selection import chosen
 from jaxsph.io.sequence import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
-from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.model.transfer.maps import value_range
 
 MAX_VALUES = 1 << 16
 """Values of a file that the range over all files is taken from, evenly spread over its particles."""

@@ -14,8 +14,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Settings
-from jaxsph.model.registry import ESTIMATING
+from jaxsph.model import Camera, Settings, registry
 
 TOLERANCES = (0.001, 0.004, 0.01)
 ESTIMATORS: dict[str, dict[str, Any]] = {
@@ -44,7 +43,7 @@ class Contender:
     @property
     def is_against_integral(self) -> bool:
         """Whether its tolerance is kept against the light integral, not against full rate."""
-        return self.tolerance is not None and self.settings.integrator in ESTIMATING
+        return self.tolerance is not None and registry.estimates(self.settings.integrator)
 
     @property
     def kind(self) -> Hashable:
@@ -62,8 +61,8 @@ class Contender:
 
 def suitable(settings: Settings) -> tuple[str, ...]:
     """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
-    allowed = {settings.integrator, *ESTIMATING}
-    return tuple(name for name, chosen in ESTIMATORS.items() if chosen["integrator"] in allowed)
+    own = settings.integrator
+    return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or registry.estimates(it["integrator"]))
 
 
 def contenders(
