@@ -69,7 +69,6 @@ class CountedSteps(StepDoubling):
 COUNTING = {"samples": "counted_samples", "step_doubling": "counted_steps"}
 registry.INTEGRATORS["counted_samples"] = f"{__name__}:CountedSamples"
 registry.INTEGRATORS["counted_steps"] = f"{__name__}:CountedSteps"
-registry.AT_POINTS.add("counted_steps")
 
 
 def contenders() -> list[js.Settings]:

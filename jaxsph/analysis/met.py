@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.scales import Scale
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
 from jaxsph.reference.media import AllOfVolume, AllParticles, Part, Whole, parts_of

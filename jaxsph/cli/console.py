@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io import ParticleTable, Report
-from jaxsph.model import Camera, Image, Settings
-from jaxsph.model.registry import ESTIMATING
+from jaxsph.model import Camera, Image, Settings, registry
 from jaxsph.numerics.checks import Progress
 
 IMAGES = (".exr", ".png")
@@ -205,7 +204,7 @@ def camera_line(camera: Camera, options: argparse.Namespace | None = None) -> st
 def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:
     """Largest error of any pixel, how it is known, and what it is measured against where that is not full rate."""
     error = f"at most {largest(image.error_bound):.2g}"
-    if settings.integrator in ESTIMATING and settings.screen != "quadtree" and not by_quadtree:
+    if registry.estimates(settings.integrator) and settings.screen != "quadtree" and not by_quadtree:
         return f"{error.replace('most', 'most about')} (estimated against the light integral)"
     return f"{error} ({'certified' if image.certified else 'estimated'})"
 

@@ -21,9 +21,8 @@ from jaxsph.io.settle.labels import NEEDS, can_name
 from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.settle.unit_names import unit_of
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
-from jaxsph.model.transfer.domains import DOMAINS, log_departure
-from jaxsph.model.transfer.presets import PRESETS
-from jaxsph.model.transfer.scales import Scale
+from jaxsph.model.transfer.domains import DOMAINS, Scale, log_departure
+from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.plot.transfer_figure import transfer_figure
 

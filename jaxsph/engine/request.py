@@ -9,9 +9,9 @@ import dataclasses
 from typing import NamedTuple
 
 from jaxsph.engine.media.in_octree import reachable
+from jaxsph.model import registry
 from jaxsph.model.asked import require_asked
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.registry import AT_POINTS, ESTIMATING
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
@@ -58,12 +58,12 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
             for that nothing can keep.
     """
     scene.check()
-    if settings.integrator in AT_POINTS:
+    if registry.integrator_class(settings.integrator).asks_points:
         _require_points(scene, settings.integrator)
     if settings.tolerance is None:
         return settings
     beyond = {
-        f"`integrator={settings.integrator!r}`": settings.integrator not in ("samples", *ESTIMATING),
+        f"`integrator={settings.integrator!r}`": settings.integrator != "samples" and not registry.estimates(settings.integrator),
         f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,

@@ -6,21 +6,20 @@ Flow: cast -> [image] -> files, notebooks.
 from __future__ import annotations
 
 import base64
-import dataclasses
 import io
 import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("metadata",))
 class Image:
     """A rendered image. Row 0 is the top, column 0 the left; the background is black.
 
@@ -142,15 +141,13 @@ class Image:
         return f"<figure>{shown}<figcaption>{', '.join(told)}</figcaption></figure>"
 
     def _repr_png_(self) -> bytes:
-        from PIL import Image as Pillow
-
-        buffer = io.BytesIO()
-        Pillow.fromarray(self.to_uint8()).save(buffer, format="PNG")
-        return buffer.getvalue()
+        return png_of(self.to_uint8())
 
 
-jax.tree_util.register_dataclass(
-    Image,
-    data_fields=["color", "transmittance", "depth", "error_bound", "evaluations", "certified", "faults", "stats", "levels"],
-    meta_fields=["metadata"],
-)
+def png_of(picture: np.ndarray) -> bytes:
+    """A PNG file of (H, W, 3) uint8."""
+    from PIL import Image as Pillow
+
+    buffer = io.BytesIO()
+    Pillow.fromarray(picture).save(buffer, format="PNG")
+    return buffer.getvalue()

@@ -19,44 +19,33 @@ from jaxtyping import Array, Bool, Int
 
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import ROUNDED
 
 
 def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
     """The scene with all looks in range, and a fault word."""
-    off: list[Bool[Array, ""]] = []
+    word = jnp.int32(faults.NONE)
 
     def kept(look: Any) -> Any:
+        nonlocal word
         if look is None or isinstance(look, tuple):
             return look if look is None else tuple(map(kept, look))
-        look, out = _points(look) if isinstance(look, Points) else _transfer(look)
-        off.append(out)
+        if isinstance(look, Points):
+            (color, extinction), off = _shaded(look.color, look.extinction, look.valid)
+            look = dataclasses.replace(look, color=color, extinction=extinction)
+        else:
+            (colors, extinction), off = _shaded(look.colors, look.extinction)
+            control = {name: getattr(look, name) for name in ("values", "extinction_values") if getattr(look, name) is not None}
+            ascending = {name: _ascending(values) for name, values in control.items()}
+            for name, values in control.items():
+                off |= (ascending[name] - values > _slack(values)).any()
+            look = dataclasses.replace(look, colors=colors, extinction=extinction, **ascending)
+        word |= faults.raised(faults.CLIPPED_LOOK, off)
         return look
 
     looks = {name: kept(getattr(scene, name)) for name in ("transfer", "volume_transfer", "points")}
-    word = jnp.int32(faults.NONE)
-    for out in off:
-        word |= faults.raised(faults.CLIPPED_LOOK, out)
     return dataclasses.replace(scene, **looks), word
-
-
-def _transfer(transfer: TransferFunction) -> tuple[TransferFunction, Bool[Array, ""]]:
-    shades, off = _shaded(transfer.colors, transfer.extinction)
-    colors, extinction = shades
-    ascending = {"values": transfer.values}
-    if transfer.extinction_values is not None:
-        ascending["extinction_values"] = transfer.extinction_values
-    for values in ascending.values():
-        off |= (_ascending(values) - values > _slack(values)).any()
-    kept = {name: _ascending(values) for name, values in ascending.items()}
-    return dataclasses.replace(transfer, colors=colors, extinction=extinction, **kept), off
-
-
-def _points(points: Points) -> tuple[Points, Bool[Array, ""]]:
-    (color, extinction), off = _shaded(points.color, points.extinction, points.valid)
-    return dataclasses.replace(points, color=color, extinction=extinction), off
 
 
 def _shaded(color: Array, extinction: Array, valid: Any = True) -> tuple[tuple[Array, Array], Bool[Array, ""]]:

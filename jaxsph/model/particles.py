@@ -12,17 +12,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model import kernels
 from jaxsph.model.clips.shapes import Box
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.model.packing import columns_of, packed, padded_to, rest_of
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
-
-NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
-
+from jaxsph.numerics.trees import tree
 
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
+VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
 SECOND = "extinction_quantity"  # a column that there may be or not
 
 
@@ -32,7 +34,15 @@ def capacity_class(count: int) -> int:
     return max(-(-count // step) * step, 1)
 
 
-@dataclasses.dataclass(frozen=True)
+def room_for(what: str, count: int, capacity: int | None) -> int:
+    """Entries that there are to be: as given, or the class of `count`."""
+    room = capacity_class(count) if capacity is None else capacity
+    if room < max(count, 1):
+        raise ValueError(f"`capacity` must be at least the number of {what}s ({count}) and 1, got {room}")
+    return room
+
+
+@tree(static=("kernel", "length_unit"))
 class Particles:
     """SPH particles that carry a quantity; make them with `from_arrays`.
 
@@ -107,20 +117,23 @@ class Particles:
         position, unit = with_unit("position", position)
         given = {"position": position, "support": in_unit("support", support, unit)}
         given |= {name: own(name, value) for name, value in _quantities(quantity).items()}
-        arrays = _columns(given | {"volume": in_unit("volume", volume, unit, 3)})
+        arrays = columns_of("particle", given | {"volume": in_unit("volume", volume, unit, 3)})
         box, count = box if isinstance(box, Box) else in_unit("box", box, unit), arrays["position"].shape[0]
-        _require_usable(arrays)
+        known = not is_traced(*arrays.values())
+        if known:
+            for name, value in arrays.items():
+                require_finite(name, value)
+            require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
+            require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
-        capacity = capacity_class(count) if capacity is None else capacity
-        if capacity < max(count, 1):
-            raise ValueError(f"`capacity` must be at least the number of particles ({count}) and 1, got {capacity}")
-        packed = {name: _padded(name, value, dtype, capacity) for name, value in arrays.items()}
-        rest = None
-        if not is_traced(*arrays.values()) and count:
-            _require_representable(arrays, packed)
-            rest = rest_of(arrays["position"], packed["position"], packed["support"])
-        valid, period, called = jnp.arange(capacity) < count, _period(box, arrays["support"], dtype), name_of(unit)
-        return cls(**packed, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=called)
+        room = room_for("particle", count, capacity)
+        columns = {name: packed(name, value, room, dtype, **_padding(name)) for name, value in arrays.items()}
+        if known:
+            _require_volumes(arrays["volume"], columns["volume"])
+        rest = rest_of(arrays["position"], columns["position"], columns["support"]) if known else None
+        entries = {name: jnp.asarray(value) for name, value in columns.items()}
+        valid, period, called = jnp.arange(room) < count, _period(box, arrays["support"], dtype), name_of(unit)
+        return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=called)
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.
@@ -130,10 +143,10 @@ class Particles:
         """
         if capacity < self.capacity:
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
-        padded = {name: _repeated(name, column, capacity, jnp) for name, column in self.columns.items()}
+        columns = {name: padded_to(column, capacity, xp=jnp, **_padding(name)) for name, column in self.columns.items()}
         valid = jnp.pad(self.valid, (0, capacity - self.capacity))
-        rest = None if self.position_rest is None else _repeated("position", self.position_rest, capacity, jnp)
-        return dataclasses.replace(self, **padded, valid=valid, position_rest=rest)
+        rest = None if self.position_rest is None else padded_to(self.position_rest, capacity, 0.0, jnp)
+        return dataclasses.replace(self, **columns, valid=valid, position_rest=rest)
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
@@ -152,9 +165,59 @@ class Particles:
         Raises:
             ValueError: a set without a box, or another point.
         """
-        from jaxsph.model import periodic
+        if self.box is None:
+            raise ValueError(
+                "particles must have a periodic box to be centred; give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`"
+            )
+        if isinstance(at, str):
+            if at != "densest":
+                raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
+            at = self._densest()
+        at = in_unit("at", at, self.length_unit)
+        if is_traced(at, self):
+            corner = jnp.asarray(at, self.dtype) - 0.5 * self.box.sides
+            return dataclasses.replace(self, box=Box(corner, corner + self.box.sides)).wrapped()
+        require_shape("at", at, (3,), "give x, y and z, or 'densest'")
+        require_finite("at", at, "give x, y and z, or 'densest'")
+        lower, upper = self.box.corners()
+        corners = (np.asarray(at, np.float64) + sign * (upper - lower) / 2 for sign in (-1, 1))
+        return dataclasses.replace(self, box=Box(*corners).of_dtype(self.dtype)).wrapped()
 
-        return periodic.centered(self, at)
+    def _densest(self) -> np.ndarray:
+        """Where most particles lie within a support, for its volume, (3,) float64 (host side); across faces, too."""
+        valid = np.asarray(self.valid)
+        if not valid.any():
+            raise ValueError("there are no particles, so none is the densest; give x, y and z")
+        position, support = self.exact_position()[valid], np.asarray(self.support, np.float64)[valid]
+        if support.max() > VARYING * support.min():  # codes adapt supports to the number density
+            return np.asarray(position[support.argmin()])
+        assert self.box is not None
+        lower, upper = self.box.corners()
+        place = np.mod(position - lower, upper - lower)
+        place = np.where(place >= upper - lower, 0, place)
+        tree = scipy.spatial.KDTree(place, boxsize=upper - lower)
+        number = tree.query_ball_point(place, support, return_length=True, workers=-1)
+        return np.asarray(position[(number / support**3).argmax()])
+
+    def wrapped(self) -> Particles:
+        """The same particles; of a periodic set, with all positions in its box.
+
+        Differentiation:
+            Positions are moved by whole periods, which are held fixed.
+        """
+        if self.box is None:
+            return self
+        turns = jnp.floor((lax.stop_gradient(self.position) - self.box.lower) / sides_of(self.box)[0])
+        return self.moved(jnp.where(jnp.isfinite(turns), -turns, 0), self.box)
+
+    def moved(self, turns: Float[Array, "particles 3"], box: Box) -> Particles:
+        """The same particles so many sides of a box further; with what that rounds off, where what rounding has left is kept."""
+        sides, left_of_sides = sides_of(box)
+        position, left = two_sum(self.position, turns * sides)
+        if self.position_rest is None:
+            return dataclasses.replace(self, position=position)
+        rest = self.position_rest + (left + turns * left_of_sides)
+        return dataclasses.replace(self, position=position, position_rest=rest)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """The particles that exist, without padding (host side): all `columns`."""
@@ -207,34 +270,8 @@ class Particles:
         return (position - support).min(0), (position + support).max(0)
 
 
-def _columns(given: dict[str, Any]) -> dict[str, Any]:
-    """Arrays of real numbers, positions first, with an entry for each particle."""
-    arrays = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
-    for name, value in arrays.items():
-        require_real(name, value)
-    if arrays["position"].size == 0 and not isinstance(arrays["position"], jax.Array):
-        arrays["position"] = arrays["position"].reshape(0, 3)
-    require_shape("position", arrays["position"], (None, 3), "one row (x, y, z) a particle")
-    count = arrays["position"].shape[0]
-    for name in list(arrays)[1:]:
-        if arrays[name].ndim == 0:
-            arrays[name] = (jnp if is_traced(arrays[name]) else np).broadcast_to(arrays[name], (count,))
-        require_shape(name, arrays[name], (count,), f"one value for each of the {count} particles, or one number for all")
-    return arrays
-
-
-def _require_usable(arrays: dict[str, Any]) -> None:
-    """Raise where values that are known are not finite, supports not positive, or volumes negative."""
-    if is_traced(*arrays.values()):
-        return
-    for name, value in arrays.items():
-        require_finite(name, value)
-    require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
-    require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
-
-
 def _quantities(given: Any) -> dict[str, Any]:
-    """One quantity or a pair, by name. A sequence of numbers alone is one quantity, as it is where there are two particles."""
+    """One quantity or a pair, by name. A sequence of two numbers is one quantity, of two particles."""
     pair = isinstance(given, tuple | list) and any(np.ndim(part) > 0 for part in given)
     if not pair:
         return {"quantity": given}
@@ -268,51 +305,32 @@ def _period(box: Any, support: Any, dtype: Any) -> Box | None:
     return jax.tree.map(lambda leaf: leaf.astype(dtype), box)
 
 
-def _padded(name: str, value: Any, dtype: Any, capacity: int) -> Array:
-    xp = jnp if is_traced(value) else np
-    with np.errstate(over="ignore"):  # what overflows is refused by name, later
-        return jnp.asarray(_repeated(name, value, capacity, xp).astype(dtype))
+def _padding(name: str) -> dict[str, Any]:
+    """How a column is padded: volumes by 0, so that padding weighs nothing."""
+    return {"nothing": NOTHING.get(name, 0.0), "repeat": name != "volume"}
 
 
-def _repeated(name: str, value: Any, capacity: int, xp: Any) -> Any:
-    """A column up to its capacity with its first entry: whoever forgets what is `valid` meets no number of our own making."""
-    missing = (capacity - value.shape[0], *value.shape[1:])
-    if name == "volume" or not value.shape[0]:
-        return xp.concatenate([value, xp.full(missing, NOTHING.get(name, 0.0), value.dtype)])
-    return xp.concatenate([value, xp.broadcast_to(value[:1], missing)])
-
-
-def rest_of(given: Any, packed: Array, support: Array) -> Array | None:
-    """What rounding `given` to `packed` has left, or None where that is negligible."""
-    given, rounded = np.asarray(given, np.float64), np.asarray(packed, np.float64)
-    rest = _repeated("position", given - rounded[: len(given)], len(rounded), np)
-    if not (np.abs(rest).max(1) > NEGLIGIBLE * np.asarray(support, np.float64)).any():
-        return None
-    return jnp.asarray(rest, packed.dtype)
-
-
-def _require_representable(given: dict[str, Any], packed: dict[str, Array]) -> None:
-    """Refuse numbers that the working precision cannot hold (a support that becomes 0, a quantity that becomes inf)."""
-    for name in given:
-        require_finite(name, packed[name], f"it overflows {packed[name].dtype}: rescale it, or use float64 under jax.enable_x64")
-    count = given["position"].shape[0]
-    require_positive(
-        "support",
-        np.asarray(packed["support"])[:count],  # on the host: a device would compile a program for every count
-        f"it underflows {packed['support'].dtype}: rescale the scene or use float64",
-    )
-    tiny = np.finfo(packed["volume"].dtype).tiny
-    given_volume = np.asarray(given["volume"], np.float64)
-    lost = (given_volume > 0) & (given_volume < tiny)
-    if lost.any():
-        i = int(np.flatnonzero(lost)[0])
+def _require_volumes(given: Any, rounded: Any) -> None:
+    """Refuse volumes that are not 0 and underflow."""
+    given, tiny = np.asarray(given, np.float64), np.finfo(rounded.dtype).tiny
+    lost = np.flatnonzero((given > 0) & (given < tiny))
+    if lost.size:
+        i = int(lost[0])
         raise ValueError(
-            f"`volume` must be 0 or at least {tiny:.3g}, but volume[{i}] = {given_volume[i]:.6g} underflows "
-            f"{packed['volume'].dtype}; only ratios of volumes matter, so multiply all of them by the same number"
+            f"`volume` must be 0 or at least {tiny:.3g}, but volume[{i}] = {given[i]:.6g} underflows {rounded.dtype}; only "
+            "ratios of volumes matter, so multiply all of them by the same number"
         )
 
 
-STATIC = ["kernel", "length_unit"]
-jax.tree_util.register_dataclass(
-    Particles, data_fields=[f.name for f in dataclasses.fields(Particles) if f.name not in STATIC], meta_fields=STATIC
-)
+def sides_of(box: Box) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Sides of a box, and what rounding them has left."""
+    sides, left = two_sum(box.upper, -box.lower)
+    return two_sum(sides, left + (box.rest[1] - box.rest[0]))
+
+
+def two_sum(first: Array, second: Array) -> tuple[Array, Array]:
+    """A sum, and what rounding it has left (Knuth 1969, section 4.2.2)."""
+    total = first + second
+    part = lax.stop_gradient(total - first)
+    left = (lax.stop_gradient(first) - (lax.stop_gradient(total) - part)) + (lax.stop_gradient(second) - part)
+    return total, left

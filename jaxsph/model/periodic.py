@@ -1,11 +1,15 @@
 r"""Periodic boxes: copies of the particles whose supports reach over a face, so that nothing else needs to know of periods.
 
-Flow: particles -> [periodic: wrap -> ghosts] -> spheres -> access.
+Flow: particles -> [periodic: ghosts] -> spheres -> access; project.
 
 The field of a periodic set is $\sum_n \sum_j$ over all periods n and particles j. In the box itself only images count whose
 support reaches into it: of supports up to the length of a side these are among the 26 around it. They are *ghosts*, appended to
 the particles; derivatives by a ghost are those by the particle that it is an image of. What is shown is one period: the medium
 ends at the faces of the box (`field.within`).
+
+A projection along an axis of the box has what the box holds, with images that reach into it: rays and pixels end at its faces.
+Along other directions faces cut rays at depths that differ from ray to ray, which column integrals do not know: there each
+particle is taken once, with all of its support.
 """
 
 from __future__ import annotations
@@ -17,20 +21,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.shapes import Box
-from jaxsph.model.particles import Particles, capacity_class
+from jaxsph.model.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import is_traced, require_finite, require_shape
-from jaxsph.numerics.given import in_unit
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
 """Periods around the box, in which ghosts can lie."""
 ROUNDING = 16  # eps of coordinates and supports that a distance to a face may be off by
-VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
+ALIGNED = 1e-6  # of its length, that a line of sight may be off an axis
 COUNTED = 32  # eps: the same where ghosts are counted, such that never more are made
 
 
@@ -40,32 +42,6 @@ class Gaps(NamedTuple):
     below: Float[Array, "particles 3"]
     above: Float[Array, "particles 3"]
     reach: Float[Array, " particles"]
-
-
-class Period(NamedTuple):
-    """Sides of a box, and what rounding them has left."""
-
-    sides: Float[Array, "3"]
-    rest: Float[Array, "3"]
-
-    @classmethod
-    def of(cls, box: Box) -> Period:
-        """Of a box."""
-        sides, left = _two_sum(box.upper, -box.lower)
-        return cls(*_two_sum(sides, left + (box.rest[1] - box.rest[0])))
-
-
-def wrapped(particles: Particles) -> Particles:
-    """The same particles with all positions in the box.
-
-    Differentiation:
-        Positions are moved by whole periods, which are held fixed.
-    """
-    if particles.box is None:
-        return particles
-    period = Period.of(particles.box)
-    turns = jnp.floor((lax.stop_gradient(particles.position) - particles.box.lower) / period.sides)
-    return _moved(particles, jnp.where(jnp.isfinite(turns), -turns, 0), period)
 
 
 def unfolded(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Particles, Int[Array, ""]]:
@@ -89,10 +65,10 @@ def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Pa
         By all that particles are made of, and by the sides of the box. Which have ghosts is held fixed.
     """
     assert particles.box is not None
-    home, period = wrapped(particles), Period.of(particles.box)
+    home, (sides, _) = particles.wrapped(), sides_of(particles.box)
     bare = dataclasses.replace(home, box=None)
-    usable = (period.sides > 0).all() & jnp.isfinite(period.sides).all()
-    fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= period.sides.min()
+    usable = (sides > 0).all() & jnp.isfinite(sides).all()
+    fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= sides.min()
     word = faults.raised(faults.BAD_BOX, ~(usable & fits))
     near, gaps = _near(home, margin, ROUNDING)
     capacity = particles.capacity
@@ -107,8 +83,7 @@ def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Pa
     place = jnp.nonzero(made.ravel(), size=room, fill_value=0)[0].astype(jnp.int32)
     exists = jnp.arange(room, dtype=jnp.int32) < number
     origin = inside[place // len(IMAGES)]
-    ghosts = bare.at(origin)
-    ghosts = _moved(ghosts, jnp.asarray(IMAGES, home.dtype)[place % len(IMAGES)], period)
+    ghosts = bare.at(origin).moved(jnp.asarray(IMAGES, home.dtype)[place % len(IMAGES)], particles.box)
     ghosts = dataclasses.replace(ghosts, valid=ghosts.valid & exists)
     word |= faults.raised(faults.GHOST_OVERFLOW, (number > room) | (near.sum(dtype=jnp.int32) > room))
     together = jax.tree.map(lambda home, more: jnp.concatenate([home, more]), bare, ghosts)
@@ -134,56 +109,12 @@ def with_ghosts(particles: Particles) -> Particles:
     return found
 
 
-def centered(particles: Particles, at: Any) -> Particles:
-    """See `Particles.centered`."""
-    if particles.box is None:
-        raise ValueError("particles must have a periodic box to be centred; give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`")
-    if isinstance(at, str):
-        if at != "densest":
-            raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
-        at = densest(particles)
-    at = in_unit("at", at, particles.length_unit)
-    if is_traced(at, particles):
-        half = 0.5 * particles.box.sides
-        lower = jnp.asarray(at, particles.dtype) - half
-        return wrapped(dataclasses.replace(particles, box=Box(lower, lower + particles.box.sides)))
-    require_shape("at", at, (3,), "give x, y and z, or 'densest'")
-    require_finite("at", at, "give x, y and z, or 'densest'")
-    ends = particles.box.corners()
-    half = (ends[1] - ends[0]) / 2
-    corners = (np.asarray(at, np.float64) + sign * half for sign in (-1, 1))
-    return wrapped(dataclasses.replace(particles, box=Box(*corners).of_dtype(particles.dtype)))
-
-
-def densest(particles: Particles) -> np.ndarray:
-    """Where most particles lie within a support, for its volume, (3,) float64 (host side); across faces, too.
-
-    Raises:
-        ValueError: no particles.
-    """
-    valid = np.asarray(particles.valid)
-    if not valid.any():
-        raise ValueError("there are no particles, so none is the densest; give x, y and z")
-    position, support = particles.exact_position()[valid], np.asarray(particles.support, np.float64)[valid]
-    if support.max() > VARYING * support.min():  # codes adapt supports to the number density
-        return np.asarray(position[support.argmin()])
-    place, period = position, None
-    if particles.box is not None:
-        lower, upper = particles.box.corners()
-        period = upper - lower
-        place = np.mod(position - lower, period)
-        place = np.where(place >= period, 0, place)
-    tree = scipy.spatial.KDTree(place, boxsize=period)
-    number = tree.query_ball_point(place, support, return_length=True, workers=-1)
-    return np.asarray(position[(number / support**3).argmax()])
-
-
 _unfolded = jax.jit(unfolded, static_argnames="room")
 
 
 @jax.jit
 def _counted(particles: Particles, margin: Float[Array, ""]) -> Int[Array, ""]:
-    near, gaps = _near(wrapped(particles), margin, COUNTED)
+    near, gaps = _near(particles.wrapped(), margin, COUNTED)
     return sum(((near & _reaches(gaps, image)).sum(dtype=jnp.int32) for image in IMAGES), jnp.int32(0))
 
 
@@ -201,23 +132,41 @@ def _near(particles: Particles, margin: Any, rounding: int) -> tuple[Array, Gaps
 
 
 def _reaches(gaps: Gaps, image: np.ndarray) -> Array:
-    """Whether an image reaches into the box: one a period further up is as far above as the particle is from the lower face."""
+    """Whether an image reaches into the box; one a period further up is as far above the box as the particle is within."""
     away = [(gaps.below if step > 0 else gaps.above)[:, k] for k, step in enumerate(image) if step]
     return jnp.sum(jnp.maximum(jnp.stack(away), 0) ** 2, 0) < gaps.reach * gaps.reach
 
 
-def _moved(particles: Particles, periods: Float[Array, "particles 3"], period: Period) -> Particles:
-    """By so many periods; with what that rounds off, where what rounding has left is kept."""
-    position, left = _two_sum(particles.position, periods * period.sides)
-    if particles.position_rest is None:
-        return dataclasses.replace(particles, position=position)
-    rest = particles.position_rest + (left + periods * period.rest)
-    return dataclasses.replace(particles, position=position, position_rest=rest)
+def sees_images(particles: Particles, camera: Camera) -> bool:
+    """Whether images of a periodic set count: for parallel rays along one of its axes, upright (host side)."""
+    if particles.box is None or camera.is_perspective:
+        return False
+    return bool((np.abs(np.asarray(camera.axes, np.float64)).max(1) > 1 - ALIGNED).all())
 
 
-def _two_sum(first: Array, second: Array) -> tuple[Array, Array]:
-    """A sum, and what rounding it has left (Knuth 1969, section 4.2.2)."""
-    total = first + second
-    part = lax.stop_gradient(total - first)
-    left = (lax.stop_gradient(first) - (lax.stop_gradient(total) - part)) + (lax.stop_gradient(second) - part)
-    return total, left
+def between_faces(camera: Camera, box: Box, pixel: str) -> tuple[Camera, Float[Array, "height width"]]:
+    """The camera with its depths cut off at the faces of a box, and what share of each pixel lies between the others.
+
+    Args:
+        camera: that `sees_images`.
+        box: a period.
+        pixel: `"mean"`, or `"ray"`, of which the middle counts.
+    """
+    ends = jnp.stack([camera.to_view(corner, rest) for corner, rest in zip((box.lower, box.upper), box.rest, strict=True)])
+    low, high = ends.min(0), ends.max(0)
+    near, far = jnp.maximum(camera.near, low[2]), jnp.minimum(camera.far, high[2])
+    meets = near < far
+    inside = dataclasses.replace(camera, near=jnp.where(meets, near, camera.near), far=jnp.where(meets, far, camera.far))
+    across = _shares(camera.column, camera.width, low[0], high[0], pixel)
+    down = _shares(camera.row, camera.height, low[1], high[1], pixel)
+    return inside, jnp.where(meets, down[:, None] * across, 0)
+
+
+def _shares(place: Any, number: int, low: Array, high: Array, pixel: str) -> Float[Array, " pixels"]:
+    """Of pixels in a row or column, how much lies between two coordinates."""
+    if pixel == "ray":
+        middle = place(jnp.arange(number) + 0.5)
+        return ((middle >= low) & (middle <= high)).astype(low.dtype)
+    edges = place(jnp.arange(number + 1))
+    lower, upper = jnp.minimum(edges[:-1], edges[1:]), jnp.maximum(edges[:-1], edges[1:])
+    return jnp.clip(jnp.minimum(upper, high) - jnp.maximum(lower, low), 0, upper - lower) / (upper - lower)

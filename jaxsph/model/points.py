@@ -5,7 +5,6 @@ Flow: files, arrays -> [points] -> field -> cast -> image.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -13,16 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.particles import Particles, capacity_class, rest_of
+from jaxsph.model.packing import columns_of, packed, rest_of
+from jaxsph.model.particles import Particles, room_for
 from jaxsph.model.profiles import Profile, profile_of
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.checks import is_traced, require_finite, require_positive
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
+from jaxsph.numerics.trees import tree
 
 SPREADS = "chords", "feet", "centres"
 MAIN = "position", "radius", "color", "extinction"
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("spread", "length_unit"))
 class Points:
     """A set of points; make it with `from_arrays`.
 
@@ -107,21 +108,21 @@ class Points:
         if spread == "feet" and splats_beyond is not None:
             raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
         position, unit = with_unit("position", position)
-        given = {"radius": in_unit("radius", radius, unit), **_strength(extinction, opacity, unit)}
-        columns = _columns(_centers(position), color, given | _own_names(attributes or {}))
+        given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
+        columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit))
+        _require_usable(columns)
         center = columns["position"]
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(center.dtype), jnp.float32)
-        room = _room(capacity, center.shape[0])
-        shape = profile_of(profile, dtype)
+        room, shape = room_for("point", center.shape[0], capacity), profile_of(profile, dtype)
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
-        packed = {name: _packed(name, value, room, dtype) for name, value in columns.items()}
-        rest = _rest(center, packed)
-        packed = {name: jnp.asarray(value) for name, value in packed.items()}
-        main = {name: packed.pop(name) for name in MAIN}
+        rounded = {name: packed(name, value, room, dtype, float(name == "radius")) for name, value in columns.items()}
+        rest = rest_of(center, rounded["position"], rounded["radius"])
+        entries: dict[str, Any] = {name: jnp.asarray(value) for name, value in rounded.items()}
+        main = {name: entries.pop(name) for name in MAIN}
         valid, beyond = jnp.arange(room) < center.shape[0], _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
         more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit)}
-        return cls(**main, valid=valid, attributes=packed, profile=shape, position_rest=rest, **more)
+        return cls(**main, valid=valid, attributes=entries, profile=shape, position_rest=rest, **more)
 
     @property
     def capacity(self) -> int:
@@ -160,72 +161,22 @@ class Points:
         return self.spheres().bounds()
 
 
-def _array(name: str, value: Any) -> Any:
-    value = value if isinstance(value, jax.Array) else np.asarray(value)
-    require_real(name, value)
-    return value
-
-
-def _centers(position: Any) -> Any:
-    center = _array("position", position)
-    if center.size == 0 and not isinstance(center, jax.Array):
-        center = center.reshape(0, 3)
-    require_shape("position", center, (None, 3), "one row (x, y, z) a point")
-    return center
-
-
-def _column(name: str, value: Any, count: int, row: tuple[int, ...] = ()) -> Any:
-    """One entry a point, of one for all where so much is given."""
-    value = _array(name, value)
-    if value.shape == row:
-        value = (jnp if is_traced(value) else np).broadcast_to(value, (count, *row))
-    each = "one row" if row else "one value"
-    require_shape(name, value, (count, *row), f"{each} for each of the {count} points, or one for all")
-    return value
-
-
-def _columns(center: Any, color: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """An entry for each point of all that is given, checked."""
-    columns = {"position": center, "color": _column("color", plain("color", color), center.shape[0], (3,))}
-    columns |= {name: _column(name, value, center.shape[0]) for name, value in given.items()}
-    _require_usable(columns)
-    return columns
-
-
-def _room(capacity: int | None, count: int) -> int:
-    """How many entries there are to be."""
-    room = capacity_class(count) if capacity is None else capacity
-    if room < max(count, 1):
-        raise ValueError(f"`capacity` must be at least the number of points ({count}) and 1, got {room}")
-    return room
-
-
-def _rest(center: Any, packed: dict[str, Any]) -> Array | None:
-    """What rounding centres has left, where they are known."""
-    known = center.shape[0] and not is_traced(center, packed["radius"])
-    return rest_of(center, packed["position"], packed["radius"]) if known else None
-
-
-def _strength(extinction: Any, opacity: Any, unit: Any) -> dict[str, Any]:
-    """The one that is given, by name."""
+def _strengths(extinction: Any, opacity: Any, attributes: dict[str, Any], unit: Any) -> dict[str, Any]:
+    """Extinction or opacity, by name, and attributes, none of which may stand for what every point has."""
     if (extinction is None) == (opacity is None):
         what = "neither" if extinction is None else "both"
         raise ValueError(f"one of `extinction` and `opacity` must be given, got {what}; opacity is that through the centre")
-    if opacity is None:
-        return {"extinction": in_unit("extinction", extinction, unit, -1)}
-    return {"opacity": plain("opacity", opacity, "it is a number")}
-
-
-def _own_names(attributes: dict[str, Any]) -> dict[str, Any]:
-    """Attributes, none of which may stand for what every point has."""
     taken = [name for name in attributes if name in (*MAIN, "opacity")]
     if taken:
         raise ValueError(f"`attributes` must not be named as what every point has, got {taken[0]!r}; give it another name")
-    return {name: own(name, value) for name, value in attributes.items()}
+    given = {name: own(name, value) for name, value in attributes.items()}
+    if opacity is None:
+        return {"extinction": in_unit("extinction", extinction, unit, -1)} | given
+    return {"opacity": plain("opacity", opacity, "it is a number")} | given
 
 
 def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
-    """That of points which a ray through the centre sees with this opacity; by float64 where numbers are known."""
+    """Extinction at the centre of points that have an opacity along a ray through it; in float64 where numbers are known."""
     through: Any = profile.through_centre()
     if not is_traced(through):
         through = float(through)
@@ -252,30 +203,9 @@ def _require_usable(columns: dict[str, Any]) -> None:
             raise ValueError(f"`{name}` must be {allowed}, got {np.asarray(value).min():.6g} .. {np.asarray(value).max():.6g}")
 
 
-def _packed(name: str, value: Any, room: int, dtype: Any) -> Any:
-    """Padded with the first point: whoever forgets what is `valid` meets no number of our own making."""
-    xp = jnp if is_traced(value) else np
-    missing = (room - value.shape[0], *value.shape[1:])
-    first = value[:1] if value.shape[0] else xp.full((1, *value.shape[1:]), 1 if name == "radius" else 0, value.dtype)
-    with np.errstate(over="ignore"):  # what overflows is refused by name
-        packed = xp.concatenate([value, xp.broadcast_to(first, missing)]).astype(dtype)
-    if not is_traced(value):
-        require_finite(name, packed, f"it overflows {packed.dtype}: rescale it, or use float64 under jax.enable_x64")
-        if name == "radius":
-            require_positive(name, packed, f"it underflows {packed.dtype}: rescale the scene or use float64")
-    return packed
-
-
 def _distance(value: Any, dtype: Any) -> Array | None:
     if value is None:
         return None
     if not is_traced(value) and not float(value) >= 0:
         raise ValueError(f"`splats_beyond` must be >= 0 or None, got {value!r}; it is a distance from the eye")
     return jnp.asarray(value, dtype)
-
-
-jax.tree_util.register_dataclass(
-    Points,
-    data_fields=["position", "radius", "color", "extinction", "valid", "attributes", "profile", "position_rest", "splats_beyond"],
-    meta_fields=["spread", "length_unit"],
-)

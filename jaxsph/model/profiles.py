@@ -9,7 +9,6 @@ meets it at $\sqrt{b^2 + t^2}$. A point ends where its radius does, whatever its
 from __future__ import annotations
 
 import abc
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.trees import tree
 
 FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -67,7 +67,7 @@ class Profile(abc.ABC):
         return self.through_centre()
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Gaussian(Profile):
     r"""$f(q) = \exp(-4.5 q^2)$, which the radius cuts off at three standard deviations (Kaehler et al. 2007, section 3.2)."""
 
@@ -82,7 +82,7 @@ class Gaussian(Profile):
         return (0.5 * math.sqrt(math.pi) / scale) * self.at_square(square) * between
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Ball(Profile):
     """f(q) = 1: the same everywhere inside."""
 
@@ -95,7 +95,7 @@ class Ball(Profile):
         return jnp.broadcast_to(end - start, jnp.broadcast_shapes(square.shape, start.shape, end.shape))
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Table(Profile):
     """Numbers at distances evenly spaced from the centre to the radius, linear between.
 
@@ -123,7 +123,7 @@ class Table(Profile):
         return 2 * self.values.max()
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("function",))
 class Shaped(Profile):
     """Any function of the offset, not necessarily the same in all directions.
 
@@ -204,9 +204,3 @@ def _sum(values: list[Array]) -> Array:
     for value in values[1:]:
         total = total + value
     return total
-
-
-for _constant in (Gaussian, Ball):
-    jax.tree_util.register_dataclass(_constant, data_fields=[], meta_fields=[])
-jax.tree_util.register_dataclass(Table, data_fields=["values"], meta_fields=[])
-jax.tree_util.register_dataclass(Shaped, data_fields=[], meta_fields=["function"])

@@ -5,19 +5,18 @@ Flow: project -> [projection] -> files, notebooks.
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import math
 import os
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.transfer.colormaps import colormap as colors_of
-from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.model.image import png_of
+from jaxsph.model.transfer.maps import colormap as colors_of
+from jaxsph.model.transfer.maps import value_range
+from jaxsph.numerics.trees import tree
 
 NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
@@ -25,7 +24,7 @@ SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels t
 EMPTY = 0  # of a picture, where there is no value
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("perspective", "name", "unit", "metadata"))
 class Projection:
     """Integrals along rays. Row 0 is the top, column 0 the left.
 
@@ -147,11 +146,7 @@ class Projection:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     def _repr_png_(self) -> bytes:
-        from PIL import Image as Pillow
-
-        buffer = io.BytesIO()
-        Pillow.fromarray(self.to_uint8()).save(buffer, format="PNG")
-        return buffer.getvalue()
+        return png_of(self.to_uint8())
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:
@@ -162,10 +157,3 @@ def _ends(values: np.ndarray) -> tuple[float, float]:
     shares = np.cumsum(positive / positive[-1])
     low, high = (float(positive[np.searchsorted(shares, share * shares[-1])]) for share in SHARES)
     return (low, high) if high > 1.001 * low else (0.5 * high, 2 * high)
-
-
-jax.tree_util.register_dataclass(
-    Projection,
-    data_fields=["values", "weight", "pixel_area", "faults"],
-    meta_fields=["perspective", "name", "unit", "metadata"],
-)

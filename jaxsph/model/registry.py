@@ -1,8 +1,9 @@
-"""What can be chosen by name, and where it is found: the one file that a new integrator or screen sampler is entered in.
+"""What can be chosen by name: integrators and screen samplers, which rooms above this one enter.
 
 Flow: settings -> [registry] -> stages.
 
-Entries are `module:name`, imported when they are used, so that this file knows no room above it.
+Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast` and
+`jaxsph.engine.screen`; any other package may enter its own.
 """
 
 from __future__ import annotations
@@ -11,18 +12,9 @@ import functools
 import importlib
 from typing import Any
 
-INTEGRATORS = {
-    "samples": "jaxsph.engine.cast.samples:PointSamples",
-    "segments": "jaxsph.engine.cast.segments:Segments",
-    "step_doubling": "jaxsph.engine.cast.step_doubling:StepDoubling",
-}
-"""Classes without arguments, each a `jaxsph.engine.cast.integrator.Integrator`; but for those of `AT_POINTS`."""
-AT_POINTS = {"step_doubling"}
-"""Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
-ESTIMATING = {"segments"}
-"""Integrators that estimate their error against the light integral, and are refined for a tolerance."""
-SCREENS = {"pixels": "jaxsph.engine.screen.pixels:EveryPixel", "quadtree": "jaxsph.engine.screen.quadtree:Quadtree"}
-"""Classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`."""
+INTEGRATORS: dict[str, str] = {}
+"""Classes, each a `jaxsph.engine.cast.integrator.Integrator`; without arguments, but for those that ask for points."""
+SCREENS: dict[str, str] = {}  # classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`
 
 
 def integrator(name: str, *arguments: Any) -> Any:
@@ -30,10 +22,14 @@ def integrator(name: str, *arguments: Any) -> Any:
     return _made(INTEGRATORS[name], *arguments)
 
 
-def between_samples(name: str) -> bool:
-    """Whether the integrator of that name has media tell of what lies between samples, too."""
-    module, _, kind = INTEGRATORS[name].partition(":")
-    return bool(getattr(importlib.import_module(module), kind).between)
+def integrator_class(name: str) -> Any:
+    """The class of the integrator of that name, which says what it needs: see `Integrator`."""
+    return _found(INTEGRATORS[name])
+
+
+def estimates(name: str) -> bool:
+    """Whether there is an integrator of that name that estimates its error, against the light integral."""
+    return name in INTEGRATORS and bool(integrator_class(name).estimates)
 
 
 def screen(name: str) -> Any:
@@ -43,5 +39,9 @@ def screen(name: str) -> Any:
 
 @functools.cache
 def _made(entry: str, *arguments: Any) -> Any:
+    return _found(entry)(*arguments)
+
+
+def _found(entry: str) -> Any:
     module, _, name = entry.partition(":")
-    return getattr(importlib.import_module(module), name)(*arguments)
+    return getattr(importlib.import_module(module), name)

@@ -1,13 +1,19 @@
-"""Scene: the parts that are looked at. A part that is absent is `None` and is neither traced nor paid for."""
+"""Scene: the parts that are looked at. A part that is absent is `None` and is neither traced nor paid for.
+
+Flow: user -> [scene] -> viewing -> access.
+
+All parts that have centres and radii are *spheres*, in one set, such that one grid finds what a ray can meet: particles come
+first, then the point sets one after the other. To the field of particles points are particles without volume, and to a point set
+all else is out of its range of numbers: each medium takes from a list what is its own.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips.clips import Clip, both
@@ -16,6 +22,7 @@ from jaxsph.model.particles import NOTHING, Particles
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.trees import tree
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
 MIXES = "extinction", "opacity"
@@ -28,7 +35,7 @@ class Formulas(NamedTuple):
     mix: str
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("mix",))
 class Scene:
     """What is in a scene, and what its quantities look like.
 
@@ -81,8 +88,13 @@ class Scene:
         volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")
-        if self.particles is not None and self.transfer is not None:
-            _require_looks(self.particles, self.transfer)
+        two_quantities = self.particles is not None and self.particles.extinction_quantity is not None
+        if two_quantities and self.transfer is not None and self.transfer.extinction_values is None:
+            raise ValueError(
+                "`particles` carry two quantities, but `transfer` looks up colour and extinction by one: give "
+                "`jaxsph.TransferFunction.from_points(..., extinction_values=...)`, control points in units of the second, or "
+                "`jaxsph.Particles.from_arrays` a single `quantity`"
+            )
         if self.particles is None and not volumes and not self.point_sets and not self.media:
             absent = "`particles`, `volume`, `points` and `media` are all absent"
             raise ValueError(f"{absent}; give `jaxsph.Scene` something to look at")
@@ -136,6 +148,43 @@ class Scene:
         return Particles(**entry | {"position": jnp.zeros((1, 3), self.dtype)}, valid=jnp.zeros(1, bool))
 
 
+def spheres_of(scene: Scene) -> Particles:
+    """Supports of particles, and points.
+
+    Differentiation:
+        By particles alone: where points can be met is held fixed.
+    """
+    points = [lax.stop_gradient(points.spheres()) for points in scene.point_sets]
+    sets = points if scene.particles is None and points else [scene.particle_set, *points]
+    if len(sets) == 1:
+        return sets[0]
+    dtype = scene.dtype
+    columns: dict[str, Any] = {
+        name: jnp.concatenate([one.columns.get(name, one.quantity).astype(dtype) for one in sets]) for name in sets[0].columns
+    }
+    rest = None
+    if any(one.position_rest is not None for one in sets):
+        rests = [jnp.zeros_like(one.position) if one.position_rest is None else one.position_rest for one in sets]
+        rest = jnp.concatenate([one.astype(dtype) for one in rests])
+    valid = jnp.concatenate([one.valid for one in sets])
+    return Particles(**columns, valid=valid, kernel=scene.formulas.kernel, position_rest=rest)
+
+
+def first_spheres(scene: Scene) -> tuple[int, ...]:
+    """Number of the first sphere of each point set, static."""
+    number = 0 if scene.particles is None else scene.particles.capacity
+    first = []
+    for points in scene.point_sets:
+        first.append(number)
+        number += points.capacity
+    return tuple(first)
+
+
+def num_spheres(scene: Scene) -> int:
+    """Entries of all sets, padding included, static; at least 1."""
+    return sum(one.capacity for one in ((scene.particles,) if scene.particles is not None else ()) + scene.point_sets) or 1
+
+
 def _require_one_unit(parts: dict[str, tuple[Any, ...]]) -> None:
     """Raise where parts were given in different units of length; those given as numbers are meant in that of the others."""
     units = {unit: name for name, of in parts.items() for one in of if (unit := getattr(one, "length_unit", None)) is not None}
@@ -144,24 +193,8 @@ def _require_one_unit(parts: dict[str, tuple[Any, ...]]) -> None:
         raise ValueError(f"all parts of a scene must have one unit of length, got {told}; convert positions to one unit")
 
 
-def _require_looks(particles: Particles, transfer: TransferFunction) -> None:
-    if particles.extinction_quantity is not None and transfer.extinction_values is None:
-        raise ValueError(
-            "`particles` carry two quantities, but `transfer` looks up colour and extinction by one: give "
-            "`jaxsph.TransferFunction.from_points(..., extinction_values=...)`, control points in units of the second, or "
-            "`jaxsph.Particles.from_arrays` a single `quantity`"
-        )
-
-
 def _all_of(part: Any) -> tuple[Any, ...]:
     """One part or several, as a tuple."""
     if part is None:
         return ()
     return part if isinstance(part, tuple) else (part,)
-
-
-jax.tree_util.register_dataclass(
-    Scene,
-    data_fields=["particles", "transfer", "media", "volume", "volume_transfer", "points", "within"],
-    meta_fields=["mix"],
-)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 import numbers
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.model.registry import ESTIMATING, INTEGRATORS, SCREENS
+from jaxsph.model.registry import INTEGRATORS, SCREENS, estimates
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
+NUMBERS = "tolerance", "relax", "min_transmittance"
 LEAF_PIXELS = 4, 8, 16, 32
 LEAF_ESTIMATORS = "hierarchical", "corner_variance", "uniform"  # see `screen.estimators`
 ALLOCATIONS = ("budget", "greedy")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@tree(traced=NUMBERS, unchecked=True, kw_only=True)
 class Settings:
     """Choices of the user; hashable where they fix a shape. `tolerance`, `relax` and `min_transmittance` are leaves, and floats.
 
@@ -80,7 +81,7 @@ class Settings:
     @property
     def is_refined(self) -> bool:
         """Whether samples are doubled along rays where a tolerance needs it."""
-        return self.tolerance is not None and self.integrator in ESTIMATING and self.screen == "pixels"
+        return self.tolerance is not None and estimates(self.integrator) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
         for name in NUMBERS:
@@ -148,25 +149,3 @@ def _number(name: str, value: Any) -> Any:
 def _is_number(value: Any) -> bool:
     """Whether `value` can be looked at: a number, not a tracer nor what a transformation puts in a leaf's place."""
     return not is_traced(value) and isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and np.ndim(value) == 0
-
-
-def _flatten(settings: Settings) -> tuple[list[Any], tuple[Any, ...]]:
-    return [getattr(settings, name) for name in NUMBERS], tuple(getattr(settings, name) for name in FIXED)
-
-
-def _flatten_with_keys(settings: Settings) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-    leaves, fixed = _flatten(settings)
-    return [(jax.tree_util.GetAttrKey(name), leaf) for name, leaf in zip(NUMBERS, leaves, strict=True)], fixed
-
-
-def _unflatten(fixed: tuple[Any, ...], leaves: Any) -> Settings:
-    """Unchecked, as transformations put things into leaves that are no numbers."""
-    settings = object.__new__(Settings)
-    for name, value in zip((*NUMBERS, *FIXED), (*leaves, *fixed), strict=True):
-        object.__setattr__(settings, name, value)
-    return settings
-
-
-NUMBERS = "tolerance", "relax", "min_transmittance"
-FIXED = tuple(field.name for field in dataclasses.fields(Settings) if field.name not in NUMBERS)
-jax.tree_util.register_pytree_with_keys(Settings, _flatten_with_keys, _unflatten, _flatten)

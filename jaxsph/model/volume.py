@@ -5,7 +5,6 @@ Flow: files, scenes, resampled particles -> [volume] -> field -> cast -> image.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -15,12 +14,12 @@ from jaxtyping import Array, Float, Num
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
+from jaxsph.numerics.trees import tree
 
-KEPT = ("uint8", "int8", "uint16", "int16")
-"""Integers that stay as they are in memory: float32 holds each of them exactly."""
+KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("length_unit",))
 class Volume:
     r"""A quantity given at the points $x = \text{lower} + (i, j, k) \cdot \text{spacing}$ of a grid; make it with `from_array`.
 
@@ -62,7 +61,11 @@ class Volume:
             ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
                 is not > 0 and finite, a `lower` that is not finite; masked arrays, units that cannot be converted.
         """
-        values, (lower, spacing, unit) = own("values", values), _place(lower, spacing)
+        values, (lower, unit) = own("values", values), with_unit("lower", lower)
+        if unit is None and not is_traced(lower) and not np.any(lower):  # the origin is it in any unit
+            spacing, unit = with_unit("spacing", spacing)
+        else:
+            spacing = in_unit("spacing", spacing, unit, of="lower")
         given = values if isinstance(values, jax.Array) else np.asarray(values)
         require_real("values", given)
         if given.ndim != 3:
@@ -75,7 +78,9 @@ class Volume:
         if not is_traced(given):
             _require_finite_values(given, "repair them, or give them a number that the transfer function does not show")
         with np.errstate(over="ignore"):  # what overflows is refused by name
-            packed = jnp.asarray(given, _kept_dtype(given.dtype))
+            wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
+            wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
+            packed = jnp.asarray(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
             _require_finite_values(packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
@@ -104,23 +109,6 @@ class Volume:
         return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
 
 
-def _place(lower: Any, spacing: Any) -> tuple[Any, Any, Any]:
-    """Where a grid is, and the unit of both: of `lower`, or of `spacing` where that is the origin, which is it in any unit."""
-    lower, unit = with_unit("lower", lower)
-    if unit is None and not is_traced(lower) and not np.any(lower):
-        return lower, *with_unit("spacing", spacing)
-    return lower, in_unit("spacing", spacing, unit, of="lower"), unit
-
-
-def _kept_dtype(given: Any) -> Any:
-    """Of values in memory: as given where that pays, else float32 or float64."""
-    if np.dtype(given).name in KEPT:
-        return given
-    if jnp.issubdtype(given, jnp.floating):
-        return jnp.promote_types(jax.dtypes.canonicalize_dtype(given), jnp.float32)
-    return jnp.float32
-
-
 def _require_finite_values(values: Any, remedy: str) -> None:
     """Raise `ValueError` with how many values are not finite, and the index of the first."""
     host = np.asarray(values)
@@ -145,6 +133,3 @@ def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:
         raise ValueError(f"`{name}` must have shape {shape}, got {given.shape}; {remedy}")
     require_finite(name, given, remedy)
     return np.broadcast_to(given, shape)
-
-
-jax.tree_util.register_dataclass(Volume, data_fields=["values", "lower", "spacing", "lower_rest"], meta_fields=["length_unit"])

@@ -63,10 +63,8 @@ def require_finite(name: str, value: Any, remedy: str = "remove or repair these 
     value = np.asarray(value)
     bad = ~np.isfinite(value)
     if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
-        entry = value[where] if where else value[()]
-        at = f"[{', '.join(map(str, where))}]" if where else ""
-        raise ValueError(f"`{name}` must be finite, but {int(bad.sum())} value(s) are not, first {name}{at} = {entry}; {remedy}")
+        first = _first(name, value, bad)
+        raise ValueError(f"`{name}` must be finite, but {int(bad.sum())} value(s) are not, first {first}; {remedy}")
 
 
 def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True) -> None:
@@ -74,10 +72,14 @@ def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True)
     value = np.asarray(value)
     bad = ~(value > 0) if strict else ~(value >= 0)
     if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
-        entry = value[where] if where else value[()]
-        at = f"[{', '.join(map(str, where))}]" if where else ""
-        raise ValueError(f"`{name}` must be {'> 0' if strict else '>= 0'}, but {name}{at} = {entry}; {remedy}")
+        raise ValueError(f"`{name}` must be {'> 0' if strict else '>= 0'}, but {_first(name, value, bad)}; {remedy}")
+
+
+def _first(name: str, value: np.ndarray, bad: np.ndarray) -> str:
+    """The first of bad entries, with its index if it has one."""
+    where = tuple(int(i) for i in np.argwhere(bad)[0])
+    at = f"[{', '.join(map(str, where))}]" if where else ""
+    return f"{name}{at} = {value[where]}"
 
 
 def rounded_into(name: str, value: Any, ends: tuple[float, float], remedy: str) -> Any:
@@ -89,15 +91,10 @@ def rounded_into(name: str, value: Any, ends: tuple[float, float], remedy: str) 
     slack = 0.0
     if np.issubdtype(given.dtype, np.floating):
         finite = np.abs(given[np.isfinite(given)], dtype=np.float64)
-        slack = (
-            ROUNDED
-            * float(np.finfo(jax.dtypes.canonicalize_dtype(given.dtype)).eps)
-            * max(finite.max(initial=0), 0 if np.isinf(ends[1]) else ends[1])
-        )
+        eps = float(np.finfo(jax.dtypes.canonicalize_dtype(given.dtype)).eps)
+        slack = ROUNDED * eps * max(finite.max(initial=0), 0 if np.isinf(ends[1]) else ends[1])
     bad = np.abs(given.astype(np.float64) - kept.astype(np.float64)) > slack
     if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
-        low, high = ends
-        wanted = f">= {low:g}" if np.isinf(high) else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"`{name}` must be {wanted}, but {name}[{', '.join(map(str, where))}] = {given[where]}; {remedy}")
+        wanted = f">= {ends[0]:g}" if np.isinf(ends[1]) else f"in [{ends[0]:g}, {ends[1]:g}]"
+        raise ValueError(f"`{name}` must be {wanted}, but {_first(name, given, bad)}; {remedy}")
     return kept

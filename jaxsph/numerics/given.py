@@ -81,9 +81,12 @@ def in_unit(name: str, value: Any, unit: Any, power: int = 1, of: str = "positio
     if unit is None:
         return plain(name, value, f"`{of}` has no unit to convert it to")
     _require_whole(name, value)
-    wanted = _to_power(unit, power)
+    wanted = unit
+    if power != 1:
+        wanted = f"{unit}**{power}" if isinstance(unit, str) else unit**power
     try:
-        return _native(_numbers(value) if _same(given, wanted) else _converted(value, wanted))
+        same = type(given) is type(wanted) and bool(given == wanted)
+        return _native(_numbers(value) if same else _converted(value, wanted))
     except Exception as error:  # libraries of units have errors of their own
         raise ValueError(
             f"`{name}` is in {given}, which cannot be converted to {wanted}, as `{of}` is in {unit}; "
@@ -150,16 +153,6 @@ def _pure(value: Any, unit: Any) -> Any:
         return None if isinstance(unit, str) else _converted(value, unit**0)
     except Exception:  # libraries of units have errors of their own
         return None
-
-
-def _to_power(unit: Any, power: int) -> Any:
-    if power == 1:
-        return unit
-    return f"{unit}**{power}" if isinstance(unit, str) else unit**power
-
-
-def _same(unit: Any, other: Any) -> bool:
-    return type(unit) is type(other) and bool(unit == other)
 
 
 def _converted(value: Any, unit: Any) -> Any:

@@ -9,7 +9,7 @@ module, so that the methods are there whatever of the package is imported.
 from jaxsph.io import read_camera_path, read_transfer, write_camera_path, write_image, write_projection, write_transfer
 from jaxsph.model import CameraPath, Image, TransferFunction
 from jaxsph.model.projection import Projection
-from jaxsph.model.transfer.presets import preset
+from jaxsph.model.transfer.looks import preset
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.plot.transfer_figure import transfer_figure
 

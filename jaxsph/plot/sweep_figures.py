@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
-from jaxsph.model.registry import ESTIMATING
+from jaxsph.model import registry
 from jaxsph.trade.contenders import ESTIMATORS, FULL_RATE
 from jaxsph.trade.measurement import Measurement
 
@@ -54,7 +54,7 @@ class Point:
     @property
     def kept(self) -> float | None:
         """The error that its tolerance is held against; None where it was not measured."""
-        return self.integral if self.method in ESTIMATING else self.error
+        return self.integral if registry.estimates(self.method) else self.error
 
 
 def require_matplotlib() -> None:
@@ -190,7 +190,7 @@ def _error(points: Sequence[Point], title: str) -> Any:
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
             axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
-    of_others = "\n(segments: the light integral)" if any(point.method in ESTIMATING for point in controlled) else ""
+    of_others = "\n(segments: the light integral)" if any(registry.estimates(point.method) for point in controlled) else ""
     axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.reference.where import lines, ray_coordinates
 
 MOST_CANDIDATES = 1 << 20  # pairs of a ray and a sphere that are looked at at once
 
@@ -35,14 +36,12 @@ class Rays(NamedTuple):
     @property
     def start(self) -> Float[np.ndarray, "rays 3"]:
         """Places at depth 0."""
-        aside = np.stack([self.u, self.v, np.zeros_like(self.u)], -1)
-        return np.zeros_like(aside) if self.is_perspective else aside
+        return lines(self.u, self.v, self.is_perspective)[0]
 
     @property
     def direction(self) -> Float[np.ndarray, "rays 3"]:
         """Change of place a unit of depth."""
-        ahead = np.stack([np.zeros_like(self.u), np.zeros_like(self.u), np.ones_like(self.u)], -1)
-        return ahead + np.stack([self.u, self.v, np.zeros_like(self.u)], -1) if self.is_perspective else ahead
+        return lines(self.u, self.v, self.is_perspective)[1]
 
     @property
     def slant(self) -> Float[np.ndarray, " rays"]:
@@ -56,9 +55,7 @@ class Rays(NamedTuple):
 
 def rays_of(camera: Camera, rows: Int[np.ndarray, " rays"], columns: Int[np.ndarray, " rays"]) -> Rays:
     """The rays through the middles of pixels."""
-    half = float(camera.half_height)
-    u = half * camera.width / camera.height * (2 * (columns + 0.5) / camera.width - 1)
-    v = half * (1 - 2 * (rows + 0.5) / camera.height)
+    u, v = ray_coordinates(camera, columns + 0.5, rows + 0.5)
     return Rays(u, v, float(camera.near), float(camera.far), camera.is_perspective)
 
 

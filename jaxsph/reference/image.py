@@ -23,7 +23,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.points import thickness
-from jaxsph.reference.where import columns_of, to_world
+from jaxsph.reference.where import columns_of, ray_coordinates, to_view, to_world
 from jaxsph.reference.where import inside as within
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
@@ -57,7 +57,10 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
     quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
-    edges, lengths = _depth(camera, np.arange(settings.samples + 1), settings.samples), _ray_lengths(camera, every)
+    u, v = _ray_coordinates(camera, every)
+    square = 1 + u[None, :] ** 2 + v[:, None] ** 2
+    lengths = np.sqrt(square) if camera.is_perspective else np.ones_like(square)  # path length a unit of depth
+    edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
     places = None
     if scene.particles_within is not None:
         places = _world(camera, settings.samples, every)
@@ -66,7 +69,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     others = [
         _in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths) for volume, look in scene.volumes
     ]
-    others += [_of_points(points, camera, every, edges) for points in scene.point_sets]
+    others += [_of_points(points, camera, u, v, edges) for points in scene.point_sets]
     parts += others if scene.within is None or places is None else [_clipped(one, within(scene.within, places)) for one in others]
     color, transmittance, depth = _composite(parts, edges, lengths.shape, scene.mix)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
@@ -103,12 +106,12 @@ def _fields(
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
     kernel = kernels.by_name(scene.particle_set.kernel)
-    position, support, quantities, volume = _particles(scene, camera)
+    position, support, volume, *quantities = columns_of(scene.particle_set)
     strength = volume / support**3
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
     shape = (len(v), len(u), samples)
     numerators, denominator, evaluations = [np.zeros(shape) for _ in quantities], np.zeros(shape), np.zeros(shape, np.int32)
-    for (x, y, z), h, m, *carried in zip(position, support, strength, *quantities, strict=True):
+    for (x, y, z), h, m, *carried in zip(to_view(position, camera), support, strength, *quantities, strict=True):
         rows, columns, depths = _box(x, y, z, h, u, v, s, camera.is_perspective) if cull else (slice(None),) * 3
         dx = (spread[depths] * u[columns, None] - x) / h
         dy = (spread[depths] * v[rows, None] - y) / h
@@ -121,25 +124,9 @@ def _fields(
     return numerators, denominator, evaluations
 
 
-def _particles(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
-    position, support, volume, *quantities = columns_of(scene.particle_set)
-    view = (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    return view, support, quantities, volume
-
-
 def _ray_coordinates(camera: Camera, every: int) -> tuple[np.ndarray, np.ndarray]:
-    half, pixels = float(camera.half_height), slice(every // 2, None, every)
-    u = half * camera.width / camera.height * (2 * (np.arange(camera.width) + 0.5) / camera.width - 1)
-    v = half * (1 - 2 * (np.arange(camera.height) + 0.5) / camera.height)
-    return u[pixels], v[pixels]
-
-
-def _ray_lengths(camera: Camera, every: int) -> np.ndarray:
-    """|d|: path length a unit of depth, (height, width)."""
-    u, v = _ray_coordinates(camera, every)
-    if not camera.is_perspective:
-        return np.ones((len(v), len(u)))
-    return np.sqrt(1 + u[None, :] ** 2 + v[:, None] ** 2)
+    u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return u[every // 2 :: every], v[every // 2 :: every]
 
 
 def _depth(camera: Camera, u: np.ndarray, samples: int) -> np.ndarray:
@@ -198,16 +185,20 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
 def _in_medium(
     quantities: list[np.ndarray], inside: np.ndarray, transfer: TransferFunction, edges: np.ndarray, lengths: np.ndarray
 ) -> Part:
+    """Colour is looked up by the first quantity, extinction by the last."""
+    of_extinction = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+
     def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
-        color, extinction = _look_up(transfer, [quantity[..., i] for quantity in quantities])
+        color = _interpolated(transfer.values, transfer.colors, quantities[0][..., i])
+        extinction = _interpolated(of_extinction, transfer.extinction[:, None], quantities[-1][..., i])[..., 0]
         own = np.where(inside[..., i], extinction, 0) * (edges[i + 1] - edges[i]) * lengths
         return own, own[..., None] * color
 
     return sample
 
 
-def _of_points(points: Points, camera: Camera, every: int, edges: np.ndarray) -> Part:
-    total, colored = thickness(points, camera, *_ray_coordinates(camera, every), edges)
+def _of_points(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edges: np.ndarray) -> Part:
+    total, colored = thickness(points, camera, u, v, edges)
     return lambda i: (total[..., i], colored[..., i, :])
 
 
@@ -231,13 +222,6 @@ def _composite(parts: list[Part], edges: np.ndarray, shape: tuple[int, ...], mix
         depth = np.where(crossed, edges[i] + place * (edges[i + 1] - edges[i]), depth)
         transmittance = behind
     return color, transmittance, depth
-
-
-def _look_up(transfer: TransferFunction, quantities: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Colour by the first quantity, extinction by the last."""
-    of_extinction = transfer.values if transfer.extinction_values is None else transfer.extinction_values
-    colors = _interpolated(transfer.values, transfer.colors, quantities[0])
-    return colors, _interpolated(of_extinction, transfer.extinction[:, None], quantities[-1])[..., 0]
 
 
 def _interpolated(points: Any, given: Any, quantity: np.ndarray) -> np.ndarray:

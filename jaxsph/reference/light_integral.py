@@ -8,6 +8,7 @@ $I = \int T(l)\,c(l)\,\sigma(l)\,dl$ over the path length l, with $T(l) = \exp(-
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from jaxtyping import Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.numerics.checks import Progress
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import AtNodes, Light, light_of, where_thickness
 from jaxsph.reference.media import Part, Whole, parts_of
@@ -37,7 +37,7 @@ def integral(
     pixels: tuple[Any, Any] | None = None,
     every: int = 1,
     tolerance: float = 1e-7,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Image:
     r"""The light integral along rays between `camera.near` and `camera.far`, by quadrature of a known error.
 
@@ -81,27 +81,27 @@ def integral(
         raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
     rows, columns = _pixels(camera, pixels, every)
     rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
-    found, counts = _all(rays, parts, tolerance, progress or (lambda done, total: None))
+    found, counts = _all(rays, parts, tolerance, progress)
     color: Any = found[:, :3].reshape(*rows.shape, 3)
     transmittance, depth, error, evaluations = found[:, 3:].T.reshape(4, *rows.shape)
-    stats = _stats(found, counts) | {"seconds": {"cast": time.perf_counter() - started}}
+    total = int(found[:, 6].sum())
+    stats: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
+    stats |= {"rays": len(found), "chords": int(counts[0]), "portions": int(counts[1])}
+    stats |= {"seconds": {"cast": time.perf_counter() - started}}
     return Image(color, transmittance, depth, error, evaluations, False, 0, stats)
 
 
-def _all(rays: Rays, parts: list[Whole], tolerance: float, told: Progress) -> tuple[np.ndarray, np.ndarray]:
+def _all(
+    rays: Rays, parts: list[Whole], tolerance: float, progress: Callable[[int, int], None] | None
+) -> tuple[np.ndarray, np.ndarray]:
     """See `_block`."""
     found, counts, done = np.empty((len(rays.u), 7)), np.zeros(2, int), 0
     for some in blocks(rays, BLOCK):
         found[some], more = _block(rays.some(some), parts, tolerance)
         counts, done = counts + more, done + len(some)
-        told(done, len(rays.u))
+        if progress is not None:
+            progress(done, len(rays.u))
     return found, counts
-
-
-def _stats(found: np.ndarray, counts: np.ndarray) -> dict[str, Any]:
-    total = int(found[:, 6].sum())
-    of_image = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
-    return of_image | {"rays": len(found), "chords": int(counts[0]), "portions": int(counts[1])}
 
 
 def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple[Int[np.ndarray, "..."], Int[np.ndarray, "..."]]:
@@ -154,7 +154,7 @@ def _refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float
 
     light = look(portions)
     for turn in range(ROUNDS):
-        error = light.error * _in_front(portions, light)
+        error = light.error * np.exp(-_thickness_before(portions, light))
         number = np.bincount(portions.ray, minlength=count)
         wanting = (np.bincount(portions.ray, error, count) > tolerance) & (number < MOST_PORTIONS)
         long = portions.end - portions.start > SHORTEST * np.abs(portions.end)
@@ -186,13 +186,8 @@ def _split(portions: Portions, crossing: np.ndarray, parts: list[Part], turn: in
     return where
 
 
-def _in_front(portions: Portions, light: Light) -> np.ndarray:
-    """Transmittance of all of a ray in front of each of its portions."""
-    return np.exp(-_thickness_before(portions, light))
-
-
 def _thickness_before(portions: Portions, light: Light) -> np.ndarray:
-    """Ray by ray: a sum over all would lose digits behind a wall."""
+    """Optical thickness of all of a ray in front of each of its portions; ray by ray, as digits are lost behind walls."""
     first = np.searchsorted(portions.ray, portions.ray)
     place = np.arange(len(portions.ray)) - first
     table = np.zeros((portions.ray.max(initial=-1) + 1, place.max(initial=-1) + 2))

@@ -22,7 +22,7 @@ from jaxsph.reference.chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference.points import at_offset, kinks
 from jaxsph.reference.portions import Cuts, Lists, Portions, borders, lists
-from jaxsph.reference.where import columns_of, crossings, inside
+from jaxsph.reference.where import columns_of, crossings, inside, to_view
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 
@@ -70,15 +70,10 @@ def parts_of(scene: Scene, camera: Camera) -> list[Whole]:
     parts: list[Whole] = []
     if scene.particles is not None and scene.transfer is not None:
         own: Whole = AllParticles(scene.particles, scene.transfer, camera)
-        parts.append(own if scene.particles_within is None else AllWithin(own, scene.particles_within, camera))
+        parts.append(own if scene.particles_within is None else _AllWithin(own, scene.particles_within, camera))
     others: list[Whole] = [AllOfVolume(volume, look, camera) for volume, look in scene.volumes]
     others += [AllPoints(points, camera) for points in scene.point_sets]
-    return parts + [one if scene.within is None else AllWithin(one, scene.within, camera) for one in others]
-
-
-def to_view(position: np.ndarray, camera: Camera) -> np.ndarray:
-    """World to view coordinates of places (n, 3)."""
-    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    return parts + [one if scene.within is None else _AllWithin(one, scene.within, camera) for one in others]
 
 
 class AllParticles(Whole):
@@ -95,34 +90,37 @@ class AllParticles(Whole):
 
     def seen_by(self, rays: Rays) -> Part:
         """See `Whole`."""
-        return ParticlesMet(self, rays)
+        return _ParticlesMet(self, rays)
 
 
-class ParticlesMet(Part):
+class _MetByChords(Part):
+    """What is made of spheres, as some rays meet it."""
+
+    def __init__(self, spheres: Spheres, rays: Rays):
+        self._rays, self.chords = rays, spheres.chords(rays)
+
+    def lies_over(self, roots: Portions) -> np.ndarray:
+        self._lists: Lists = lists(self._rays, roots, self.chords)
+        return self._lists.length > 0
+
+    def keep(self, which: np.ndarray) -> None:
+        self._lists = self._lists.some(which)
+
+
+class _ParticlesMet(_MetByChords):
     """Particles that some rays meet."""
 
     def __init__(self, whole: AllParticles, rays: Rays):
-        self._whole, self._rays = whole, rays
-        self.chords = whole.spheres.chords(rays)
+        super().__init__(whole.spheres, rays)
+        self._whole = whole
         self._scale = rays.slant[self.chords.ray] / whole.support[self.chords.sphere]
         self._strength = whole.strength[self.chords.sphere]
         self._quantities = [quantity[self.chords.sphere] for quantity in whole.quantities]
 
     def cuts(self) -> Cuts:
-        """See `Part`."""
         return borders(self.chords, 1 / self._scale)
 
-    def lies_over(self, roots: Portions) -> np.ndarray:
-        """See `Part`."""
-        self._lists = lists(self._rays, roots, self.chords)
-        return self._lists.length > 0
-
-    def keep(self, which: np.ndarray) -> None:
-        """See `Part`."""
-        self._lists = self._lists.some(which)
-
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        """See `Part`."""
         count = self._lists.length[portions.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
@@ -154,7 +152,6 @@ class ParticlesMet(Part):
         return found
 
     def border_by(self, portions: Portions) -> np.ndarray:
-        """See `Part`."""
         which, chord = self._lists.over(portions.root)
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
@@ -176,18 +173,17 @@ def _filled(quantity: np.ndarray) -> np.ndarray:
     return quantity
 
 
-class AllWithin(Whole):
+class _AllWithin(Whole):
     """A part in a clip alone."""
 
     def __init__(self, whole: Whole, clip: Clip, camera: Camera):
         self.clip, self._whole, self._axes, self._eye = clip, whole, np.asarray(camera.axes, np.float64), camera.exact_eye()
 
     def seen_by(self, rays: Rays) -> Part:
-        """See `Whole`."""
-        return MetWithin(self._whole.seen_by(rays), self.clip, rays.start @ self._axes + self._eye, rays.direction @ self._axes)
+        return _MetWithin(self._whole.seen_by(rays), self.clip, rays.start @ self._axes + self._eye, rays.direction @ self._axes)
 
 
-class MetWithin(Part):
+class _MetWithin(Part):
     """A part in a clip, as some rays meet it; portions are cut where rays may pass its faces, so that each is in it or not."""
 
     def __init__(self, part: Part, clip: Clip, start: np.ndarray, direction: np.ndarray):
@@ -196,25 +192,21 @@ class MetWithin(Part):
         self._shown: np.ndarray = np.zeros(0, bool)
 
     def cuts(self) -> Cuts:
-        """See `Part`."""
         depth = crossings(self._clip, self._start, self._direction)
         ray, place = np.nonzero(~np.isnan(depth))
         rays, depths = self._part.cuts()
         return np.concatenate([rays, ray]), np.concatenate([depths, depth[ray, place]])
 
     def lies_over(self, roots: Portions) -> np.ndarray:
-        """See `Part`."""
         middle = (roots.start + roots.end) / 2
         self._shown = inside(self._clip, self._start[roots.ray] + middle[:, None] * self._direction[roots.ray])
         return self._part.lies_over(roots) & self._shown
 
     def keep(self, which: np.ndarray) -> None:
-        """See `Part`."""
         self._shown = self._shown[which]
         self._part.keep(which)
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        """See `Part`."""
         some = np.flatnonzero(self._shown[portions.root])
         part = dataclasses.replace(seen, **{name: column[..., some] for name, column in vars(seen).items()})
         self._part.add(part, portions.some(some))
@@ -222,7 +214,6 @@ class MetWithin(Part):
             column[..., some] = getattr(part, name)
 
     def border_by(self, portions: Portions) -> np.ndarray:
-        """See `Part`."""
         return self._part.border_by(portions)
 
 
@@ -237,10 +228,10 @@ class AllOfVolume(Whole):
     def seen_by(self, rays: Rays) -> Part:
         """See `Whole`."""
         start = (rays.start @ self._axes + self._eye - self._lower) / self._spacing
-        return VolumeMet(self, rays, start, rays.direction @ self._axes / self._spacing)
+        return _VolumeMet(self, rays, start, rays.direction @ self._axes / self._spacing)
 
 
-class VolumeMet(Part):
+class _VolumeMet(Part):
     """A volume that some rays meet; they are given in its lattice."""
 
     def __init__(self, whole: AllOfVolume, rays: Rays, start: np.ndarray, direction: np.ndarray):
@@ -263,13 +254,11 @@ class VolumeMet(Part):
         return ray, depth[ray, place]
 
     def lies_over(self, roots: Portions) -> np.ndarray:
-        """See `Part`."""
         at = self._at(roots.ray, (roots.start + roots.end) / 2)
         self._over = np.all((at >= 0) & (at <= self._last), axis=-1)
         return self._over
 
     def keep(self, which: np.ndarray) -> None:
-        """See `Part`."""
         self._over = self._over[which]
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
@@ -304,15 +293,15 @@ class AllPoints(Whole):
 
     def seen_by(self, rays: Rays) -> Part:
         """See `Whole`."""
-        return PointsMet(self, rays)
+        return _PointsMet(self, rays)
 
 
-class PointsMet(Part):
+class _PointsMet(_MetByChords):
     """Points that some rays meet."""
 
     def __init__(self, whole: AllPoints, rays: Rays):
-        self._whole, self._rays = whole, rays
-        self.chords = whole.spheres.chords(rays)
+        super().__init__(whole.spheres, rays)
+        self._whole = whole
 
     def cuts(self) -> Cuts:
         """Ends, feet, and where rays cross spheres at which a profile may have a kink."""
@@ -326,17 +315,7 @@ class PointsMet(Part):
         depths += [chords.entry, chords.exit]
         return np.tile(chords.ray, len(depths)), np.concatenate(depths)
 
-    def lies_over(self, roots: Portions) -> np.ndarray:
-        """See `Part`."""
-        self._lists: Lists = lists(self._rays, roots, self.chords)
-        return self._lists.length > 0
-
-    def keep(self, which: np.ndarray) -> None:
-        """See `Part`."""
-        self._lists = self._lists.some(which)
-
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        """See `Part`."""
         for some in self._lists.batches(portions.root):
             self._add(seen, some, portions.some(some))
 

@@ -5,7 +5,6 @@ Flow: Points, rays, borders of samples -> [points] -> image.
 
 from __future__ import annotations
 
-import itertools
 from typing import NamedTuple
 
 import jax
@@ -15,8 +14,7 @@ import numpy as np
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
-
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
+from jaxsph.reference.where import integral_across, lines
 
 
 class Chords(NamedTuple):
@@ -51,7 +49,8 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
         Kaehler, Abel & Hege 2007, section 3.2, for the spreads "feet" and "centres".
     """
     total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
-    directions, starts = _rays(camera, u, v)
+    across, down = np.meshgrid(u, v)
+    starts, directions = lines(across, down, camera.is_perspective)
     axes, center = np.asarray(camera.axes, np.float64), points.exact_position() - camera.exact_eye()
     for point in np.flatnonzero(np.asarray(points.valid)):
         radius, middle = float(points.radius[point]), axes @ center[point]
@@ -78,13 +77,6 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
     return total, colored
 
 
-def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions a unit of depth, and places at depth 0, in view space; (height, width, 3) each."""
-    aside = np.stack([*np.meshgrid(u, v), np.zeros((len(v), len(u)))], -1)
-    ahead = np.broadcast_to(np.array([0.0, 0.0, 1.0]), aside.shape)
-    return (aside + ahead, np.zeros_like(aside)) if camera.is_perspective else (ahead, aside)
-
-
 def _spread(points: Points, middle: np.ndarray, perspective: bool) -> str:
     away = np.linalg.norm(middle) if perspective else middle[2]
     is_splat = points.splats_beyond is not None and away > float(points.splats_beyond)
@@ -93,25 +85,16 @@ def _spread(points: Points, middle: np.ndarray, perspective: bool) -> str:
 
 def _integral(profile: Profile, chords: Chords, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Of the profile along rays from `start` to `end`, (rays, samples), in radii; split where a profile may have a kink."""
-    square = (chords.foot**2).sum(-1)[:, None]
-    rings = np.sqrt(np.maximum(kinks(profile)[:, None, None] ** 2 - square, 0))
-    breaks = [*-rings[::-1], *rings]
-    total = np.zeros(np.broadcast_shapes(start.shape, end.shape))
-    for low, high in itertools.pairwise(breaks):
-        first, last = np.clip(start, low, high), np.clip(end, low, high)
-        for node, weight in zip(NODES, WEIGHTS, strict=True):
-            total += weight * (last - first) / 2 * _value(profile, chords, (first + last) / 2 + node * (last - first) / 2)
-    return total
+
+    def value(t: np.ndarray) -> np.ndarray:
+        return at_offset(profile, chords.foot[:, None] + t[..., None] * chords.direction[:, None], chords.attributes)
+
+    return integral_across(kinks(profile), (chords.foot**2).sum(-1)[:, None], start, end, value)
 
 
 def kinks(profile: Profile) -> np.ndarray:
     """Distances in [0, 1] between which a profile is smooth, from 0 to 1."""
     return np.linspace(0, 1, profile.values.shape[0]) if isinstance(profile, Table) else np.array([0.0, 1.0])
-
-
-def _value(profile: Profile, chords: Chords, t: np.ndarray) -> np.ndarray:
-    """A profile at places along rays, (rays, samples)."""
-    return at_offset(profile, chords.foot[:, None] + t[..., None] * chords.direction[:, None], chords.attributes)
 
 
 def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.ndarray]) -> np.ndarray:

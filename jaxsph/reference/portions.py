@@ -67,11 +67,9 @@ Cuts = tuple[np.ndarray, np.ndarray]
 def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
     """Entries and exits that rays are cut at from the start.
 
-    Those where the union of all chords of a ray begins or ends, as the medium does there: all of them, and where less than
-    `FEW` chords are on one side, as a mean of few may change quickly. Of the others, where
-    only a higher derivative jumps and which are cut at where the error demands it, the first in each of the bins that are
-    `LONGEST` of a support long (of the power of two below it): no chord of more than that lies within a single portion, so that
-    none is overlooked between nodes.
+    All where less than `FEW` chords are on one side: there the medium begins or ends, or a mean of few may change quickly. At the
+    others only a higher derivative jumps, and rays are cut where the error demands it. Of these the first in each of the bins
+    that are `LONGEST` of a support long (of the power of two below it): so no longer chord is overlooked between nodes.
     """
     ray, depth = np.tile(chords.ray, 2), np.concatenate([chords.entry, chords.exit])
     step = np.repeat([1, -1], len(chords.ray))

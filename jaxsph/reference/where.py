@@ -1,14 +1,15 @@
-"""Where a scene is shown, in float64 NumPy: clips at points and along rays, and periodic sets as explicit copies.
+"""Where things are, in float64 NumPy: rays, views, clips at points and along rays, and periodic sets as explicit copies.
 
-Flow: scene -> [where] -> image, media.
+Flow: scene, camera -> [where] -> image, chords, points, columns, media.
 
-Written apart from `model.clips`, `model.clip_shapes` and `model.periodic`, which are judged by it: in world space, with all
-copies of all particles.
+Written apart from `model.camera`, `model.clips`, `model.clip_shapes` and `model.periodic`, which are judged by it: clips in world
+space, periodic sets with all copies of all particles.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,51 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.particles import Particles
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
+
+
+def ray_coordinates(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lateral coordinates u and v of rays, by image-space coordinates: the middle of pixel c is at c + 1/2."""
+    half = float(camera.half_height)
+    return half * camera.width / camera.height * (2 * columns / camera.width - 1), half * (1 - 2 * rows / camera.height)
+
+
+def lines(u: np.ndarray, v: np.ndarray, is_perspective: bool) -> tuple[Float[np.ndarray, "... 3"], Float[np.ndarray, "... 3"]]:
+    """Of rays in view space: places at depth 0, and change of place a unit of depth."""
+    aside = np.stack([u, v, np.zeros_like(u)], -1)
+    ahead = np.broadcast_to(np.array([0.0, 0.0, 1.0]), aside.shape)
+    return (np.zeros_like(aside), aside + ahead) if is_perspective else (aside, ahead)
+
+
+def to_view(position: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
+    """World to view coordinates."""
+    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+
+
+def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
+    """World coordinates of view coordinates."""
+    return place @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
+
+
+def integral_across(
+    kinks: np.ndarray, square: np.ndarray, start: np.ndarray, end: np.ndarray, value: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Integral along rays from t = `start` to `end`, counted from the foot of a centre; by Gauss-Legendre quadrature.
+
+    Args:
+        kinks: distances from the centre, ascending from 0, between which what is integrated is smooth.
+        square: of the distance of the foot.
+        start, end: within the last kink, or cut off there.
+        value: at t.
+    """
+    rings = np.sqrt(np.maximum(kinks.reshape(-1, *[1] * square.ndim) ** 2 - square, 0))
+    total = np.zeros(np.broadcast_shapes(start.shape, end.shape))
+    for low, high in itertools.pairwise([*-rings[::-1], *rings]):
+        first, last = np.clip(start, low, high), np.clip(end, low, high)
+        for node, weight in zip(NODES, WEIGHTS, strict=True):
+            total += weight * (last - first) / 2 * value((first + last) / 2 + node * (last - first) / 2)
+    return total
 
 
 def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
@@ -84,11 +130,6 @@ def places_of(particles: Particles) -> tuple[Float[np.ndarray, "places 3"], Int[
     reaching = [gap < support for gap in away]
     places = np.concatenate([copy[which] for copy, which in zip(copies, reaching, strict=True)])
     return places, np.concatenate([entry[which] for which in reaching])
-
-
-def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
-    """World coordinates of view coordinates."""
-    return place @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
 
 
 def _exact(near: Any, rest: Any) -> np.ndarray:

@@ -19,15 +19,21 @@ from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
 from jaxsph.model.transfer import looks as appearance
-from jaxsph.model.transfer.looks import colormap, default_transfer, default_volume_transfer, opacity_by_second
-from jaxsph.model.transfer.presets import domain_transfer, fitted, preset
+from jaxsph.model.transfer.looks import (
+    colormap,
+    default_transfer,
+    default_volume_transfer,
+    domain_transfer,
+    fitted,
+    opacity_by_second,
+    preset,
+)
 from jaxsph.scenes import cosmos, fields
 from jaxsph.scenes.checker_board import checker_board
-from jaxsph.scenes.dam_break import dam_break
 from jaxsph.scenes.flubber import flubber
 from jaxsph.scenes.letters import letters
-from jaxsph.scenes.mixer import mixer
 from jaxsph.scenes.radial import radial
+from jaxsph.scenes.simulated import dam_break, mixer
 
 __all__ = [
     "appearance",

@@ -6,19 +6,14 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
+from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
 from jaxsph.scenes.view import looking_at_box
 
 PARTICLES = 100_000
-CUBES = 5
-"""Cubes along each axis."""
-
-FRONT = 0.01
-"""Width of the front between cubes in frame 0, over the edge of the board."""
-
-SPREAD = 0.0004
-"""What a frame adds to the square of that width."""
+CUBES = 5  # cubes along each axis
+FRONT = 0.01  # width of the front between cubes in frame 0, over the edge of the board
+SPREAD = 0.0004  # what a frame adds to the square of that width
 
 
 def checker_board(
@@ -28,28 +23,14 @@ def checker_board(
 
     Frame 0 has sharp fronts, later ones diffuse (any number >= 0, fractions too); `None` is frame 2.
     """
-    moment = 2.0 if frame is None else float(frame)
-    if not (np.isfinite(moment) and moment >= 0):
-        raise ValueError(f"`frame` of scene 'checker_board' must be >= 0 and finite, got {frame!r}")
+    moment = moment_of("checker_board", frame, 2.0)
     count = PARTICLES if particles is None else particles
     position = scatter(np.zeros(3), np.ones(3), count, seed)
     spacing = (1.0 / count) ** (1 / 3)
-    fluid = Particles.from_arrays(
-        position.astype(np.float32),
-        SUPPORT_IN_SPACINGS * spacing,
-        concentration(position, moment).astype(np.float32),
-        spacing**3,
-    )
+    fluid = fluid_of(position, concentration(position, moment), spacing)
     transfer = TransferFunction.from_points(
         values=[0.0, 0.1, 0.3, 0.5, 0.75, 1.0],
-        colors=[
-            (0.2, 0.3, 0.5),
-            (0.35, 0.35, 0.95),
-            (0.15, 0.7, 0.75),
-            (0.35, 0.85, 0.3),
-            (1.0, 0.8, 0.2),
-            (1.0, 0.3, 0.15),
-        ],
+        colors=[(0.2, 0.3, 0.5), (0.35, 0.35, 0.95), (0.15, 0.7, 0.75), (0.35, 0.85, 0.3), (1.0, 0.8, 0.2), (1.0, 0.3, 0.15)],
         extinction=[0.15, 3.0, 5.0, 6.0, 7.0, 8.0],
     )
     camera = looking_at_box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-0.55, -0.45, -1.0), fluid, width, height)

@@ -5,19 +5,14 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
+from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
 from jaxsph.scenes.view import looking_at_box
 
 PARTICLES = 100_000
-BALL = 0.5
-"""Radius of each fluid's ball in frame 0; the two touch at the centre."""
-
-TILT = np.radians(40.0)
-"""Between the axes of the two rotations, which makes sheets of what would be a flat spiral."""
-
-RATES = (0.9, 0.5)
-"""Of the two rotations at the centre, radians a frame."""
+BALL = 0.5  # radius of each fluid's ball in frame 0; the two touch at the centre
+TILT = np.radians(40.0)  # between the axes of the two rotations, which makes sheets of what would be a flat spiral
+RATES = (0.9, 0.5)  # of the two rotations at the centre, radians a frame
 
 CORE = 0.35
 """Distance from the centre within which the fluid turns nearly as one; without it the centre would turn infinitely fast."""
@@ -30,18 +25,13 @@ def flubber(
 
     It is a formula, not a simulation (`orbited`): frames are any number >= 0, fractions too; `None` is frame 8.
     """
-    moment = 8.0 if frame is None else float(frame)
-    if not (np.isfinite(moment) and moment >= 0):
-        raise ValueError(f"`frame` of scene 'flubber' must be >= 0 and finite, got {frame!r}")
+    moment = moment_of("flubber", frame, 8.0)
     count = PARTICLES if particles is None else particles
     halves = [ball(part, seed + number) for number, part in enumerate((count // 2, count - count // 2))]
     place = np.concatenate([half + (side * BALL, 0.0, 0.0) for side, half in zip((-1, 1), halves, strict=True)])
     quantity = np.repeat([0.0, 1.0], [len(half) for half in halves])
     spacing = (2 * 4 / 3 * np.pi * BALL**3 / count) ** (1 / 3)
-    position = orbited(place, moment)
-    fluid = Particles.from_arrays(
-        position.astype(np.float32), SUPPORT_IN_SPACINGS * spacing, quantity.astype(np.float32), spacing**3
-    )
+    fluid = fluid_of(orbited(place, moment), quantity, spacing)
     transfer = TransferFunction.from_points(
         values=[0.0, 0.35, 0.5, 0.65, 1.0],
         colors=[(0.95, 0.45, 0.15), (0.95, 0.60, 0.25), (0.95, 0.95, 0.85), (0.30, 0.75, 0.70), (0.10, 0.50, 0.75)],

@@ -7,39 +7,25 @@ import functools
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
+from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
 from jaxsph.scenes.view import looking_at_box
 
 PARTICLES = 100_000
 SECONDS_PER_FRAME = 0.1
 GRAVITY = 9.81
 
-BASIN = ((-1.0, 0.0, -0.5), (1.0, 0.2, 0.5))
-"""Where the water stands at rest, metres."""
-
-HEIGHT, THICKNESS = 0.6, 0.2
-"""Of a letter, metres, without the width of its stroke; and from its front to its back."""
-
-GAP, STAGGER = 0.25, 0.1
-"""From the water to the first letter in frame 0, and what each further letter hangs higher, metres."""
-
-SUBSAMPLE_VARIANCE = (-0.84, -0.18, 0.48)
-"""Left edges of the letters, metres."""
-
-STROKE = 0.12
-"""Half the width of a stroke, in heights of a letter."""
-
-SPLASHING = 0.3
-"""Share of a letter that is thrown up again where it meets the water; the rest sinks."""
-
-SINKING, SPREAD = 0.12, 0.12
-"""Seconds in which what sinks comes to rest, and how far it is carried sideways meanwhile, metres."""
+BASIN = ((-1.0, 0.0, -0.5), (1.0, 0.2, 0.5))  # where the water stands at rest, metres
+HEIGHT, THICKNESS = 0.6, 0.2  # of a letter, metres, without the width of its stroke; and from its front to its back
+GAP, STAGGER = 0.25, 0.1  # from the water to the first letter in frame 0, and what each further letter hangs higher, metres
+LEFT_EDGES = (-0.84, -0.18, 0.48)  # left edges of the letters, metres
+STROKE = 0.12  # half the width of a stroke, in heights of a letter
+SPLASHING = 0.3  # share of a letter that is thrown up again where it meets the water; the rest sinks
+SINKING, SPREAD = 0.12, 0.12  # seconds in which what sinks comes to rest, and how far it is carried sideways meanwhile, metres
 
 SWELL, SWELL_WIDTH, SWELL_SPEED = 0.35, 0.12, 1.4
 """Height over the water's depth, width in metres and speed in metres a second, of the ring that a letter raises."""
-LATEST = 10_000
-"""The last moment: all has long been at rest."""
+LATEST = 10_000  # the last moment: all has long been at rest
 
 
 def letters(
@@ -51,9 +37,7 @@ def letters(
     again, and others come to rest (`fallen`). Frames are tenths of a second, any number >= 0, fractions too; `None` is
     frame 3.5.
     """
-    moment = 3.5 if frame is None else float(frame)
-    if not 0 <= moment <= LATEST:
-        raise ValueError(f"`frame` of scene 'letters' must be >= 0 and at most {LATEST:,}, got {frame!r}")
+    moment = moment_of("letters", frame, 3.5, LATEST)
     count = PARTICLES if particles is None else particles
     lower, upper = np.asarray(BASIN)
     volumes = [float((upper - lower).prod()), *(area(name) * HEIGHT**2 * THICKNESS for name in GLYPHS)]
@@ -62,23 +46,21 @@ def letters(
     now, generator = moment * SECONDS_PER_FRAME, np.random.default_rng(seed)
     drops = [letter(number, int(part), seed + 1 + number) for number, part in enumerate(parts[1:])]
     water = scatter(lower, upper, int(parts[0]), seed)
-    dropped = [fallen(drop, left, now, generator) for drop, left in zip(drops, SUBSAMPLE_VARIANCE, strict=True)]
+    dropped = [fallen(drop, left, now, generator) for drop, left in zip(drops, LEFT_EDGES, strict=True)]
     sunk = sum(float((place[:, 1] <= upper[1]).sum()) for place in dropped) / max(count, 1) * sum(volumes)
     rise = 1 + sunk / volumes[0]
-    for number, left in enumerate(SUBSAMPLE_VARIANCE):
+    for number, left in enumerate(LEFT_EDGES):
         water[:, 1] *= 1 + swell(water, left + HEIGHT * 0.3, now - float(_until_water(GAP + number * STAGGER)))
     position = np.concatenate([water, *dropped])
     position[:, 1] *= np.where(position[:, 1] <= upper[1] * (1 + SWELL), rise, 1.0)
     quantity = np.repeat(np.arange(4) / 3, parts)
-    fluid = Particles.from_arrays(
-        position.astype(np.float32), SUPPORT_IN_SPACINGS * spacing, quantity.astype(np.float32), spacing**3
-    )
+    fluid = fluid_of(position, quantity, spacing)
     transfer = TransferFunction.from_points(
         values=[0.0, 0.1, 1 / 3, 2 / 3, 1.0],
         colors=[(0.15, 0.40, 0.75), (0.20, 0.60, 0.80), (0.25, 0.85, 0.55), (0.98, 0.75, 0.20), (0.95, 0.30, 0.20)],
         extinction=[1.2, 2.5, 9.0, 9.0, 9.0],
     )
-    top = upper[1] + GAP + STAGGER * (len(SUBSAMPLE_VARIANCE) - 1) + HEIGHT * (1 + 2 * STROKE)
+    top = upper[1] + GAP + STAGGER * (len(LEFT_EDGES) - 1) + HEIGHT * (1 + 2 * STROKE)
     camera = looking_at_box(BASIN[0], (BASIN[1][0], top, BASIN[1][2]), (-0.25, -0.4, -1.0), fluid, width, height)
     return Scene(particles=fluid, transfer=transfer), camera
 
@@ -95,8 +77,7 @@ GLYPHS: dict[str, list[list[tuple[float, float]]]] = {
 }
 """Lines along the middle of the strokes, in heights of a letter: y from 0 to 1, x from 0 to 0.6."""
 
-CELL_SAMPLES = ((-STROKE, -STROKE), (0.6 + STROKE, 1 + STROKE))
-"""The box around a letter, in heights."""
+GLYPH_BOX = ((-STROKE, -STROKE), (0.6 + STROKE, 1 + STROKE))  # the box around a letter, in heights
 
 
 def distance(place: Float[np.ndarray, "points 2"], name: str) -> Float[np.ndarray, " points"]:
@@ -113,7 +94,7 @@ def distance(place: Float[np.ndarray, "points 2"], name: str) -> Float[np.ndarra
 @functools.cache
 def area(name: str) -> float:
     """Of a letter's face, in squared heights."""
-    lower, upper = np.asarray(CELL_SAMPLES)
+    lower, upper = np.asarray(GLYPH_BOX)
     axes = [np.linspace(a, b, 200) for a, b in zip(lower, upper, strict=True)]
     inside = distance(np.stack(np.meshgrid(*axes), -1).reshape(-1, 2), name) <= STROKE
     return float(inside.mean() * (upper - lower).prod())
@@ -122,11 +103,11 @@ def area(name: str) -> float:
 def letter(number: int, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
     """`count` points, evenly spread through a letter where it hangs in frame 0, metres."""
     name = tuple(GLYPHS)[number]
-    lower, upper = (np.append(corner, depth) for corner, depth in zip(np.asarray(CELL_SAMPLES), (-0.5, 0.5), strict=True))
+    lower, upper = (np.append(corner, depth) for corner, depth in zip(np.asarray(GLYPH_BOX), (-0.5, 0.5), strict=True))
     box = scatter(lower, upper, round(count * float((upper - lower)[:2].prod()) / area(name)) + 1, seed)
     kept = box[np.sort(np.argsort(distance(box[:, :2], name), kind="stable")[:count])]
     bottom = BASIN[1][1] + GAP + STAGGER * number + HEIGHT * STROKE
-    return kept * (HEIGHT, HEIGHT, THICKNESS) + (SUBSAMPLE_VARIANCE[number], bottom, 0.0)
+    return kept * (HEIGHT, HEIGHT, THICKNESS) + (LEFT_EDGES[number], bottom, 0.0)
 
 
 def _until_water(above: Float[np.ndarray, " points"] | float) -> Float[np.ndarray, " points"]:

@@ -6,16 +6,13 @@ import colorsys
 
 import numpy as np
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, scatter
+from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.scenes.sampling import fluid_of, scatter
 from jaxsph.scenes.view import looking_at_box
 
 PARTICLES = 100_000
-CENTRE = (1.0, 1.0, 1.0)
-"""Where the concentration is 0: the upper right corner that the camera sees in front."""
-
-BANDS = 16
-"""Narrow bands of the transfer function, evenly spaced over the concentration."""
+CENTRE = (1.0, 1.0, 1.0)  # where the concentration is 0: the upper right corner that the camera sees in front
+BANDS = 16  # narrow bands of the transfer function, evenly spaced over the concentration
 
 
 def radial(
@@ -29,9 +26,7 @@ def radial(
     position = scatter(np.zeros(3), np.ones(3), count, seed)
     concentration = np.linalg.norm(position - CENTRE, axis=1) / np.sqrt(3)
     spacing = (1.0 / count) ** (1 / 3)
-    fluid = Particles.from_arrays(
-        position.astype(np.float32), SUPPORT_IN_SPACINGS * spacing, concentration.astype(np.float32), spacing**3
-    )
+    fluid = fluid_of(position, concentration, spacing)
     camera = looking_at_box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-0.55, -0.45, -1.0), fluid, width, height)
     return Scene(particles=fluid, transfer=narrow_bands()), camera
 

@@ -12,17 +12,32 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Shaped
 
-SUPPORT_IN_SPACINGS = 2.0
-"""Support radius over particle spacing."""
+from jaxsph.model import Particles
 
-PLASTIC = 1.2207440846057596
-"""Root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)."""
+SUPPORT_IN_SPACINGS = 2.0  # support radius over particle spacing
+PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)
+JITTER = 0.2  # largest random step from the even place, in spacings: enough to hide the pattern, too little to clump
+MIXED = 8  # simulated neighbours that a new particle takes its quantity from: those around one lattice cube
 
-JITTER = 0.2
-"""Largest random step from the even place, in spacings: enough to hide the pattern, too little to clump."""
 
-MIXED = 8
-"""Simulated neighbours that a new particle takes its quantity from: those around one lattice cube."""
+def fluid_of(position: Float[np.ndarray, "count 3"], quantity: Float[np.ndarray, " count"], spacing: float) -> Particles:
+    """Particles in float32 that stand for their share of a fluid."""
+    return Particles.from_arrays(
+        position.astype(np.float32), SUPPORT_IN_SPACINGS * spacing, quantity.astype(np.float32), spacing**3
+    )
+
+
+def moment_of(name: str, frame: float | None, best: float, last: float = np.inf) -> float:
+    """The frame of a scene that is asked for, `best` where none is.
+
+    Raises:
+        ValueError: one below 0, beyond the last or not finite.
+    """
+    moment = best if frame is None else float(frame)
+    if not (np.isfinite(moment) and 0 <= moment <= last):
+        most = "finite" if np.isinf(last) else f"at most {last:,}"
+        raise ValueError(f"`frame` of scene {name!r} must be >= 0 and {most}, got {frame!r}")
+    return moment
 
 
 def scatter(

@@ -1,6 +1,9 @@
-"""Scenes from packaged simulations: a few frames of particles that carry a dye.
+"""`mixer` and `dam_break`, from packaged simulations: a few frames of particles that carry a dye.
 
-Flow: packaged npz -> [simulated] -> mixer, dam_break -> Scene.
+In `mixer` a paddle stirs a tank in which dye stands in cubes, as in Hochstetter et al. 2016, figure 9. In `dam_break` two columns
+of water collapse into a basin: thin sheets, spray, and much empty space.
+
+Flow: packaged npz -> [simulated] -> Scene.
 
 The files in `data/` were computed for this project with SPlisHSPlasH (DFSPH); each holds `position` (frames, N, 3),
 `concentration` (N,), `time` (frames,) in seconds, and `spacing` in metres: a particle's mass over the rest density is
@@ -17,8 +20,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Particles
-from jaxsph.scenes.sampling import SUPPORT_IN_SPACINGS, refill
+from jaxsph.model import Camera, Particles, Scene, TransferFunction
+from jaxsph.scenes.sampling import fluid_of, refill
+from jaxsph.scenes.view import looking_at_box
+
+TANK = ((-0.6, 0.0, -0.6), (0.6, 0.9, 0.6))  # where the fluid stands at rest, metres; what splashes above it may leave the image
+BASIN = ((-1.55, 0.0, -1.55), (1.55, 0.9, 1.55))  # where nearly all of the water stays, metres
 
 
 class Simulation(NamedTuple):
@@ -53,6 +60,40 @@ def particles_of(name: str, frame: float, count: int | None, seed: int) -> Parti
     position, concentration, spacing = stored.position[index], stored.concentration, stored.spacing
     if count is not None and count != len(position):
         position, concentration, spacing = refill(position, concentration, spacing, count, seed)
-    return Particles.from_arrays(
-        position.astype(np.float32), SUPPORT_IN_SPACINGS * spacing, concentration.astype(np.float32), spacing**3
+    return fluid_of(position, concentration, spacing)
+
+
+def mixer(
+    particles: int | None = None, frame: float | None = None, *, width: int = 512, height: int = 512, seed: int = 0
+) -> tuple[Scene, Camera]:
+    """A simulated tank 1.2 m wide; the quantity is the concentration of the dye, in [0, 1].
+
+    Frames 0, 1 and 2 are 0.0, 0.2 and 0.4 seconds after the paddle starts; `None` is frame 1. `particles=None` are
+    the 43,740 simulated particles; any other number fills the same fluid.
+    """
+    fluid = particles_of("mixer", 1 if frame is None else frame, particles, seed)
+    transfer = TransferFunction.from_points(
+        values=[0.0, 0.2, 0.45, 0.7, 1.0],
+        colors=[(0.20, 0.45, 0.85), (0.15, 0.50, 0.85), (0.10, 0.80, 0.60), (0.75, 0.95, 0.30), (1.0, 0.62, 0.15)],
+        extinction=[0.9, 0.9, 2.0, 3.5, 5.0],
     )
+    camera = looking_at_box(*TANK, (-0.45, -0.42, -1.0), fluid, width, height)
+    return Scene(particles=fluid, transfer=transfer), camera
+
+
+def dam_break(
+    particles: int | None = None, frame: float | None = None, *, width: int = 512, height: int = 512, seed: int = 0
+) -> tuple[Scene, Camera]:
+    """A simulated basin 3.1 m wide; the quantity is the concentration of a dye that stood in cubes, in [0, 1].
+
+    Frames 0, 1 and 2 are 0.0, 0.3 and 0.6 seconds after the columns are let go; `None` is frame 1. `particles=None`
+    are the 59,582 simulated particles; any other number fills the same fluid.
+    """
+    water = particles_of("dam_break", 1 if frame is None else frame, particles, seed)
+    transfer = TransferFunction.from_points(
+        values=[0.0, 0.35, 0.65, 1.0],
+        colors=[(0.15, 0.45, 0.80), (0.30, 0.65, 0.85), (0.95, 0.60, 0.35), (0.95, 0.35, 0.20)],
+        extinction=[1.5, 2.0, 4.0, 5.0],
+    )
+    camera = looking_at_box(*BASIN, (-0.35, -0.55, -1.0), water, width, height)
+    return Scene(particles=water, transfer=transfer), camera

@@ -13,16 +13,12 @@ import numpy as np
 
 from jaxsph.model import Camera, Particles
 
-NEAREST = 1e-3
-"""Smallest near over far, where particles reach the eye: sample depths are geometric between them."""
-
-ROUNDING = 1e-4
-"""Relative widening of the depths, far above the rounding of float32 positions."""
+NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
+ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
 
 FOV_DEGREES = 35.0
 UP = (0.0, 1.0, 0.0)
-BORDER = 0.06
-"""Part of the image that stays empty around a scene."""
+BORDER = 0.06  # part of the image that stays empty around a scene
 
 
 def snug(camera: Camera, particles: Particles) -> Camera:

@@ -20,7 +20,7 @@ from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.selection import chosen
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
-from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.checks import Progress
 
 MAX_VALUES = 1 << 16

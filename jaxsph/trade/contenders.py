@@ -14,8 +14,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Int
 
-from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.model.registry import ESTIMATING
+from jaxsph.model import Camera, Image, Scene, Settings, registry
 from jaxsph.reference import integral
 
 TOLERANCES = (0.001, 0.004, 0.01)
@@ -47,7 +46,7 @@ class Contender:
     @property
     def is_against_integral(self) -> bool:
         """Whether its tolerance is kept against the light integral, not against full rate."""
-        return self.tolerance is not None and self.settings.integrator in ESTIMATING
+        return self.tolerance is not None and registry.estimates(self.settings.integrator)
 
     @property
     def kind(self) -> Hashable:
@@ -65,8 +64,8 @@ class Contender:
 
 def suitable(settings: Settings) -> tuple[str, ...]:
     """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
-    allowed = {settings.integrator, *ESTIMATING}
-    return tuple(name for name, chosen in ESTIMATORS.items() if chosen["integrator"] in allowed)
+    own = settings.integrator
+    return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or registry.estimates(it["integrator"]))
 
 
 def contenders(

@@ -12,7 +12,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.model.periodic import _unfolded as unfolded
-from jaxsph.model.periodic import num_ghosts, with_ghosts, wrapped
+from jaxsph.model.periodic import num_ghosts, with_ghosts
 from jaxsph.numerics import faults
 
 SIDES = np.array([1.0, 1.5, 0.8])
@@ -60,7 +60,7 @@ def test_positions_outside_of_the_box_are_wrapped_with_all_their_digits():
     shifted = given.exact_position()[:60] + np.random.default_rng(1).integers(-3, 4, (60, 3)) * SIDES
     moved = js.Particles.from_arrays(shifted, given.support[:60], 0.5, box=given.box)
     assert moved.position_rest is not None
-    home = wrapped(moved).exact_position()[:60]
+    home = moved.wrapped().exact_position()[:60]
     turns = (home - given.exact_position()[:60]) / SIDES
     assert np.abs(turns - np.round(turns)).max() < 1e-6
     assert (home > 1e4 - 1e-6).all() and (home < 1e4 + SIDES + 1e-6).all()

@@ -1,5 +1,7 @@
 """What is chosen by name is found, and is one object: so that it may be static in what is compiled."""
 
+from pathlib import Path
+
 import pytest
 
 import jaxsph as js
@@ -32,3 +34,15 @@ def test_what_is_entered_can_be_chosen(monkeypatch):
     monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
     assert js.Settings(screen="again").screen == "again"
     assert registry.screen("again") is registry.screen("pixels")
+
+
+def test_integrators_say_themselves_what_they_ask_for():
+    assert [name for name in registry.INTEGRATORS if registry.estimates(name)] == ["segments"]
+    assert [name for name in registry.INTEGRATORS if registry.integrator_class(name).asks_points] == ["step_doubling"]
+    assert not registry.estimates("none such")
+
+
+def test_the_model_names_no_room_above_it():
+    for file in Path(registry.__file__).parent.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        assert '"jaxsph.' not in text.replace('"jaxsph.model.', "").replace('"jaxsph.numerics.', ""), file.name

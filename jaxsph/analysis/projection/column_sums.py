@@ -21,8 +21,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.analysis.projection.columns import column_between, whole_column
-from jaxsph.analysis.projection.pixel_shares import pixel_shares
+from jaxsph.analysis.projection.columns import column_between, pixel_shares, whole_column
 from jaxsph.engine.access.lists import BUNDLE, BundleLists
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.transposed import linear_map

@@ -1,28 +1,45 @@
-r"""What of a kernel lies along a ray, and what lies between two depths: integrals in closed form.
+r"""What of a kernel lies along a ray, between two depths, and in each pixel of an image.
 
-Flow: kernels -> [columns] -> field.column_sums, model.pixel_shares.
+Flow: kernels -> [columns] -> field.column_sums.
 
 Lengths are in supports: a ray passes a particle at the distance b, and t counts from the foot of its centre on the ray. All
 kernels are sums of polynomials in r, each inside a radius c of its own, and $r = \sqrt{b^2 + t^2}$. So all integrals follow from
 
 $$I_n(t) = \int_0^t r^n dt = \frac{t r^n + n b^2 I_{n-2}(t)}{n + 1}, \quad I_0 = t, \quad I_{-1} = \mathrm{asinh}(t / b),$$
 
-which is exact for whole chords and for any part of one. Kernels of high order are summed shell by shell instead
-(`shell_integrals`). All functions take `xp`, which is `numpy` or `jax.numpy`.
+which is exact for whole chords and for any part of one.
+
+Polynomials of kernels of high order have terms a thousand times their sum. Along a ray these are integrated by Gauss-Legendre
+quadrature of the kernel itself, between the radii where its pieces end: in each shell it is smooth, its values are positive, and
+rounding stays that of the kernel. Across planes, each of their pieces is a polynomial in the distance $d = c - r$ to its edge,
+which is integrated twice in closed form. Functions take `xp`, which is `numpy` or `jax.numpy`.
+
+Means over pixels are exact however small a support is. With $G(x, y) = \int_0^x \int_0^y F$, the integral of a column F over a
+rectangle is a difference of G at its four corners. G is smooth, symmetric and odd in x and y, so that a few products do:
+$G(x, y) \approx \sum_k \lambda_k g_k(x) g_k(y)$ with polynomials $g_k$. Shares of neighbouring pixels are differences of the same
+numbers, so they add up to what the whole image holds: mass is kept to rounding, whatever the error of a share.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from jaxsph.analysis.projection import shell_integrals
 from jaxsph.model import kernels
+from jaxsph.numerics.fusion import barriers_kept
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
+
+
+TERMS = 24  # odd Chebyshev polynomials that each g_k is made of
+PRODUCTS = 8  # with more, the error of the fit by polynomials is larger than that of leaving out the rest
+CELLS, CELL_NODES = 160, 6  # of the quadrature, on each axis
 
 
 class Piece(NamedTuple):
@@ -42,7 +59,31 @@ PIECES = {
     "cubic_spline": (Piece(1.0, (2, -6, 6, -2)), Piece(0.5, (-1, 6, -12, 8))),
     "wendland_c2": (Piece(1.0, (1, 0, -10, 20, -15, 4)),),
 }
-"""Of some kernels of `model.kernels`, without their norms. Of others rounding would be too much; see `shell_integrals`."""
+"""Of some kernels of `model.kernels`, without their norms. Of others rounding would be too much, see `EDGES`."""
+
+
+NODES, WEIGHTS = ((values + shift) / 2 for values, shift in zip(np.polynomial.legendre.leggauss(16), (1, 0), strict=True))
+
+
+class Edge(NamedTuple):
+    """A polynomial in the distance to a radius, inside of it.
+
+    Attributes:
+        radius: where it ends, in supports.
+        coefficients: of the powers of the distance, by power.
+    """
+
+    radius: float
+    coefficients: dict[int, float]
+
+
+EDGES = {
+    "quartic_spline": (Edge(1.0, {4: 1}), Edge(0.6, {4: -5}), Edge(0.2, {4: 10})),
+    "quintic_spline": (Edge(1.0, {5: 1}), Edge(2 / 3, {5: -6}), Edge(1 / 3, {5: 15})),
+    "wendland_c4": (Edge(1.0, {6: 56 / 3, 7: -88 / 3, 8: 35 / 3}),),
+    "wendland_c6": (Edge(1.0, {8: 66, 9: -154, 10: 121, 11: -32}),),
+}
+"""Without norms."""
 
 
 def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
@@ -62,7 +103,7 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
         Finite everywhere.
     """
     if kernels.by_name(name).name not in PIECES:
-        return 2 * shell_integrals.from_foot(name, square, xp.ones_like(square), xp)
+        return 2 * _along_shells(name, square, xp.ones_like(square), xp)
     total = 0.0
     for piece in PIECES[name]:
         half, inside = _half_chord(piece, square, xp)
@@ -73,7 +114,7 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
 def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) -> Any:
     """The same integral from t = `start` to t = `end`, with start <= end; all three broadcast."""
     if kernels.by_name(name).name not in PIECES:
-        first, last = (shell_integrals.from_foot(name, square, t, xp) for t in (start, end))
+        first, last = (_along_shells(name, square, t, xp) for t in (start, end))
         return xp.maximum(last - first, 0)
     total = 0.0
     for piece in PIECES[name]:
@@ -86,7 +127,7 @@ def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) 
 def depth_share(name: str, start: Any, end: Any, xp: Any = jnp) -> Any:
     """How much of a kernel of support 1 lies between two planes at distances `start` <= `end` from its centre, in [0, 1]."""
     if kernels.by_name(name).name not in PIECES:
-        return xp.clip(shell_integrals.below(name, end, xp) - shell_integrals.below(name, start, xp), 0, 1)
+        return xp.clip(_below(name, end, xp) - _below(name, start, xp), 0, 1)
     total = 0.0
     for radius, coefficients in PIECES[name]:
         low, high = xp.clip(start, -radius, radius), xp.clip(end, -radius, radius)
@@ -121,3 +162,119 @@ def _from_foot(piece: Piece, square: Any, t: Any, xp: Any) -> Any:
         integral[n] = (t * powers[n] + n * solid * integral[n - 2]) / (n + 1)
         total = total + piece.coefficients[n] * integral[n]
     return total
+
+
+def _along_shells(name: str, square: Any, t: Any, xp: Any = jnp) -> Any:
+    """Integral of a kernel of support 1 from the foot of its centre on a ray to t, as far as the support goes; odd in t."""
+    kernel, total, reached = kernels.by_name(name), 0.0, xp.zeros_like(square * t)
+    for radius in sorted(edge.radius for edge in EDGES[name]):
+        within = radius**2 - square
+        half = xp.where(within > 0, xp.sqrt(xp.where(within > 0, within, 1)), 0)
+        half = jax.lax.stop_gradient(half) if xp is jnp else half  # what one shell gains the next loses
+        end = xp.where(abs(t) <= half, abs(t), half)  # chosen, not the less of both: where they are alike t has the derivative
+        end = xp.where(end > reached, end, reached)
+        length = end - reached
+        for node, weight in zip(NODES.tolist(), WEIGHTS.tolist(), strict=True):
+            at = reached + node * length
+            total = total + weight * length * kernel.of_square(square + at * at, xp)
+        reached = end
+    return kernel.norm * xp.sign(t) * total
+
+
+def _below(name: str, z: Any, xp: Any = jnp) -> Any:
+    """How much of a kernel of support 1 lies between its centre and a plane at z; negative where z is."""
+    total = 0.0
+    for radius, coefficients in EDGES[name]:
+        for power, factor in coefficients.items():
+            whole, beyond = (_tail(radius, power, d) for d in (radius, xp.maximum(radius - abs(z), 0)))
+            total = total + 2 * math.pi * factor * (whole - beyond)
+    return kernels.by_name(name).norm * xp.sign(z) * total
+
+
+def _tail(radius: float, power: int, d: Any) -> Any:
+    """Of d^power, over all points of the ball that are nearer than d to the plane that touches it."""
+    n = power + 2
+    return d**n * (radius / ((n - 1) * n) - d / (n * (n + 1)))
+
+
+class Shares(NamedTuple):
+    """The products of a kernel.
+
+    Attributes:
+        polynomials: coefficients of g_k by odd Chebyshev polynomials.
+        factors: lambda_k.
+    """
+
+    polynomials: Float[np.ndarray, "terms products"]
+    factors: Float[np.ndarray, " products"]
+
+
+@functools.cache
+def shares_of(name: str) -> Shares:
+    """Fitted in float64 to quadrature; the density of shares is good to 1e-4 of F(0), and that of the whole plane is 1."""
+    edges, corner = _corner_integrals(name)
+    odd = np.polynomial.chebyshev.chebvander(edges, 2 * TERMS - 1)[:, 1::2]
+    inverse = np.linalg.pinv(odd)
+    factors, vectors = np.linalg.eigh(inverse @ corner @ inverse.T)
+    largest = np.argsort(-np.abs(factors))[:PRODUCTS]
+    factors, polynomials = factors[largest], vectors[:, largest]
+    whole = 4 * (factors * polynomials.sum(0) ** 2).sum()  # every polynomial is 1 at 1
+    return Shares(polynomials, factors / whole)
+
+
+def pixel_shares(
+    name: str, x: Float[Array, "... edges_across"], y: Float[Array, "... edges_down"]
+) -> Float[Array, "... pixels_down pixels_across"]:
+    """Integrals of a column of support 1 over the pixels between edges, counted from its centre; signs follow the edges' order.
+
+    What lies outside the support has exactly nothing, and no share is negative.
+    """
+    shares = shares_of(name)
+    of_x, of_y = (_between(shares, edges) for edges in (x, y))
+    product = jnp.einsum("...rk,...ck->...rc", of_y * shares.factors.astype(of_y.dtype), of_x, precision="highest")
+    nearest = _nearest(y)[..., :, None] ** 2 + _nearest(x)[..., None, :] ** 2
+    return jnp.where(nearest < 1, jnp.maximum(product, 0), 0)
+
+
+def _between(shares: Shares, edges: Array) -> Float[Array, "... pixels products"]:
+    """Differences of all g_k between neighbouring edges, upwards."""
+    at = jnp.clip(edges, -1, 1)
+    values = (_by_product if barriers_kept() else _by_chain)(shares.polynomials.astype(at.dtype), at)
+    return values[..., 1:, :] - values[..., :-1, :]
+
+
+def _by_product(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
+    """All g_k as one product of matrices: on CPUs, where the chain below takes longer."""
+    double = 4 * at * at - 2  # T_(n+2) = 2 T_2 T_n - T_(n-2)
+    odd = [at, at * (double - 1)]
+    for _ in coefficients[2:]:
+        odd.append(double * odd[-1] - odd[-2])
+    return jnp.matmul(jnp.stack(odd, -1), coefficients, precision="highest")
+
+
+def _by_chain(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
+    """The same by Clenshaw's recurrence, which accelerators fuse into one chain and hold in registers."""
+    at = at[..., None]
+    double = 4 * at * at - 2
+    last = before = jnp.zeros_like(at * coefficients[0])
+    for row in coefficients[::-1]:
+        last, before = row + double * last - before, last
+    return at * (last - before)
+
+
+def _nearest(edges: Array) -> Array:
+    """Distance of the centre from the span between neighbouring edges, which ascend."""
+    return jnp.maximum(jnp.maximum(edges[..., :-1], -edges[..., 1:]), 0)
+
+
+def _corner_integrals(name: str) -> tuple[Any, Any]:
+    """Edges from 0 to 1, dense where the support ends, and G at all pairs of them."""
+    edges = np.sin(np.linspace(0, np.pi / 2, CELLS + 1))
+    nodes, weights = np.polynomial.legendre.leggauss(CELL_NODES)
+    sizes = np.diff(edges)[:, None]
+    at, weight = (edges[:-1, None] + sizes * (nodes + 1) / 2).ravel(), (sizes * weights / 2).ravel()
+    cells = whole_column(name, at[:, None] ** 2 + at**2, np) * weight[:, None] * weight
+    cells = cells.reshape(CELLS, CELL_NODES, CELLS, CELL_NODES).sum((1, 3))
+    corner = np.zeros((CELLS + 1, CELLS + 1))
+    corner[1:, 1:] = cells.cumsum(0).cumsum(1)
+    return edges, corner

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxsph.analysis.projection.column_sums import BLOCK, subrays_of
-from jaxsph.analysis.projection.periodic_views import between_faces, sees_images
 from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.access.ordering import Ordered
@@ -23,7 +22,7 @@ from jaxsph.engine.planning.plan import MAX_CAPACITY
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
-from jaxsph.model.periodic import num_ghosts, unfolded, wrapped
+from jaxsph.model.periodic import between_faces, num_ghosts, sees_images, unfolded
 from jaxsph.numerics.checks import is_traced
 
 PIXELS = ("mean", "ray")
@@ -146,7 +145,7 @@ def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> P
     if images is not None:
         camera, particles = _of_box(particles, camera, beyond, room=images, pixel=pixel)
     else:
-        particles = wrapped(particles)
+        particles = particles.wrapped()
     placed = placed_by(particles, camera)
     counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in bare.rules]  # type: ignore[arg-type]
     while True:

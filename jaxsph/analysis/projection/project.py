@@ -23,7 +23,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.analysis.projection.column_sums import ColumnInputs, ColumnMethod, column_sums, pixels_of, subrays_of
 from jaxsph.analysis.projection.columns import depth_share
-from jaxsph.analysis.projection.periodic_views import between_faces
 from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
 from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, beside, plan_projection
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
@@ -31,7 +30,7 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.held import Held, held_by, unit_held
 from jaxsph.model.particles import Particles
-from jaxsph.model.periodic import with_sources, wrapped
+from jaxsph.model.periodic import between_faces, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
@@ -61,7 +60,7 @@ def project(
     it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see `emission`.
 
     Args:
-        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic_views`.
+        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.
         camera: where from, how large the image is, and the depths that rays begin and end at.
         of: numbers of all particles in their order, or the name of a column of them, `"volume"` or `"quantity"`. Without
             weight: the amounts $a_j$, default the volumes (which then must be true ones, and give the path length inside). With
@@ -200,7 +199,7 @@ class _Shown(NamedTuple):
 
 def _shown(particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan) -> _Shown:
     if plan.images is None or particles.box is None:
-        return _Shown(wrapped(particles), amounts, camera, None, jnp.int32(faults.NONE))
+        return _Shown(particles.wrapped(), amounts, camera, None, jnp.int32(faults.NONE))
     camera, pixels = between_faces(camera, particles.box, plan.pixel)
     particles, source, word = with_sources(particles, plan.images)
     return _Shown(particles, amounts[source], camera, pixels, word)

@@ -9,19 +9,17 @@ that are near in depth are near each other, and any part of it can be put in fro
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxsph.numerics.sums import running_sum
+from jaxsph.numerics.trees import tree
 
 SIZE_BITS = 5  # of a sort key: how full an item is, in quarters of octaves
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class CompactedSlabs:
     """The filled items of a band, layer by layer; `slabs * bundles` is a dummy item.
 
@@ -61,6 +59,3 @@ def fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk:
     key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
     order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
     return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
-
-
-jax.tree_util.register_dataclass(CompactedSlabs, data_fields=["item", "start", "bundle_rank"], meta_fields=[])

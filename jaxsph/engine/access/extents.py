@@ -5,17 +5,15 @@ Flow: grid -> [extents] -> media -> schedule.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class SlabExtents:
     """The least and the greatest view coordinate of any point of a slab that a ray of its bundle can pass."""
 
@@ -48,8 +46,3 @@ def slab_extents(grid: Grid, camera: Camera, slab_samples: int) -> SlabExtents:
 
     depths = (jnp.broadcast_to(side, (slabs, bundles)) for side in (front, back))
     return SlabExtents(*sides(u), *sides(v), *depths)
-
-
-jax.tree_util.register_dataclass(
-    SlabExtents, data_fields=[field.name for field in dataclasses.fields(SlabExtents)], meta_fields=[]
-)

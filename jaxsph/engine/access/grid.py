@@ -5,9 +5,6 @@ Flow: ordering -> lists -> cells -> [grid] -> control, cast.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -15,9 +12,10 @@ from jaxsph.engine.access.lists import BUNDLE, BundleLists
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.slab_windows import SlabWindows
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Grid:
     """Particles by rank, the lists of all bundles, and the windows of all slabs.
 
@@ -48,6 +46,3 @@ class Grid:
         pixel, dtype = jnp.arange(BUNDLE, dtype=jnp.int32)[:, None], self.half_steps.dtype
         u = camera.column((self.column[bundle] + pixel).astype(dtype) + 0.5)
         return u, camera.row((self.row[bundle] + pixel).astype(dtype) + 0.5)
-
-
-jax.tree_util.register_dataclass(Grid, data_fields=[field.name for field in dataclasses.fields(Grid)], meta_fields=[])

@@ -29,6 +29,7 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.sums import running_sum
+from jaxsph.numerics.trees import tree
 
 MAX_EXACT = 1 << 22  # tiles of a band that float32 divides by columns without a mistake; whole numbers take longer
 MAX_PAIRS = 2.0**30  # beyond this a 32-bit sum could wrap
@@ -80,7 +81,7 @@ class ListPlan:
         return value.reshape(self.tile_rows * 2 * down, self.tile_columns * 2 * across, *value.shape[6:])
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class BundleLists:
     """Ranks of the particles that can touch each bundle: `rank[start[b] : end[b]]`, ascending.
 
@@ -130,7 +131,7 @@ def _run_by_run(always: Array, function: Callable[[Any], Array], runs: Any) -> A
     return lax.map(lambda run: fusion_barrier(always, function, run), runs)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Ranges:
     """Which bundles of a band each particle can touch: first, and past the last; none if `left >= right`."""
 
@@ -150,7 +151,7 @@ def bundle_ranges(ordered: Ordered, plan: ListPlan, first_row: Int[Array, ""] | 
     return Ranges(left // BUNDLE, past[0], top // BUNDLE, past[1])
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class _Pairs:
     """(Particle, tile) pairs in runs, each sorted by (tile, rank); a run's ranks all precede those of the next run.
 
@@ -330,7 +331,3 @@ def children_mask(touched: list[Bool[Array, " pairs"]]) -> Int[Array, " pairs"]:
 
 def _of(like: Array, value: Array) -> Array:
     return value.astype(like.dtype)
-
-
-for _kind in (BundleLists, Ranges, _Pairs):
-    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

@@ -9,23 +9,22 @@ running sums, however large the box is.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxsph.model.transfer.function import EVEN, SELECT_ALL, TransferFunction, look_up
 from jaxsph.numerics.sums import running_sum
+from jaxsph.numerics.trees import tree
 
 MACROCELL = 4
 Reduction = Callable[..., Array]
 ROUNDING = 8  # eps that interpolation between two values, or their look-up, may be off by
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class MacrocellRanges:
     """The least and the greatest value at the grid points of each macrocell."""
 
@@ -73,7 +72,7 @@ class MacrocellRanges:
         return at_ends | (up_to[last] > up_to[first])
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Occupancy:
     """Which macrocells are occupied, as numbers of those before each corner of a macrocell."""
 
@@ -115,7 +114,3 @@ def _reduced(values: Array, of_two: Reduction, of_all: Reduction, axis: int) -> 
     own = lax.slice_in_dim(padded, 0, number * MACROCELL, axis=axis).reshape(*before_axis, number, MACROCELL, *behind)
     of_next = lax.slice_in_dim(padded, MACROCELL, number * MACROCELL + 1, MACROCELL, axis)
     return of_two(of_all(own, axis=axis + 1), of_next)
-
-
-jax.tree_util.register_dataclass(MacrocellRanges, data_fields=["lo", "hi"], meta_fields=[])
-jax.tree_util.register_dataclass(Occupancy, data_fields=["before"], meta_fields=[])

@@ -21,11 +21,12 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.resolution import ROUNDING
 from jaxsph.engine.access.view import DEPTH_BITS, Columns, Viewed, depth_key
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.trees import tree
 
 KEY_MARGIN = 8  # keys that a window is wider on either side: a key is at most an ulp of its depth, a logarithm errs by a few
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Ordered(Columns):
     """Particles in rank order (class, then depth); those that no sample can meet come last.
 
@@ -95,10 +96,3 @@ def _sort_by(key: Int[Array, " particles"]) -> tuple[Array, Array]:
         packed = (key.astype(jnp.uint64) << 32) | lax.iota(jnp.uint64, key.shape[0])
         packed = lax.sort(packed)
         return (packed >> 32).astype(jnp.uint32), packed.astype(jnp.uint32).astype(jnp.int32)
-
-
-jax.tree_util.register_dataclass(
-    Ordered,
-    data_fields=[field.name for field in dataclasses.fields(Ordered)],
-    meta_fields=[],
-)

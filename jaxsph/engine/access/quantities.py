@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.engine.lookups.joined import joined
 from jaxsph.model.particles import Particles
 from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
 from jaxsph.numerics import exponents
@@ -33,7 +32,7 @@ def in_units_of(particles: Particles, transfer: TransferFunction) -> tuple[Parti
     Of particles that carry one quantity the transfer function then has one set of control points.
     """
     if particles.extinction_quantity is None or transfer.extinction_values is None:
-        transfer = joined(transfer)
+        transfer = transfer.joined()
         quantity, values = rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values)
         return dataclasses.replace(particles, quantity=quantity), dataclasses.replace(transfer, values=values)
     first, second = (quantity.astype(transfer.values.dtype) for quantity in particles.quantities)

@@ -9,21 +9,19 @@ of supports.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxsph.engine.access.lists import BundleLists
 from jaxsph.engine.access.ordering import Ordered
+from jaxsph.numerics.trees import tree
 
 MAX_LEVEL = 4  # at which a cell has one sample
 CELL_SAMPLES = 1 << MAX_LEVEL  # fine samples of a cell along depth: D_z of Hochstetter et al. 2016
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class SlabWindows:
     """Windows `rank[begin : begin + length]` of a bundle's list, and their sum over classes.
 
@@ -45,7 +43,7 @@ def slab_windows_with_borders(ordered: Ordered, lists: BundleLists) -> SlabWindo
     return _windows(lists, ordered.first_beside, ordered.last_beside)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Window:
     """Windows of the bundle's list, for each class of supports, of slabs 2^l times as deep as those of the grid."""
 
@@ -101,7 +99,3 @@ def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
         return jnp.where((past <= high) & smaller, past, position)
 
     return lax.fori_loop(0, bits, step, jnp.broadcast_to(low, (*wanted.shape[:-1], low.shape[0])))
-
-
-jax.tree_util.register_dataclass(SlabWindows, data_fields=["begin", "length", "count"], meta_fields=[])
-jax.tree_util.register_dataclass(Window, data_fields=["begin", "length"], meta_fields=[])

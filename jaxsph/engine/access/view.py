@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -21,6 +20,7 @@ from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import Particles
 from jaxsph.numerics import exponents, faults
+from jaxsph.numerics.trees import tree
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
 DEAD_CLASS = 255
@@ -62,7 +62,7 @@ class Columns:
         return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Viewed(Columns):
     """Particles in their own order.
 
@@ -159,6 +159,3 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
     weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & exponents.is_subnormal(volume))
     return size / support, size, weak
-
-
-jax.tree_util.register_dataclass(Viewed, data_fields=[field.name for field in dataclasses.fields(Viewed)], meta_fields=[])

@@ -1,1 +1,9 @@
 """Along rays: from the optics of media at samples to colour and transmittance, and back for gradients."""
+
+from jaxsph.model import registry
+
+registry.INTEGRATORS |= {
+    "samples": "jaxsph.engine.cast.samples:PointSamples",
+    "segments": "jaxsph.engine.cast.segments:Segments",
+    "step_doubling": "jaxsph.engine.cast.step_doubling:StepDoubling",
+}

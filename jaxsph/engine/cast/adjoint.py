@@ -43,6 +43,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
+from jaxsph.numerics.trees import tree
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
@@ -65,7 +66,7 @@ class CastMethod:
         return self.packets_of(grid, camera) if chosen is None else self.packets_of(grid, camera, chosen)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class DiffInputs:
     """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any.
 
@@ -80,7 +81,7 @@ class DiffInputs:
     within: Clip | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class NonDiffInputs:
     """What is held fixed: which particles and samples meet, and how they are sampled."""
 
@@ -219,7 +220,7 @@ def _require_values(fixed: NonDiffInputs) -> None:
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Accumulated:
     """Cotangents added up over slabs.
 
@@ -334,7 +335,3 @@ class _Backward:
         (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.met(gathered, task), task.path())
         of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
         return of_optics, of_path
-
-
-for _kind in (DiffInputs, NonDiffInputs, Accumulated):
-    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

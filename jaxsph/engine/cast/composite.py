@@ -21,6 +21,7 @@ from jaxsph.engine.cast.integrator import Segment
 from jaxsph.engine.cast.samples import transmitted
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 Carry = TypeVar("Carry")
 
@@ -46,7 +47,7 @@ class Together:
         return cls(together, min(tuning.half_depths_found, together), together == packets)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class RayState:
     """Rays of packets in order of height, and room for as many as are composited together past the last.
 
@@ -193,6 +194,3 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: A
         crossed = crossed & ~here
         reached = behind
     return depth
-
-
-jax.tree_util.register_dataclass(RayState, data_fields=["color", "transmittance", "depth", "square"], meta_fields=[])

@@ -5,20 +5,19 @@ Flow: media -> [integrator] -> composite.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
+from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Segment:
     """Slabs as seen from right in front of each.
 
@@ -45,11 +44,15 @@ class Integrator:
             neighbouring slabs share one.
         between: whether it is given means over the intervals between samples (`Medium.means`), which lie on borders; else optics
             at samples.
+        estimates: whether `compared` estimates its error, against the light integral: a tolerance is then kept by more samples.
+        asks_points: whether it chooses for itself where it asks media: it is made with a tolerance and the samples of a ray.
         forward_only: what is said where reverse mode is asked for; None where there is that.
     """
 
     halo: ClassVar[int] = 0
     between: ClassVar[bool] = False
+    estimates: ClassVar[bool] = False
+    asks_points: ClassVar[bool] = False
     forward_only: ClassVar[str | None] = None
 
     def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
@@ -72,6 +75,3 @@ class Integrator:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
         color, thickness = self.segment(medium.met(gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
-
-
-jax.tree_util.register_dataclass(Segment, data_fields=["color", "transmittance", "thickness", "error"], meta_fields=[])

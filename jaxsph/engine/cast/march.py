@@ -24,9 +24,10 @@ from jaxsph.engine.cast.refine import CAUTION, errors_seen, refine, shares_of
 from jaxsph.engine.field.schedule import SlabSchedule, evaluations_of_slabs
 from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.medium import Medium
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class RayResult:
     """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance.
 
@@ -137,8 +138,3 @@ def result_of(rays: RayState, batches: Batches) -> RayResult:
     *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
     error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
     return RayResult(jnp.stack(color), transmittance, depth, error=error)
-
-
-jax.tree_util.register_dataclass(
-    RayResult, data_fields=["color", "transmittance", "depth", "left_out", "error", "refined", "cut"], meta_fields=[]
-)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -21,9 +20,10 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.cast.batches import Batch
 from jaxsph.engine.cast.composite import Together, over_layers, rows
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class ReplayState:
     """Rays of packets in order of height: the image, its cotangents, and how far it is made again.
 
@@ -88,8 +88,3 @@ def _pull_slabs(rays: ReplayState, light: list[Array]) -> tuple[Array, Array, Ar
     remaining = jnp.clip(rays.color - color, 0, behind)
     hidden = (rays.cotangent[:3] * remaining).sum(0) + rays.cotangent[3] * rays.transmittance
     return color, behind, jnp.concatenate([rays.cotangent[:3] * rays.transmittance_so_far, -hidden[None]])
-
-
-jax.tree_util.register_dataclass(
-    ReplayState, data_fields=[field.name for field in dataclasses.fields(ReplayState)], meta_fields=[]
-)

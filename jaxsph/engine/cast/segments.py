@@ -42,6 +42,7 @@ class Segments(Integrator):
 
     halo = 1
     between = True
+    estimates = True
 
     def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
         """See `Integrator`; of means of emission and extinction."""

@@ -70,6 +70,7 @@ class StepDoubling(Integrator):
         samples: of the whole ray.
     """
 
+    asks_points = True
     forward_only = (
         "`integrator='step_doubling'` has no reverse-mode derivatives, as a ray takes any number of steps; "
         "take forward ones (`jax.jvp`), or give `integrator='samples'`"

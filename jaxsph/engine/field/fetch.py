@@ -5,16 +5,14 @@ Flow: schedule -> [fetch] -> gather, nodes, transposed.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Block:
     """Some particles of each of some slabs; of size 0 past the last of a slab's windows.
 
@@ -69,6 +67,3 @@ def fetch(
     )
     relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
     return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)
-
-
-jax.tree_util.register_dataclass(Block, data_fields=[field.name for field in dataclasses.fields(Block)], meta_fields=[])

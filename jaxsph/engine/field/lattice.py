@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.shards import unshard
+from jaxsph.numerics.trees import tree
 
 REACH = 2  # nodes to either side that a fourth difference takes
 GAP = REACH + 1  # nodes without anything past the last along each axis: a fourth difference, and the far border of a slab
@@ -43,7 +44,7 @@ class Spacing:
 FINEST = Spacing(4, 2)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("rows", "columns", "spacing"))
 class Region:
     """The bundles of a band that have nodes: those around all that is seen, as far as there is room.
 
@@ -72,7 +73,7 @@ def region_of(grid: Grid, rows: int, columns: int, spacing: Spacing) -> Region:
     return Region(row, column, rows, columns, spacing)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Lattice:
     """Sums at the nodes of a region, up to one common factor.
 
@@ -106,7 +107,3 @@ def sum_shards(shards: tuple[Lattice, ...]) -> Lattice:
     weight, weighted = jax.tree.map(lambda first, *others: sum(others, first), *values)
     evaluations = unshard(tuple(shard.evaluations for shard in shards))
     return dataclasses.replace(shards[0], weight=weight, weighted=weighted, evaluations=evaluations)
-
-
-jax.tree_util.register_dataclass(Region, data_fields=["row", "column"], meta_fields=["rows", "columns", "spacing"])
-jax.tree_util.register_dataclass(Lattice, data_fields=[field.name for field in dataclasses.fields(Lattice)], meta_fields=[])

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.slab_windows import SlabWindows
 from jaxsph.engine.field.fetch import position
+from jaxsph.numerics.trees import tree
 
 SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that a subsampled slab is marched at
 MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs
@@ -25,7 +25,7 @@ DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `field.methods`; to th
 NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class SlabSchedule:
     """Entries by the slab that they begin at; a slab that begins none is not `filled`.
 
@@ -90,8 +90,3 @@ def evaluations_of_slabs(schedule: SlabSchedule, samples: int, slab_samples: int
     in_slab = slab_samples + halo - jnp.maximum(beyond, 0)[:, None] * (schedule.level == 0)
     rays = 1 if schedule.method is None else jnp.where(schedule.method == SUBSAMPLED, len(SUBSAMPLE) ** 2 / BUNDLE**2, 1)
     return schedule.count.astype(jnp.float32) * rays * in_slab.astype(jnp.float32)
-
-
-jax.tree_util.register_dataclass(
-    SlabSchedule, data_fields=[field.name for field in dataclasses.fields(SlabSchedule)], meta_fields=[]
-)

@@ -15,18 +15,18 @@ import functools
 from collections.abc import Iterable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.fusion import barriers_kept
+from jaxsph.numerics.trees import tree
 
 MIN_WEIGHT = 2.0**20  # times the least normal number
 REDUCED = 2  # quantities whose sums, of weights among them, are reduced rather than carried
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("num_quantities",))
 class Sums:
     """Sums up to one common factor.
 
@@ -104,6 +104,3 @@ def by_rays(sums: Sums) -> list[Float[Array, "tasks samples rays"]]:
 def least_weight(dtype: Any) -> float:
     """The sum of weights below which a sample has no cotangents, as one over it could overflow."""
     return float(MIN_WEIGHT * jnp.finfo(dtype).tiny)
-
-
-jax.tree_util.register_dataclass(Sums, data_fields=["packed"], meta_fields=["num_quantities"])

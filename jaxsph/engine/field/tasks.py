@@ -15,12 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.numerics.trees import tree
 
 Sums = TypeVar("Sums")
 FEWEST = 256  # slabs of a task that are worth more than one loop: each is compiled
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("scattered",))
 class RayPackets:
     """Rays in tensor products: of a packet, through all pairs of a column and a row; or one by one.
 
@@ -85,7 +86,7 @@ class Part(NamedTuple):
     share: Float[Array, "tasks intervals rays"]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("perspective", "scattered", "between"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -238,11 +239,3 @@ class Turns(NamedTuple):
     def put(self, some: Sums, sums: Sums) -> Sums:
         """All sums, with some of these slabs."""
         return jax.tree.map(lambda new, old: jnp.concatenate([new, old[self.number :]]), some, sums)  # type: ignore[no-any-return]
-
-
-jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "real"], meta_fields=["scattered"])
-jax.tree_util.register_dataclass(
-    SlabTask,
-    data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border", "part"],
-    meta_fields=["perspective", "scattered", "between"],
-)

@@ -12,10 +12,8 @@ are summed side by side.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -26,13 +24,14 @@ from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 BLOCK = 16  # particles at once
 COLUMNS = ("x", "y", "z", "scale", "size", "quantity", "extinction_quantity")  # of particles, that samples depend on; one or two
 WIDTH = 8  # of a row of cotangents, one or two of them unused: it fills a vector, and is added as one
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class GatherCotangents:
     """Cotangents of particles, added up over all slabs so far, and of the samples of a chunk.
 
@@ -175,6 +174,3 @@ def _cotangents(particles: list[Array], s: Array, moments: tuple[Array, ...], *,
     # sum of dx u s + dy v s, as u s = dx + x: the cotangent of a common factor of u and v
     lateral = 2 * square - depth * in_z + x * in_x + y * in_y
     return jnp.stack(row, -1), jnp.where(solid, lateral, 0).sum(0), jnp.where(solid, in_z, 0).sum(0)
-
-
-jax.tree_util.register_dataclass(GatherCotangents, data_fields=["table", "lateral", "along"], meta_fields=[])

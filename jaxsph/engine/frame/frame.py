@@ -202,7 +202,7 @@ class Frame:
 
 def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:
     """Whether any medium meets spheres between samples."""
-    return registry.between_samples(plan.integrator) or any(medium.between_samples for medium in media)
+    return registry.integrator_class(plan.integrator).between or any(medium.between_samples for medium in media)
 
 
 def over_bands(plan: Plan, draw: Callable[[Int[Array, ""]], Drawn]) -> Drawn:

@@ -15,9 +15,9 @@ from jaxsph.engine.frame.claims import certified, disclaimed, faults_of_settings
 from jaxsph.engine.frame.layers import Drawn, Layers
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.executors import Clock
+from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
-from jaxsph.model.registry import ESTIMATING
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
 from jaxsph.numerics.version import __version__
@@ -84,7 +84,7 @@ def _counts(drawn: Drawn) -> dict[str, Any]:
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     """What a file says of how its image was made."""
     exact = settings.tolerance is None
-    estimator = settings.integrator if settings.integrator in ESTIMATING else settings.estimator
+    estimator = settings.integrator if registry.estimates(settings.integrator) else settings.estimator
     return (
         ("jaxsph.version", __version__),
         ("jaxsph.integrator", settings.integrator),

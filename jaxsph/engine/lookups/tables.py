@@ -5,14 +5,12 @@ Flow: transfer -> [tables] -> means over ranges -> cast -> image.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsph.model.transfer.function import SELECT_ALL, Segments
+from jaxsph.model.transfer.function import SELECT_ALL, Segments, at
+from jaxsph.numerics.trees import tree
 
 WIDENED = 1  # eps of a range's upper end and of the control points' that it is widened by: at least its next number
 FARTHEST = 2.0**120  # times the largest control point: where quantities are clamped, such that nothing overflows
@@ -21,7 +19,7 @@ ALL_PAIRS = 128  # up to this many control points, integrals between any two are
 EXTINCTION = 3  # the row of extinction; those before are emission of red, green and blue
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class MeanTables:
     """A transfer function prepared for means: made once, outside of loops.
 
@@ -122,11 +120,6 @@ def beyond(tables: MeanTables, row: int, point: int) -> Array:
     return value[row] if row == EXTINCTION else value[row] * value[EXTINCTION]
 
 
-def at(row: Array, i: Array) -> Array:
-    """`row[i]` for indices known to be in range."""
-    return row.at[i].get(mode="promise_in_bounds")
-
-
 def ends(tables: MeanTables, near: Array, far: Array) -> tuple[Array, Array]:
     """Positions of the lower and the upper end of ranges, widened."""
     return ordered(near * tables.unit, far * tables.unit, 1)
@@ -164,6 +157,3 @@ def split(lo: Array, hi: Array, first: Array, last: Array) -> tuple[Array, Array
     below = lesser(first, hi) - lesser(first, lo)
     above = greater(last, hi) - greater(last, lo)
     return below, above, clamped(lo, first, last), clamped(hi, first, last)
-
-
-jax.tree_util.register_dataclass(MeanTables, data_fields=[f.name for f in dataclasses.fields(MeanTables)], meta_fields=[])

@@ -12,10 +12,10 @@ from jaxsph.engine.media.octree_particles import OctreeParticles
 from jaxsph.engine.media.octree_points import OctreePoints
 from jaxsph.engine.media.octree_sums import reach_of
 from jaxsph.engine.media.within import Within
+from jaxsph.model import registry
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles import Particles
 from jaxsph.model.periodic import with_ghosts
-from jaxsph.model.registry import AT_POINTS
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
@@ -63,7 +63,7 @@ def octree_plans(scene: Scene) -> tuple[OctreePlan, ...]:
 
 def reachable(scene: Scene, settings: Settings) -> Scene:
     """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
-    return in_octree(scene) if settings.integrator in AT_POINTS and _sets(scene) else scene
+    return in_octree(scene) if registry.integrator_class(settings.integrator).asks_points and _sets(scene) else scene
 
 
 def _sets(scene: Scene) -> tuple[Particles, ...]:

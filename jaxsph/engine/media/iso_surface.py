@@ -27,6 +27,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.trees import tree
 
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
 POLISHED = 2  # steps of Newton's after those: the last has the derivatives, and they are as good as the root before it
@@ -34,7 +35,7 @@ OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other
 Coordinates = list[Float[Array, "tasks samples rays"]]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class IsoSurface(Medium):
     r"""Where a volume first crosses a level along each ray; make it with `from_volume`.
 
@@ -252,6 +253,3 @@ def _gradient(grid: VolumeGrid, place: Coordinates) -> Coordinates:
         low, high = ([side if k == axis else at for k, at in enumerate(place)] for side in (before, behind))
         found.append((grid.interpolate(high) - grid.interpolate(low)) / (behind - before))
     return found
-
-
-jax.tree_util.register_dataclass(IsoSurface, data_fields=[field.name for field in dataclasses.fields(IsoSurface)], meta_fields=[])

@@ -23,11 +23,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "..."]]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("mix",))
 class Mixture(Medium):
     """Several media as one.
 
@@ -138,6 +139,3 @@ def mixed_colors(colors: list[Optics], extinctions: Optics, path: Float[Array, "
 def _opacity(extinction: Float[Array, "..."], path: Float[Array, "..."]) -> Float[Array, "..."]:
     """Of an interval; a unit length where that has none, which is the limit."""
     return jnp.where(path > 0, -jnp.expm1(-extinction * path), extinction)
-
-
-jax.tree_util.register_dataclass(Mixture, data_fields=["media"], meta_fields=["mix"])

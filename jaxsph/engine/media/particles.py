@@ -11,7 +11,6 @@ Whatever there is for each quantity is a tuple here, of which the first is that 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -34,6 +33,7 @@ from jaxsph.engine.media.between import SumsBetween, intervals_between, pull_cov
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 EXTINCTION = slice(3, 4)
 
@@ -68,7 +68,7 @@ class ParticleCotangents(NamedTuple):
         return TransferFunction(first[4], first[:3].T, last[3], None if len(self.transfer) == 1 else last[4])
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("kernel", "wanted"))
 class ParticleMedium(Medium):
     """Particles of a band, or of a shard of it.
 
@@ -265,8 +265,3 @@ def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Float[
     rows = jnp.concatenate([values * (1 - part), values * part]).T
     added = jnp.zeros((points, 10), values.dtype).at[segment].add(rows, mode="promise_in_bounds").T
     return added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
-
-
-jax.tree_util.register_dataclass(
-    ParticleMedium, data_fields=["grid", "segments", "tables", "lattice"], meta_fields=["kernel", "wanted"]
-)

@@ -32,6 +32,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.profiles import Chord, Profile, Shaped
 from jaxsph.numerics import faults
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 BLOCK = 4  # points whose chords are held at once
 PARTS = 4, 16  # of the slabs of a task that have loops of their own: points are clustered
@@ -45,7 +46,7 @@ class Listed(NamedTuple):
     border: Float[Array, " samples_and_one"]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("first", "spread"))
 class PointsMedium(Medium):
     """A point set in view space.
 
@@ -276,10 +277,3 @@ class _Some(NamedTuple):
 
 def _moved(task: SlabTask, places: OfPlaces) -> SlabTask:
     return dataclasses.replace(task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor)
-
-
-jax.tree_util.register_dataclass(
-    PointsMedium,
-    data_fields=["table", "attributes", "axes", "splat", "profile", "fault", "lists"],
-    meta_fields=["first", "spread"],
-)

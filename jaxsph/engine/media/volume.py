@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.intervals import Intervals, means_of
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.lookups.joined import joined
 from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
@@ -27,6 +26,7 @@ from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
+from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
 
@@ -47,7 +47,7 @@ class AlongSlab(NamedTuple):
     exit: Float[Array, "tasks rays"]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class VolumeMedium(Medium):
     """A volume in view space.
 
@@ -75,7 +75,7 @@ class VolumeMedium(Medium):
             held fixed.
         """
         grid, ranges = VolumeGrid.seen(volume, camera), MacrocellRanges.of(volume.values)
-        transfer = joined(jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer))
+        transfer = jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer).joined()
         still = jax.tree.map(jax.lax.stop_gradient, transfer)
         placed = jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all()
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
@@ -155,6 +155,3 @@ class VolumeMedium(Medium):
     ) -> tuple[VolumeMedium, OfPlaces]:
         """See `Medium.pull`: tables are made again, such that the transfer function has their cotangents."""
         return super(VolumeMedium, dataclasses.replace(self, tables=None)).pull(total, gathered, task, cotangents)
-
-
-jax.tree_util.register_dataclass(VolumeMedium, data_fields=["grid", "segments", "shown", "fault", "tables"], meta_fields=[])

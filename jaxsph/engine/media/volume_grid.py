@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
@@ -16,12 +15,13 @@ from jaxsph.engine.access.extents import SlabExtents
 from jaxsph.engine.access.macrocells import Occupancy
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.trees import tree
 
 ROUNDING = 32  # eps of view coordinates that a computed grid coordinate may be off by: six products, their sums, and the box's
 PAIRS = lax.GatherDimensionNumbers(offset_dims=(3,), collapsed_slice_dims=(), start_index_map=(0,))
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class VolumeGrid:
     """Values on a grid in view space. Grid coordinates count in cells: the points are where all three are whole numbers.
 
@@ -119,6 +119,3 @@ def _pair(row: Array, at: Array, dtype: jnp.dtype) -> tuple[Array, Array]:
 def _lerp(first: Array, second: Array, part: Array) -> Array:
     """Exact where both are equal."""
     return first + part * (second - first)
-
-
-jax.tree_util.register_dataclass(VolumeGrid, data_fields=["values", "origin", "cells"], meta_fields=[])

@@ -24,9 +24,10 @@ from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.medium import LIGHT, Medium, OfPlaces
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Within(Medium):
     """Part of a medium: `jaxsph.Within(medium, clip)`, in `Scene(media=...)`; all of a scene by `Scene(within=clip)`.
 
@@ -183,6 +184,3 @@ def _parts(task: SlabTask, clip: Clip, depth: Float[Array, "tasks samples"], fac
         total = total + jnp.where(filled, leaves - enters, 0)
         low, high = jnp.minimum(low, jnp.where(filled, enters, 1)), jnp.maximum(high, jnp.where(filled, leaves, 0))
     return Part(low, jnp.maximum(high, low), total)
-
-
-jax.tree_util.register_dataclass(Within, data_fields=["medium", "clip"], meta_fields=[])

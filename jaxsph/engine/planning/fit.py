@@ -31,9 +31,8 @@ from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import Particles, capacity_class
 from jaxsph.model.periodic import num_ghosts
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings
-from jaxsph.model.spheres import spheres_of
 from jaxsph.numerics.checks import is_traced
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -119,7 +118,7 @@ def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
 
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
-    return bool(scene.point_sets) or registry.between_samples(integrator)
+    return bool(scene.point_sets) or registry.integrator_class(integrator).between
 
 
 @compiled_quickly

@@ -24,12 +24,11 @@ from jaxsph.engine.planning.memory_estimate import frame_bytes, quadtree_bytes
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning
 from jaxsph.engine.screen.quadtree import QuadtreePlan
+from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles import capacity_class
-from jaxsph.model.registry import AT_POINTS
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, num_spheres
 from jaxsph.model.settings import Settings
-from jaxsph.model.spheres import num_spheres
 
 MIN_PACKETS = 64  # bundles cast together, by a quadtree
 MAX_CAPACITY = 1 << 30
@@ -306,7 +305,7 @@ def in_bands(
 
 def _step_tolerance(settings: Settings) -> float | None:
     """That of integrators that have one, so that plans of others are the same whatever it is."""
-    return float(settings.step_tolerance) if settings.integrator in AT_POINTS else None
+    return float(settings.step_tolerance) if registry.integrator_class(settings.integrator).asks_points else None
 
 
 def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, lists: ListPlan) -> QuadtreePlan:

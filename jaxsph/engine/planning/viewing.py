@@ -26,8 +26,7 @@ from jaxsph.model.clips.clips import Clip
 from jaxsph.model.in_range import scene_in_range
 from jaxsph.model.medium import Medium
 from jaxsph.model.periodic import unfolded
-from jaxsph.model.scene import Scene
-from jaxsph.model.spheres import first_spheres, num_spheres, spheres_of
+from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 

@@ -21,8 +21,8 @@ from jaxsph.io.settle.assemble import OF_FILE, range_of, rounding_note
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, plain
 from jaxsph.model.points import Points
-from jaxsph.model.transfer.colormaps import colormap as colors_of_map
-from jaxsph.model.transfer.colormaps import value_range
+from jaxsph.model.transfer.maps import colormap as colors_of_map
+from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import given
 
 RADIUS_NAMES = ("radius", "radii", "rad", "r", "size")

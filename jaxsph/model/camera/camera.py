@@ -21,8 +21,8 @@ from jaxtyping import Array, Float
 
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.trees import tree
 
-PROJECTIONS = ("perspective", "orthographic")
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
 
 
@@ -53,7 +53,7 @@ class BoundingBox(NamedTuple):
         return self.lower, self.upper
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("width", "height", "projection", "stride"))
 class Camera:
     """A perspective or orthographic camera; make it with `look_at`, `orthographic` or `framing`.
 
@@ -324,10 +324,3 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
         raise ValueError(f"`near` must be > 0 for a perspective camera, got {near}; samples are spaced geometrically from it")
     if np.float32(near) >= np.float32(far) and not jax.config.read("jax_enable_x64"):
         raise ValueError(f"`near` = {near} and `far` = {far} are the same number in float32; move them apart")
-
-
-jax.tree_util.register_dataclass(
-    Camera,
-    data_fields=["eye", "axes", "half_height", "near", "far", "eye_rest"],
-    meta_fields=["width", "height", "projection", "stride"],
-)

@@ -19,11 +19,8 @@ from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.leg import Leg, made
 from jaxsph.numerics.given import plain
 
-MAX_TURN = 90.0
-"""Degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one."""
-
-NEAREST = 1e-3
-"""Smallest near over far where a ball reaches the eye: sample depths are geometric between them."""
+MAX_TURN = 90.0  # degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one
+NEAREST = 1e-3  # smallest near over far where a ball reaches the eye: sample depths are geometric between them
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,16 +10,14 @@ more of the other side, products of both.
 from __future__ import annotations
 
 import abc
-import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.trees import tree
 
-Made = TypeVar("Made", bound="Clip")
 Place = tuple[Float[Array, "..."], ...]
 """Coordinates x, y and z of points."""
 
@@ -64,10 +62,10 @@ class Clip(abc.ABC):
 
     @abc.abstractmethod
     def over(self, lower: Place, upper: Place) -> Overlap:
-        """How it lies to boxes. Theorem: no rounding of this or of `contains` makes either answer wrong, see `ROUNDING`."""
+        """Which boxes it meets, and which it holds: both are right whatever is rounded here and in `contains`."""
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Outside(Clip):
     """The other side of a clip: `~clip`."""
 
@@ -93,7 +91,7 @@ class Outside(Clip):
         return Overlap(~inner.holds, ~inner.meets)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Both(Clip):
     """What is in both of two clips: `first & second`."""
 
@@ -152,37 +150,3 @@ def _sorted(values: Array) -> Array:
             pair = rows[k : k + 2]
             rows[k : k + 2] = jnp.where(swapped, pair[1], pair[0]), jnp.where(swapped, pair[0], pair[1])
     return jnp.stack(rows)
-
-
-def fill(clip: Clip, /, **fields: Any) -> None:
-    """Set the fields of a frozen clip that is being made."""
-    for name, value in fields.items():
-        object.__setattr__(clip, name, value)
-
-
-def made(kind: type[Made], /, **fields: Any) -> Made:
-    """A clip of such fields, unchecked."""
-    clip = object.__new__(kind)
-    fill(clip, **fields)
-    return clip
-
-
-def register(kind: type[Clip]) -> None:
-    """A pytree that is made again of whatever JAX puts into it, without a check."""
-    names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    keys = [jax.tree_util.GetAttrKey(name) for name in names]
-
-    def flatten_with_keys(clip: Any) -> tuple[list[tuple[Any, Any]], None]:
-        return [(key, getattr(clip, name)) for key, name in zip(keys, names, strict=True)], None
-
-    def unflatten(_: None, leaves: Any) -> Any:
-        return made(kind, **dict(zip(names, leaves, strict=True)))
-
-    def flatten(clip: Any) -> tuple[list[Any], None]:
-        return [getattr(clip, name) for name in names], None
-
-    jax.tree_util.register_pytree_with_keys(kind, flatten_with_keys, unflatten, flatten)
-
-
-for _kind in (Outside, Both):
-    register(_kind)

@@ -5,6 +5,7 @@ Flow: user -> [clip_shapes] -> clips -> scene.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from typing import Any
 
@@ -14,14 +15,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common, fill, made, register
+from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.trees import fill, tree, unchecked_of
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
 
 
-@dataclasses.dataclass(frozen=True, init=False)
+@tree(unchecked=True, init=False)
 class Plane(Clip):
     """What lies on the side of a plane that its normal points to; `~plane` is the other side.
 
@@ -60,7 +62,7 @@ class Plane(Clip):
         """See `Clip`."""
         point = camera.to_view(self.point, self.rest)
         normal = camera.rotate(self.normal).astype(point.dtype)
-        return made(Plane, point=point, normal=normal, rest=jnp.zeros_like(point))
+        return unchecked_of(Plane, point=point, normal=normal, rest=jnp.zeros_like(point))
 
     def contains(self, place: Place) -> Bool[Array, "..."]:
         """See `Clip`."""
@@ -79,8 +81,35 @@ class Plane(Clip):
         return _along(self.normal, place, self.point)
 
 
-@dataclasses.dataclass(frozen=True, init=False)
-class Box(Clip):
+class _Boxed(Clip):
+    """What boxes have in common, whose frame is their lower corner, their axes and their sides."""
+
+    @abc.abstractmethod
+    def _frame(self) -> tuple[Array, Array, Array]: ...
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        origin, axes, sides = self._frame()
+        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(_all_along(axes, place, origin), sides, strict=True))
+        return x & y & z
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        origin, axes, sides = self._frame()
+        ways = zip(_all_along(axes, begin, origin), _all_along(axes, end, origin), sides, strict=True)
+        x, y, z = (common(_halves(first, last), _halves(side - first, side - last)) for first, last, side in ways)
+        return common(common(x, y), z)
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        meets: Any = True
+        holds: Any = True
+        origin, axes, sides = self._frame()
+        for axis, side in zip(axes, sides, strict=True):
+            low, high = _heights(origin, axis, lower, upper, jnp.abs(side))
+            meets, holds = meets & (high >= 0) & (low <= side), holds & (low >= 0) & (high <= side)
+        return Overlap(meets, holds)
+
+
+@tree(unchecked=True, init=False)
+class Box(_Boxed):
     """A box along the axes; `~box` is all but it.
 
     Attributes:
@@ -116,22 +145,10 @@ class Box(Clip):
         """Lengths along x, y and z."""
         return (self.upper - self.lower) + (self.rest[1] - self.rest[0])
 
-    def seen_by(self, camera: Camera) -> TurnedBox:
+    def seen_by(self, camera: Camera) -> _TurnedBox:
         """See `Clip`."""
         origin = camera.to_view(self.lower, self.rest[0])
-        return TurnedBox(origin, camera.axes.T.astype(origin.dtype), self.sides.astype(origin.dtype))
-
-    def contains(self, place: Place) -> Bool[Array, "..."]:
-        """See `Clip`."""
-        return self._turned().contains(place)
-
-    def spans(self, begin: Place, end: Place) -> Spans:
-        """See `Clip`."""
-        return self._turned().spans(begin, end)
-
-    def over(self, lower: Place, upper: Place) -> Overlap:
-        """See `Clip`."""
-        return self._turned().over(lower, upper)
+        return _TurnedBox(origin, camera.axes.T.astype(origin.dtype), self.sides.astype(origin.dtype))
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner in float64 (host side)."""
@@ -142,12 +159,12 @@ class Box(Clip):
         """The same in float32 or float64 (host side)."""
         return Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in self.corners()))
 
-    def _turned(self) -> TurnedBox:
-        return TurnedBox(self.lower, jnp.eye(3, dtype=self.lower.dtype), self.sides)
+    def _frame(self) -> tuple[Array, Array, Array]:
+        return self.lower, jnp.eye(3, dtype=self.lower.dtype), self.sides
 
 
-@dataclasses.dataclass(frozen=True)
-class TurnedBox(Clip):
+@tree()
+class _TurnedBox(_Boxed):
     """A box along axes of its own.
 
     Attributes:
@@ -160,39 +177,15 @@ class TurnedBox(Clip):
     axes: Float[Array, "3 3"]
     sides: Float[Array, "3"]
 
-    def seen_by(self, camera: Camera) -> TurnedBox:
-        """See `Clip`."""
+    def seen_by(self, camera: Camera) -> _TurnedBox:
         turned = jnp.stack([camera.rotate(axis) for axis in self.axes])
-        return TurnedBox(camera.to_view(self.origin), turned, self.sides)
+        return _TurnedBox(camera.to_view(self.origin), turned, self.sides)
 
-    def contains(self, place: Place) -> Bool[Array, "..."]:
-        """See `Clip`."""
-        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(self._coordinates(place), self.sides, strict=True))
-        return x & y & z
-
-    def spans(self, begin: Place, end: Place) -> Spans:
-        """See `Clip`."""
-        spans = None
-        for first, last, side in zip(self._coordinates(begin), self._coordinates(end), self.sides, strict=True):
-            between = common(_halves(first, last), _halves(side - first, side - last))
-            spans = between if spans is None else common(spans, between)
-        assert spans is not None
-        return spans
-
-    def over(self, lower: Place, upper: Place) -> Overlap:
-        """See `Clip`."""
-        meets: Any = True
-        holds: Any = True
-        for axis, side in zip(self.axes, self.sides, strict=True):
-            low, high = _heights(self.origin, axis, lower, upper, jnp.abs(side))
-            meets, holds = meets & (high >= 0) & (low <= side), holds & (low >= 0) & (high <= side)
-        return Overlap(meets, holds)
-
-    def _coordinates(self, place: Place) -> list[Array]:
-        return [_along(axis, place, self.origin) for axis in self.axes]
+    def _frame(self) -> tuple[Array, Array, Array]:
+        return self.origin, self.axes, self.sides
 
 
-@dataclasses.dataclass(frozen=True, init=False)
+@tree(unchecked=True, init=False)
 class Sphere(Clip):
     """A ball; `~sphere` is all but it.
 
@@ -226,7 +219,7 @@ class Sphere(Clip):
     def seen_by(self, camera: Camera) -> Sphere:
         """See `Clip`."""
         center = camera.to_view(self.center, self.rest)
-        return made(Sphere, center=center, radius=self.radius.astype(center.dtype), rest=jnp.zeros_like(center))
+        return unchecked_of(Sphere, center=center, radius=self.radius.astype(center.dtype), rest=jnp.zeros_like(center))
 
     def contains(self, place: Place) -> Bool[Array, "..."]:
         """See `Clip`."""
@@ -290,6 +283,10 @@ def _along(axis: Array, place: Place, origin: Array) -> Array:
     return axis[0] * x + axis[1] * y + axis[2] * z
 
 
+def _all_along(axes: Array, place: Place, origin: Array) -> list[Array]:
+    return [_along(axis, place, origin) for axis in axes]
+
+
 def _heights(origin: Array, axis: Array, lower: Place, upper: Place, further: Any = 0.0) -> tuple[Array, Array]:
     """The least and the greatest coordinate of boxes along an axis, rounded outwards; `further` is what they are held against."""
     low: Any = 0
@@ -319,7 +316,3 @@ def _halves(first: Array, last: Array) -> Spans:
 
 def _span(begin: Array, end: Array) -> Spans:
     return ascending(jnp.clip(begin, 0, 1)[None], jnp.clip(end, 0, 1)[None])
-
-
-for _kind in (Plane, Box, TurnedBox, Sphere):
-    register(_kind)

@@ -1,6 +1,6 @@
-r"""Domains: where on the axis of a quantity the colours of a map sit.
+r"""Domains: where on the axis of a quantity the colours of a map sit; and scales, on which an axis of control values is drawn.
 
-Flow: quantity, name of a domain -> [domains] -> control values -> TransferFunction.
+Flow: quantity, name of a domain -> [domains] -> control values -> TransferFunction; control values -> [Scale] -> bins, axes.
 
 A transfer function is linear in Q between its control points, whatever the domain: a domain lays the points. The points of a map
 are at even places $t_k = k / (K - 1)$, and a domain says which value is at which place:
@@ -24,6 +24,7 @@ References: Webber 2012, *A bi-symmetric log transformation for wide-range data*
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -31,14 +32,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.transfer.colormaps import POINTS, TAILS, value_range
+from jaxsph.model.transfer.maps import POINTS, TAILS, value_range
 from jaxsph.numerics.given import own
 
-LINEAR_SHARE = 1e-3
-"""Width around zero in which `symlog` is about linear, over the largest value, unless it is given."""
-
-UNRESOLVED = 1e-6
-"""Of the largest value: ends that are nearer to each other float32 would not tell apart."""
+LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
+EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
+FEW = 8  # control points fewer than this were laid by hand, and not by a domain: their axis is linear
+WIDE = 2.0  # largest over least of control values from which an even spacing of logarithms is meant as such
+UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
 
 
 def control_values(
@@ -161,21 +162,16 @@ def _log(asked: _Asked) -> np.ndarray:
             raise ValueError(f"`{name}` = {end:g} must be > 0 for the domain 'log'{least}; {remedy}")
     if asked.values is not None and not positive.size and None in (asked.low, asked.high):
         raise ValueError("the domain 'log' needs positive values, and the quantity has none; use 'symlog' or 'linear'")
-    _refuse_single(asked, positive)
-    low, high = (None if end is None else float(np.log(end)) for end in (asked.low, asked.high))
-    values = None if asked.values is None else np.log(positive)
-    first, last = asked._replace(values=values, low=low, high=high).ends()
-    made = np.exp(first + (last - first) * asked.place)
-    return _with_ends(made, asked.low, asked.high)
-
-
-def _refuse_single(asked: _Asked, positive: np.ndarray) -> None:
-    """One positive value beside others gives no range to choose."""
     others = 0 if asked.values is None else asked.values.size - positive.size
     if others and None in (asked.low, asked.high) and positive.min() == positive.max():
         count = f"{others:,} of {others + positive.size:,} are not positive"
         what = f"{positive.min():g} is the only positive value of the quantity, {count}"
         raise ValueError(f"the domain 'log' finds no range: {what}; use 'symlog' or 'linear'")
+    low, high = (None if end is None else float(np.log(end)) for end in (asked.low, asked.high))
+    values = None if asked.values is None else np.log(positive)
+    first, last = asked._replace(values=values, low=low, high=high).ends()
+    made = np.exp(first + (last - first) * asked.place)
+    return _with_ends(made, asked.low, asked.high)
 
 
 def _symlog(asked: _Asked) -> np.ndarray:
@@ -237,3 +233,55 @@ DOMAINS: dict[str, Callable[[_Asked], np.ndarray]] = {
     "equalised": _equalised,
 }
 """The domains by name."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scale:
+    """A monotone map from values to places, 0 at the first control value and 1 at the last.
+
+    Attributes:
+        name: "linear", "log", or "even": control values are at even places, and it is linear in between.
+        values: ascending control values, at least two of them different.
+    """
+
+    name: str
+    values: Float[np.ndarray, " points"]
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " points"]) -> Scale:
+        """The scale on which control values are evenly spaced; linear where there are few, or two are equal.
+
+        All equal, or a single one, they are given an axis of width 1 around them (of values over 1, of their size).
+        """
+        values = np.asarray(values, np.float64)
+        first, last = values[0], values[-1]
+        if not last > first:
+            half = max(abs(first), 1.0) / 2
+            return cls("linear", np.array([first - half, first + half]))
+        if len(values) < 3 or _is_even(values):
+            return cls("linear", values)
+        if first > 0 and last > WIDE * first and _is_even(np.log(values)):
+            return cls("log", values)
+        return cls("even" if len(values) >= FEW and (np.diff(values) > 0).all() else "linear", values)
+
+    def place(self, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Places of values; outside of the control values below 0 and above 1, of "even" 0 and 1."""
+        value, (first, last) = np.asarray(value, np.float64), self.values[[0, -1]]
+        if self.name == "even":
+            return np.interp(value, self.values, np.linspace(0, 1, len(self.values)))
+        if self.name == "linear":
+            return (value - first) / (last - first)
+        positive = np.where(value > 0, value, 1)
+        return np.where(value > 0, np.log(positive / first) / np.log(last / first), -np.inf)
+
+    def value(self, place: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Values at places."""
+        place, (first, last) = np.asarray(place, np.float64), self.values[[0, -1]]
+        if self.name == "even":
+            return np.interp(place, np.linspace(0, 1, len(self.values)), self.values)
+        return first + (last - first) * place if self.name == "linear" else first * (last / first) ** place
+
+
+def _is_even(values: np.ndarray) -> bool:
+    off = np.abs(values - np.linspace(values[0], values[-1], len(values))).max()
+    return bool(off <= EVEN * (values[-1] - values[0]))

@@ -5,8 +5,9 @@ Flow: [transfer] -> cast -> image.
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+import os
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.transfer.ways import TransferWays
+from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.trees import tree
 
 
-@dataclasses.dataclass(frozen=True)
-class TransferFunction(TransferWays):
+@tree()
+class TransferFunction:
     """Piecewise linear map of a quantity Q to colour and extinction, clamped at its ends.
 
     Two equal neighbours in `values` make a jump; the later point holds at the jump itself.
@@ -37,6 +38,12 @@ class TransferFunction(TransferWays):
     colors: Float[Array, "points 3"]
     extinction: Float[Array, " points_of_extinction"]
     extinction_values: Float[Array, " points_of_extinction"] | None = None
+
+    presets: ClassVar[Callable[..., TransferFunction]]
+    writer: ClassVar[Callable[..., None]]
+    reader: ClassVar[Callable[..., TransferFunction]]
+    drawer: ClassVar[Callable[..., Any]]
+    """What rooms above this one know: presets, files and figures."""
 
     @classmethod
     def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
@@ -89,6 +96,68 @@ class TransferFunction(TransferWays):
                 _require_apart(name, np.asarray(given[name], np.float64), packed[name])
         return cls(**packed)
 
+    @classmethod
+    def from_colormap(cls, colors: Any, values: Any, extinction: Any = 1.0) -> TransferFunction:
+        """A transfer function whose colours are those of a map, evenly placed over its control values.
+
+        Args:
+            colors: name of a colour map, or (M, 3) colours from low to high.
+            values: (K,) control values, as `jaxsph.control_values` lays them; or two ends, between which 16 are evenly spaced.
+            extinction: per length unit: a number, or any number of them from the low end to the high, evenly placed.
+
+        Raises:
+            ValueError: an unknown colour map, or what `from_points` refuses.
+        """
+        return cls.from_points(*of_colormap(colors, values, extinction))
+
+    @classmethod
+    def from_matplotlib(
+        cls,
+        cmap: Any,
+        norm: Any = None,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        extinction: Any = 1.0,
+        points: int = POINTS,
+    ) -> TransferFunction:
+        """A transfer function of a colour map of matplotlib's, as a figure made with the same map and norm shows a quantity.
+
+        Args:
+            cmap: a `Colormap`, or its name. Extinction is multiplied by its alpha.
+            norm: such as `Normalize`, `LogNorm`, `SymLogNorm`, with its `vmin` and `vmax`; `None` is linear from `low` to `high`.
+                Of a `BoundaryNorm` the colours jump at its boundaries.
+            low, high: ends, where the norm does not have them.
+            extinction: per length unit: a number, or any number of them from the low end to the high, evenly placed.
+            points: control points; at these the colours are the map's.
+
+        Raises:
+            ImportError: `cmap` is a name, and matplotlib is not installed.
+            ValueError: an unknown name, a norm without its ends or without an inverse.
+        """
+        return cls.from_points(*of_matplotlib(cmap, norm, low, high, extinction, points))
+
+    @classmethod
+    def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:
+        """One that suits a kind of data, `"fluid"`, `"density"`, ..., of particles or a volume; see `jaxsph.scenes.preset`."""
+        return cls.presets(name, shown, **more)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
+        """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
+        return cls.reader(path)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
+        type(self).writer(path, self)
+
+    def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
+        """A figure of matplotlib's: colours and extinction, over the histogram of what rays of `camera` meet in `scene`.
+
+        See `jaxsph.plot.transfer_figure.transfer_figure` for `more`.
+        """
+        return type(self).drawer(self, scene, camera, **more)
+
     def __call__(
         self, quantity: Float[Array, "..."], extinction_quantity: Float[Array, "..."] | None = None
     ) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
@@ -105,7 +174,7 @@ class TransferFunction(TransferWays):
         return jnp.stack(channels[:3], -1), of_other[3]
 
     def parts(self) -> tuple[TransferFunction, ...]:
-        """By the quantities that they are looked up by: itself; or colours, where extinction is 1, and extinction in black."""
+        """One function for each quantity: itself, or one of the colours (with extinction 1) and one of extinction (in black)."""
         if self.extinction_values is None:
             return (self,)
         black = jnp.zeros((*self.extinction.shape, 3), self.colors.dtype)
@@ -113,6 +182,25 @@ class TransferFunction(TransferWays):
             TransferFunction(self.values, self.colors, jnp.ones_like(self.values)),
             TransferFunction(self.extinction_values, black, self.extinction),
         )
+
+    def joined(self) -> TransferFunction:
+        """The same functions of one quantity, both given at the control points of either.
+
+        Between neighbours of all control points both functions are linear, so that nothing changes but for rounding. At a jump of
+        either, the first of equal points has what lies before it, the others what lies behind.
+
+        Differentiation:
+            By all numbers of the transfer function.
+        """
+        if self.extinction_values is None:
+            return self
+        values = jnp.sort(jnp.concatenate([self.values, self.extinction_values]))
+        first = jnp.append(True, values[1:] > values[:-1])[:, None]
+        tables = (self.values, self.colors), (self.extinction_values, self.extinction[:, None])
+        colors, extinction = (
+            jnp.where(first, _one_sided(*table, values, "left"), _one_sided(*table, values, "right")) for table in tables
+        )
+        return TransferFunction(values, colors, extinction[:, 0])
 
     def segments(self) -> Segments:
         """The tables that `look_up` reads, of what has no `extinction_values`: made once, outside of loops."""
@@ -132,10 +220,16 @@ class TransferFunction(TransferWays):
         return Segments(self.values, inverse, table, change, below, rate, fullest, off.all() & (extent > 0))
 
 
-def numbers(name: str, value: Any) -> Any:
-    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
-    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
-    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
+def _one_sided(
+    points: Float[Array, " points"], table: Float[Array, "points channels"], at: Float[Array, " places"], side: str
+) -> Float[Array, "places channels"]:
+    """What a table has at places, at a jump that of its left or right side."""
+    last = points.shape[0] - 1
+    above = jnp.searchsorted(lax.stop_gradient(points), lax.stop_gradient(at), side=side)
+    before, after = jnp.clip(above - 1, 0, last), jnp.clip(above, 0, last)
+    width = points[after] - points[before]
+    part = jnp.where(width > 0, (at - points[before]) / jnp.where(width > 0, width, 1), 0)[:, None]
+    return table[before] * (1 - part) + table[after] * part
 
 
 def _require_ascending(name: str, given: Any) -> None:
@@ -148,7 +242,7 @@ def _require_ascending(name: str, given: Any) -> None:
 
 
 def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:
-    """Refuse values that rounding moves by a share of what they span, or takes for (nearly) nothing."""
+    """Refuse values that rounding moves by too much of what they span, or nearly makes zero."""
     span, largest = given[-1] - given[0], np.abs(given).max()
     moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), MIN_NORMALS * np.finfo(packed.dtype).tiny
     if moved > MOVED * span:
@@ -167,7 +261,7 @@ MOVED = 2.0**-12  # of the span of its values that a transfer function's values 
 MIN_NORMALS = 2.0**16  # smallest normal numbers that values must reach: quantities among them are then not taken for zero
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Segments:
     """A transfer function cut into segments; the last reaches to infinity and is constant.
 
@@ -196,7 +290,7 @@ SELECT_ALL = 16  # up to this many control points a chain of selects vectorises,
 
 
 def look_up(segments: Segments, quantity: Float[Array, "..."]) -> list[Float[Array, "..."]]:
-    """`[red, green, blue, extinction]` of `quantity`, each of its shape; or what else the tables' channels are.
+    """The channels of the tables at `quantity`, each of its shape: of a transfer function red, green, blue and extinction.
 
     A segment is evaluated as base + part * change from its own beginning, so control points are met exactly (evenly spaced
     ones to a few eps of the whole range).
@@ -217,7 +311,7 @@ def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(N
     bases, changes = (list(table)[channels] for table in (segments.base, segments.change))
     if len(place) == 2:
         i, part = place
-        return [_at(base, i) + part * _at(change, i) for base, change in zip(bases, changes, strict=True)]
+        return [at(base, i) + part * at(change, i) for base, change in zip(bases, changes, strict=True)]
     rows = [segments.start, segments.inverse, *bases, *changes]
     start, inverse, *found = _selected(rows, segments.start, place[0])
     part = jnp.clip((place[0] - start) * inverse, 0, 1)
@@ -225,7 +319,7 @@ def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(N
 
 
 def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Array, "*any"], Float[Array, "*any"]]:
-    """Segment that holds `quantity`, and the share of it that lies before: what `look_up` interpolates by."""
+    """Segment that holds `quantity`, and how far along it the quantity is, in [0, 1]."""
     if segments.start.shape[0] > SELECT_ALL:
         return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
     each = jnp.arange(segments.start.shape[0], dtype=jnp.int32)
@@ -239,7 +333,7 @@ def slope_in_middle(
     """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
     middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
     slopes, place = jnp.clip(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
-    slope = _at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
+    slope = at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
     return jnp.where(middle >= segments.start[0], slope, 0)
 
 
@@ -252,7 +346,7 @@ def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
     return found
 
 
-def _at(row: Array, i: Array) -> Array:
+def at(row: Array, i: Array) -> Array:
     """`row[i]` for indices known to be in range: a clamped gather is a third slower."""
     return row.at[i].get(mode="promise_in_bounds")
 
@@ -270,18 +364,18 @@ def _segment(segments: Segments, quantity: Array) -> Array:
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) // 2
-        past = (low < high) & (quantity >= _at(segments.start, jnp.minimum(middle, count - 1)))
+        past = (low < high) & (quantity >= at(segments.start, jnp.minimum(middle, count - 1)))
         return jnp.where(past, middle + 1, low), jnp.where(past | (low >= high), high, middle)
 
     steps = 32 - lax.clz(segments.fullest)
-    not_above = lax.fori_loop(0, steps, halve, (_at(segments.below, bucket), _at(segments.below, bucket + 1)))[0]
+    not_above = lax.fori_loop(0, steps, halve, (at(segments.below, bucket), at(segments.below, bucket + 1)))[0]
     return jnp.maximum(not_above - 1, 0)
 
 
 def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     """Segment and place within it, for any control points."""
     i = _segment(segments, quantity)
-    return i, jnp.clip((quantity - _at(segments.start, i)) * _at(segments.inverse, i), 0, 1)
+    return i, jnp.clip((quantity - at(segments.start, i)) * at(segments.inverse, i), 0, 1)
 
 
 @jax.custom_jvp
@@ -298,11 +392,7 @@ def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) 
     """Control points that move one by one are evenly spaced no more, so the place within a segment changes as in any other."""
     (segments, quantity), (segments_dot, quantity_dot) = primals, tangents
     i, part = _evenly(segments, quantity)
-    start, inverse = _at(segments.start, i), _at(segments.inverse, i)
-    change = (quantity_dot - _at(segments_dot.start, i)) * inverse + (quantity - start) * _at(segments_dot.inverse, i)
+    start, inverse = at(segments.start, i), at(segments.inverse, i)
+    change = (quantity_dot - at(segments_dot.start, i)) * inverse + (quantity - start) * at(segments_dot.inverse, i)
     inside = (quantity >= segments.start[0]) & (quantity < segments.start[-1])
     return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
-
-
-for _kind in (Segments, TransferFunction):
-    jax.tree_util.register_dataclass(_kind, data_fields=[f.name for f in dataclasses.fields(_kind)], meta_fields=[])

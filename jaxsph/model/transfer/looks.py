@@ -1,43 +1,74 @@
-"""Default appearance: a transfer function from a colour map and a range of the quantity, opaque enough to read.
+r"""Looks: transfer functions that show particles or a volume, by default or by kind of data, opaque enough to read.
 
-Flow: Particles or Volume, colour map -> [appearance] -> TransferFunction.
+Flow: Particles or Volume, colour map or kind of data -> [appearance] -> TransferFunction.
+
+| preset | colours | domain | extinction over the map | for |
+|---|---|---|---|---|
+| `fluid` | viridis | linear | rises with the square | liquids, concentrations: a surface or dye to be seen into |
+| `density` | heat | log | rises with the cube from 0: what is dense shows through thin gas | gas and dark matter, over decades |
+| `temperature` | coolwarm | log | rises with the square | hot gas within cold |
+| `velocity` | coolwarm | linear; 0 in the middle where signs change | high at both ends, or rising: flows, no rest | components |
+| `magnetic` | ice | log | rises with the square | field strengths, energies |
+| `scan` | gray | percentile | none below a quarter, then rising | CT and MRI: air and noise are not shown |
+
+Extinction is made such that typical columns have a given optical depth (`fitted`), and a map of colours has 16 control points:
+in a `log` domain colours lie as far from those of the logarithm as `jaxsph.model.transfer.domains.log_departure` says.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from jaxsph.model import Particles, TransferFunction, Volume
-from jaxsph.model.transfer.colormaps import COLORMAPS, colormap, value_range
+from jaxsph.model.particles import Particles
+from jaxsph.model.transfer.domains import control_values
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, colormap, value_range
+from jaxsph.model.volume import Volume
 
 __all__ = ["COLORMAPS", "colormap", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
-OPTICAL_DEPTH = 3.0
-"""Optical depth through the bulk of the particles: 5 % of the light behind gets through."""
+OPTICAL_DEPTH = 3.0  # optical depth through the bulk of the particles: 5 % of the light behind gets through
+FAINTEST = 0.03  # extinction at the low end of a range, over that at the high end: what is lowest is seen, but hides nothing
+STEEPNESS = 2  # power with which extinction rises over a range: the middle, where most of a set tends to lie, stays translucent
+MIN_DECADES = 1.0  # what a preset shows by `log` is shown by `linear` where it is not all positive, or spans fewer decades
+OWN_POINTS = 33  # control points of extinction, where it has its own
+CELLS = (4, 48)  # fewest and most cells along the longest edge when columns of the quantity are summed
+MAX_COLUMNS = 64  # points along each axis of a volume that columns are summed over, about
 
-FAINTEST = 0.03
-"""Extinction at the low end of a range, over that at the high end: what is lowest is seen, but hides nothing."""
+Ramp = Callable[[np.ndarray], np.ndarray]
 
-STEEPNESS = 2
-"""Power with which extinction rises over a range: the middle, where most of a set tends to lie, stays translucent."""
 
-RAMPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "even": np.ones_like,
-    "rising": lambda share: FAINTEST + (1 - FAINTEST) * share**STEEPNESS,
-    "steep": lambda share: share ** (2 * STEEPNESS),
-}
+def _rising(power: float, least: float = FAINTEST) -> Ramp:
+    return lambda place: least + (1 - least) * place**power
+
+
+RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "steep": _rising(2 * STEEPNESS, 0)}
 """How extinction depends on the place in a range: not at all; as above; from 0, so that what is low is clear."""
 
-POINTS = 33
-"""Control points of extinction, where it has its own."""
 
-CELLS = (4, 48)
-"""Fewest and most cells along the longest edge when columns of the quantity are summed."""
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`."""
 
-MAX_COLUMNS = 64
-"""Points along each axis of a volume that columns are summed over, about."""
+    colormap: str
+    domain: str
+    ramp: Ramp
+    both_ways: Ramp | None = None
+
+
+PRESETS: dict[str, Preset] = {
+    "fluid": Preset("viridis", "linear", _rising(STEEPNESS)),
+    "density": Preset("heat", "log", _rising(3, 0)),
+    "temperature": Preset("coolwarm", "log", _rising(STEEPNESS)),
+    "velocity": Preset("coolwarm", "linear", _rising(STEEPNESS, 0), lambda place: np.abs(2 * place - 1) ** 1.5),
+    "magnetic": Preset("ice", "log", _rising(STEEPNESS)),
+    "scan": Preset("gray", "percentile", lambda place: np.clip((place - 0.25) / 0.75, 0, 1) ** STEEPNESS),
+}
+"""By name."""
 
 
 def default_transfer(
@@ -68,19 +99,14 @@ def default_transfer(
     """
     if ramp is not None and ramp not in RAMPS:
         raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
-    colors = colormap(colormap_name)
-    valid = np.asarray(particles.valid)
-    quantity = np.asarray(particles.quantity, np.float64)[valid]
-    low, high = _span(quantity, values, optical_depth)
+    colors, (low, high) = colormap(colormap_name), _span(particles, values, optical_depth)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     if particles.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
         return opacity_by_second(colored, particles, optical_depth, ramp=ramp or "steep")
-    own = ramp not in (None, "rising")
-    at = np.linspace(low, high, POINTS) if own else control
-    shape = RAMPS[ramp or "rising"](np.linspace(0, 1, len(at)))
-    extinction = optical_depth / typical_depth(particles, at, shape) * shape
-    return TransferFunction.from_points(control, colors, extinction, at if own else None)
+    own = None if ramp in (None, "rising") else np.linspace(low, high, OWN_POINTS)
+    extinction = _extinction(particles, control if own is None else own, RAMPS[ramp or "rising"], optical_depth)
+    return TransferFunction.from_points(control, colors, extinction, own)
 
 
 def opacity_by_second(
@@ -99,9 +125,8 @@ def opacity_by_second(
     second = particles.extinction_quantity
     if second is None:
         raise ValueError("`particles` must have two quantities: give `quantity=(of_colour, of_extinction)`")
-    at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), POINTS)
-    shape = RAMPS[ramp](np.linspace(0, 1, POINTS))
-    extinction = optical_depth / typical_depth(particles, at, shape) * shape
+    at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), OWN_POINTS)
+    extinction = _extinction(particles, at, RAMPS[ramp], optical_depth)
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
 
 
@@ -111,74 +136,160 @@ def default_volume_transfer(
     values: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
 ) -> TransferFunction:
-    r"""A transfer function that shows a volume with a colour map.
+    """As `default_transfer`, of a volume. Extinction rises from 0: what is lowest, as the air of a scan, is not shown."""
+    colors, (low, high) = colormap(colormap_name), _span(volume, values, optical_depth)
+    control = low + (high - low) * np.linspace(0, 1, len(colors))
+    return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
 
-    Extinction rises with the square of the place in the range of values, from 0: what is lowest, as the air of a scan, is not
-    shown. Its peak makes the optical depth $\tau$ of typical columns `optical_depth`, $\sum \tau^2 / \sum \tau$ over all columns
-    of a coarser grid along the three axes.
 
-    Args:
-        volume: what to show.
-        colormap_name, values, optical_depth: as for `default_transfer`.
+def domain_transfer(
+    shown: Particles | Volume,
+    domain: str,
+    colormap_name: str = "viridis",
+    values: tuple[float, float] | None = None,
+    optical_depth: float = OPTICAL_DEPTH,
+    points: int = POINTS,
+) -> TransferFunction:
+    """As `default_transfer`, with colours and extinction over a domain other than the linear one; see `jaxsph.control_values`.
 
     Raises:
-        ValueError: as `default_transfer`.
+        ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
     """
-    colors = colormap(colormap_name)
-    low, high = _span(coarse(volume)[0], values, optical_depth)
-    share = np.linspace(0, 1, len(colors))
-    depth = _columns_of_volume(volume, low + (high - low) * share, share**STEEPNESS)
-    return TransferFunction.from_points(low + (high - low) * share, colors, optical_depth / depth * share**STEEPNESS)
+    control = control_values(domain, _quantity(shown), **_ends(values), points=points)
+    ramp = _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
+    return fitted(TransferFunction.from_colormap(colormap_name, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
 
-def typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
-    """Optical depth of typical columns of what has these extinctions at control values; 1 where there is nothing."""
+def preset(
+    name: str,
+    shown: Any,
+    *,
+    values: tuple[float, float] | None = None,
+    domain: str | None = None,
+    colormap_name: str | None = None,
+    optical_depth: float = OPTICAL_DEPTH,
+    points: int = POINTS,
+) -> TransferFunction:
+    """A transfer function that suits a kind of data.
+
+    Args:
+        name: one of `PRESETS`.
+        shown: Particles or a Volume; or (low, high) of a quantity, for a peak of extinction of 1 a length unit.
+        values: ends of the colours, see `jaxsph.control_values`; `None` chooses them by the quantity.
+        domain: other than the preset's own.
+        colormap_name: other than the preset's own.
+        optical_depth: of typical columns; larger is more opaque.
+        points: control points.
+
+    Raises:
+        ValueError: an unknown preset, domain or colour map; ends that do not suit the domain.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"`name` must be one of {', '.join(PRESETS)}, got {name!r}")
+    chosen, quantity = PRESETS[name], None
+    if isinstance(shown, Particles | Volume):
+        quantity = _quantity(shown)
+    else:
+        values, shown = tuple(shown), None
+    given, ramp = _ends(values), chosen.ramp
+    if domain is None:
+        domain = chosen.domain
+        low, high = values or (np.percentile(quantity, TAILS) if quantity is not None and quantity.size else (0.0, 0.0))
+        over_decades = low > 0 and np.log10(high / low) >= MIN_DECADES
+        if chosen.both_ways is not None and low < 0 < high:
+            ramp, largest = chosen.both_ways, float(max(abs(low), abs(high)))
+            given = given if values else {"low": -largest, "high": largest}
+        elif (domain == "percentile" and values) or (domain == "log" and not over_decades):
+            domain = "linear"
+    control = control_values(domain, quantity, **given, points=points)
+    made = TransferFunction.from_colormap(colormap_name or chosen.colormap, control, ramp(np.linspace(0, 1, points)))
+    return made if shown is None else fitted(made, shown, optical_depth)
+
+
+def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth: float = OPTICAL_DEPTH) -> TransferFunction:
+    """The same colours with extinction scaled such that typical columns of particles or of a volume have an optical depth.
+
+    Args:
+        transfer: of which only the ratios of extinction count.
+        shown: columns of which are looked at, along three axes; see `default_transfer`.
+        optical_depth: 3 lets 5 % of the light behind through; larger is more opaque.
+
+    Raises:
+        ValueError: an optical depth that is not positive.
+    """
+    _require_depth(optical_depth)
+    depth = _typical_depth(shown, np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64))
+    scale = np.asarray(optical_depth / depth, transfer.extinction.dtype)
+    return dataclasses.replace(transfer, extinction=transfer.extinction * scale)
+
+
+def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_depth: float) -> np.ndarray:
+    """A ramp over control values, such that typical columns have an optical depth."""
+    shape = ramp(np.linspace(0, 1, len(at)))
+    return optical_depth / _typical_depth(shown, at, shape) * shape
+
+
+def _quantity(shown: Particles | Volume) -> np.ndarray:
+    return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
+
+
+def _span(shown: Particles | Volume, values: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
+    """What colours span: as asked for, or by the quantity."""
+    low, high = value_range(_quantity(shown)) if values is None else (float(values[0]), float(values[1]))
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise ValueError(f"`values` must be two finite numbers that ascend, got ({low}, {high})")
+    _require_depth(optical_depth)
+    return low, high
+
+
+def _ends(values: tuple[float, float] | None) -> dict[str, float | None]:
+    if values is not None and len(values) != 2:
+        raise ValueError(f"`values` must be two numbers, low and high, got {len(values)}")
+    return {"low": None, "high": None} if values is None else {"low": float(values[0]), "high": float(values[1])}
+
+
+def _require_depth(optical_depth: float) -> None:
+    if not (np.isfinite(optical_depth) and optical_depth > 0):
+        raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
+
+
+def _typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
+    """Mean optical depth of columns along the axes, weighted by itself, of what has these extinctions at control values.
+
+    1 where there is nothing.
+    """
     if isinstance(shown, Volume):
-        return _columns_of_volume(shown, values, extinction)
-    valid = np.asarray(shown.valid)
-    quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
-    return _typical_column(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
+        quantity, size = _coarse(shown)
+        cells = np.interp(quantity, values, extinction)
+    else:
+        valid = np.asarray(shown.valid)
+        if not valid.any():
+            return 1.0
+        quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
+        cells, size = _cells(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
+    columns = np.concatenate([(cells.sum(axis) * size[axis]).ravel() for axis in range(3)])
+    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
 
 
-def coarse(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
+def _coarse(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
     """Some of the values of a volume, float64, and the distances between them along the axes."""
     steps = [max(1, points // MAX_COLUMNS) for points in volume.shape]
     values = np.asarray(volume.values)[tuple(slice(None, None, step) for step in steps)].astype(np.float64)
     return values, np.asarray(volume.spacing, np.float64) * steps
 
 
-def _columns_of_volume(volume: Volume, values: np.ndarray, extinction: np.ndarray) -> float:
-    """See `typical_depth`."""
-    quantity, cell = coarse(volume)
-    shown = np.interp(quantity, values, extinction)
-    columns = np.concatenate([(shown.sum(axis) * cell[axis]).ravel() for axis in range(3)])
-    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
-
-
-def _span(quantity: np.ndarray, values: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
-    """What colours span: as asked for, or by the quantity."""
-    low, high = value_range(quantity) if values is None else (float(values[0]), float(values[1]))
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"`values` must be two finite numbers that ascend, got ({low}, {high})")
-    if not (np.isfinite(optical_depth) and optical_depth > 0):
-        raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
-    return low, high
-
-
-def _typical_column(position: np.ndarray, support: np.ndarray, extinction: np.ndarray) -> float:
-    """Mean optical depth of the columns along the axes, weighted by itself; 1 where there is nothing."""
-    if not len(position):
-        return 1.0
+def _cells(position: np.ndarray, support: np.ndarray, extinction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean extinction in the cells of a coarse grid around particles, and their sizes along the axes."""
     lower, upper = (position - support[:, None]).min(0), (position + support[:, None]).max(0)
     longest = float((upper - lower).max())
-    across = int(np.clip(longest / np.median(support), *CELLS))
-    cell = longest / across
+    cell = longest / int(np.clip(longest / np.median(support), *CELLS))
     shape = np.maximum(np.ceil((upper - lower) / cell * (1 - 1e-9)).astype(int), 1)
     index = np.minimum(((position - lower) / cell).astype(int), shape - 1)
     flat = np.ravel_multi_index(tuple(index.T), tuple(shape))
     sphere = 4 / 3 * np.pi * support**3
     covered = np.bincount(flat, sphere, int(shape.prod()))
     mean = np.bincount(flat, sphere * extinction, int(shape.prod())) / np.where(covered > 0, covered, 1)
-    cells = (mean * np.minimum(covered / cell**3, 1)).reshape(shape)
-    columns = np.concatenate([cells.sum(axis).ravel() for axis in range(3)]) * cell
-    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
+    return (mean * np.minimum(covered / cell**3, 1)).reshape(shape), np.full(3, cell)
+
+
+TransferFunction.presets = staticmethod(preset)

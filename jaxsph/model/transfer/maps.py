@@ -1,73 +1,115 @@
-"""From colour maps to transfer functions: control points at the values of a domain, or where a norm of matplotlib has them.
+"""Colour maps: by name, the range of a quantity that they span, and control points of transfer functions made of them.
 
-Flow: colour map, values or norm, extinction -> [transfer_maps] -> TransferFunction.
+Flow: name, quantity -> [transfer_maps] -> TransferFunction, Points, Projection.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import copy
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxsph.model.transfer.colormaps import COLORMAPS, POINTS, colormap
-from jaxsph.model.transfer.function import TransferFunction, numbers
+from jaxsph.numerics.given import plain
+
+COLORMAPS: dict[str, tuple[str, ...]] = {
+    "viridis": ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"),
+    "heat": ("2a0510", "6b0f1a", "b11226", "e0401f", "f57f17", "fbb52c", "fde67a", "fffbe0"),
+    "ice": ("0b1d51", "13418f", "1b6fb8", "2f9fd0", "66c6dd", "a9e2e6", "e8f8f5"),
+    "coolwarm": ("3b4cc0", "6788ee", "9abbff", "c9d7f0", "edd1c2", "f7a889", "e26952", "b40426"),
+    "gray": ("202020", "ffffff"),
+}
+"""Control colours of the built-in maps, from low to high, evenly spaced; sRGB as displayed."""
+
+POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
+TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
 
 
-def from_colormap(colors: Any, values: Any, extinction: Any = 1.0) -> TransferFunction:
-    """A transfer function whose colours are those of a map, evenly placed over its control values.
+def colormap(name: str) -> Float[np.ndarray, "points 3"]:
+    """16 colours of a map from low to high, evenly spaced, in [0, 1]; a name that ends in `_r` is reversed.
 
-    Args:
-        colors: name of a colour map, or (M, 3) colours from low to high.
-        values: (K,) control values, as `jaxsph.control_values` lays them; or the two ends, between which 16 are evenly spaced.
-        extinction: per length unit: a number, or any number of them from the low end to the high, evenly placed.
+    Built in are `viridis`, `heat`, `ice`, `coolwarm` and `gray`; with matplotlib installed, all of its names too.
 
     Raises:
-        ValueError: an unknown colour map, or what `TransferFunction.from_points` refuses.
+        ValueError: an unknown name.
     """
+    base, reverse = (name[:-2], -1) if name.endswith("_r") else (name, 1)
+    if base in COLORMAPS:
+        rows = np.array([[int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)] for code in COLORMAPS[base]])
+        place = np.linspace(0, len(rows) - 1, POINTS)
+        return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)[::reverse]
+    try:
+        from matplotlib import colormaps
+    except ImportError:
+        more = "; matplotlib has more: pip install 'jaxsph[color]'"
+    else:
+        if base in colormaps:
+            return np.asarray(colormaps[base](np.linspace(0, 1, POINTS)))[::reverse, :3]
+        more = " or a name of matplotlib's"
+    raise ValueError(f"`colormap` must be one of {', '.join(COLORMAPS)}{more}; got {name!r}")
+
+
+def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float]:
+    """Low and high value that the colours should span: the quantity's range without its extreme tails.
+
+    A constant quantity gets a range around it, an empty set (0, 1).
+    """
+    quantity = np.asarray(quantity, np.float64)
+    if not quantity.size:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.percentile(quantity, TAILS))
+    if not high - low > 1e-6 * max(abs(low), abs(high)):  # a range that float32 would not resolve
+        low, high = float(quantity.min()), float(quantity.max())
+    if not high - low > 1e-6 * max(abs(low), abs(high)):
+        middle, half = (low + high) / 2, max(abs(low), abs(high)) / 2 or 0.5
+        return middle - half, middle + half
+    return low, high
+
+
+class ControlPoints(NamedTuple):
+    """Arguments of `TransferFunction.from_points`."""
+
+    values: Any
+    colors: Any
+    extinction: Any
+
+
+def of_colormap(colors: Any, values: Any, extinction: Any) -> ControlPoints:
+    """See `TransferFunction.from_colormap`."""
     rows = colormap(colors) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
     values = np.asarray(numbers("values", values), np.float64)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"`values` must be two ends, or control values (K,), got shape {values.shape}")
     if len(values) == 2:
         values = np.linspace(values[0], values[1], POINTS)
-    return TransferFunction.from_points(values, _spread(rows, len(values)), _spread(extinction, len(values)))
+    return ControlPoints(values, _spread(rows, len(values)), _spread(extinction, len(values)))
 
 
-def from_matplotlib(
-    cmap: Any,
-    norm: Any = None,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    extinction: Any = 1.0,
-    points: int = POINTS,
-) -> TransferFunction:
-    """A transfer function of a colour map of matplotlib's, as a figure made with the same map and norm shows a quantity.
-
-    Args:
-        cmap: a `Colormap`, or its name. Extinction is multiplied by its alpha.
-        norm: such as `Normalize`, `LogNorm`, `SymLogNorm`, with its `vmin` and `vmax`; `None` is linear from `low` to `high`. Of
-            a `BoundaryNorm` the colours jump at its boundaries.
-        low, high: ends, where the norm does not have them.
-        extinction: per length unit: a number, or any number of them from the low end to the high, evenly placed.
-        points: control points; at these the colours are the map's.
-
-    Raises:
-        ImportError: `cmap` is a name, and matplotlib is not installed.
-        ValueError: an unknown name, a norm without its ends or without an inverse.
-    """
+def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, extinction: Any, points: int) -> ControlPoints:
+    """See `TransferFunction.from_matplotlib`."""
     chosen = _named(cmap) if isinstance(cmap, str) else cmap
     if not (callable(chosen) and hasattr(chosen, "N")):
         raise ValueError(f"`cmap` must be a Colormap of matplotlib's, or the name of one, got {type(cmap).__name__}")
     if hasattr(norm, "boundaries"):
-        return _of_boundaries(chosen, norm, extinction)
-    ends = [_end(norm, name, end) for name, end in (("vmin", low), ("vmax", high))]
+        edges = np.asarray(norm.boundaries, np.float64)
+        rgba = np.asarray(chosen(np.asarray(norm((edges[1:] + edges[:-1]) / 2))), np.float64)
+        bands = _spread(extinction, len(rgba)) * rgba[:, 3]
+        return ControlPoints(np.repeat(edges, 2)[1:-1], np.repeat(rgba[:, :3], 2, 0), np.repeat(bands, 2))
+    ends = [_end(norm, *named) for named in (("vmin", "low", low), ("vmax", "high", high))]
     if not (np.isfinite(ends).all() and ends[0] < ends[1]):
         raise ValueError(f"`low` and `high` must be finite and ascend, got {ends[0]:g} and {ends[1]:g}")
     place = np.linspace(0, 1, points)
     values = np.asarray(_inverse(norm, ends, place), np.float64)
     values[[0, -1]] = ends
-    return _of_rgba(values, np.asarray(chosen(place), np.float64), extinction)
+    rgba = np.asarray(chosen(place), np.float64)
+    return ControlPoints(values, rgba[:, :3], _spread(extinction, points) * rgba[:, 3])
+
+
+def numbers(name: str, value: Any) -> Any:
+    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
+    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
+    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
 
 
 def _named(name: str) -> Any:
@@ -84,14 +126,12 @@ def _named(name: str) -> Any:
     return colormaps[name]
 
 
-def _end(norm: Any, name: str, given: float | None) -> float:
+def _end(norm: Any, name: str, argument: str, given: float | None) -> float:
     """An end of the norm's own, or the one given."""
     own = getattr(norm, name, None)
     if own is None and given is None:
-        argument = "low" if name == "vmin" else "high"
         raise ValueError(f"`norm` has no `{name}`; give it one, or give `{argument}`")
     if own is not None and given is not None and float(own) != float(given):
-        argument = "low" if name == "vmin" else "high"
         raise ValueError(f"`{argument}` = {given:g} and `norm.{name}` = {own:g} do not agree; give one of them")
     return float(given if own is None else own)  # type: ignore[arg-type]
 
@@ -103,8 +143,6 @@ def _inverse(norm: Any, ends: list[float], place: np.ndarray) -> Any:
         raise ValueError(
             f"`norm` must have an inverse, and {type(norm).__name__} has none; give LogNorm, SymLogNorm or Normalize"
         )
-    import copy
-
     own = copy.copy(norm)
     own.vmin, own.vmax = ends
     try:
@@ -112,18 +150,6 @@ def _inverse(norm: Any, ends: list[float], place: np.ndarray) -> Any:
     except ValueError as error:
         kind = type(norm).__name__
         raise ValueError(f"`norm` = {kind} from {ends[0]:g} to {ends[1]:g} cannot be used: {error}; a LogNorm is > 0") from error
-
-
-def _of_boundaries(chosen: Any, norm: Any, extinction: Any) -> TransferFunction:
-    edges = np.asarray(norm.boundaries, np.float64)
-    middles = (edges[1:] + edges[:-1]) / 2
-    rgba = np.asarray(chosen(np.asarray(norm(middles))), np.float64)
-    bands = _spread(extinction, len(middles)) * rgba[:, 3]
-    return TransferFunction.from_points(np.repeat(edges, 2)[1:-1], np.repeat(rgba[:, :3], 2, 0), np.repeat(bands, 2))
-
-
-def _of_rgba(values: np.ndarray, rgba: np.ndarray, extinction: Any) -> TransferFunction:
-    return TransferFunction.from_points(values, rgba[:, :3], _spread(extinction, len(values)) * rgba[:, 3])
 
 
 def _spread(given: Any, points: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsph.analysis.projection import columns, shell_integrals
+from jaxsph.analysis.projection import columns
 from jaxsph.model import kernels
 
 NAMES = sorted(kernels.KERNELS)
@@ -33,7 +33,7 @@ def test_pieces_add_up_to_the_kernel(name):
     if name in columns.PIECES:
         found = sum(np.where(r < piece.radius, np.polyval(piece.coefficients[::-1], r), 0) for piece in columns.PIECES[name])
     else:
-        edges = ((np.maximum(edge.radius - r, 0), edge.coefficients) for edge in shell_integrals.EDGES[name])
+        edges = ((np.maximum(edge.radius - r, 0), edge.coefficients) for edge in columns.EDGES[name])
         found = sum(factor * near**power for near, factors in edges for power, factor in factors.items())
     np.testing.assert_allclose(found, kernels.by_name(name).of_square(r * r, np), atol=1e-13)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsph.analysis.projection import columns
-from jaxsph.analysis.projection.pixel_shares import pixel_shares
+from jaxsph.analysis.projection.columns import pixel_shares
 from jaxsph.model import kernels
 from jaxsph.numerics.fusion import barriers
 

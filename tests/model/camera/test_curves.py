@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model.camera.curves import Turning, monotone, ordered, through
+from jaxsph.model.camera.leg import Turning, monotone, ordered, through
 
 FEW = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 10_000)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, Volume, reference
-from jaxsph.model.transfer.presets import PRESETS
+from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.scenes import domain_transfer, fitted, preset
 from jaxsph.scenes.sampling import scatter
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxsph.model.transfer.domains import control_values
-from jaxsph.model.transfer.scales import Scale
+from jaxsph.model.transfer.domains import Scale, control_values
 
 QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
 
