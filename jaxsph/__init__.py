@@ -9,7 +9,7 @@ from jaxsph.analysis.resample import resample
 from jaxsph.analysis.slices import Slice, slice_of
 from jaxsph.engine.access.morton import prepare
 from jaxsph.engine.frame.progressive import progressive
-from jaxsph.engine.media.in_octree import in_octree, octree_plans
+from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.engine.media.iso_surface import IsoSurface
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.planning.fit import plan
@@ -63,7 +63,6 @@ __all__ = [
     "io",
     "merge",
     "met",
-    "octree_plans",
     "plan",
     "plan_projection",
     "prepare",

@@ -19,7 +19,6 @@ UNRESOLVED = 32
 WEAK_PARTICLES = 64
 BAD_VOLUME = 128
 BAD_POINTS = 256
-OCTREE_OVERFLOW = 512
 TOLERANCE_MISSED = 1024
 GHOST_OVERFLOW = 4096
 BAD_BOX = 8192
@@ -48,15 +47,13 @@ MESSAGES = {
     BAD_VOLUME: "a volume holds values that are not finite, or its lower corner or spacing is not finite or not > 0; repair them",
     BAD_POINTS: "a point has a position, attribute or extinction that is not finite, a radius that is not > 0 and finite, an "
     "extinction < 0 or a colour outside [0, 1]; remove or repair these points",
-    OCTREE_OVERFLOW: "more (sphere, node) pairs than an octree's plan has room for; make a new plan with "
-    "`jaxsph.engine.access.octree_build.plan_octree`, of these spheres",
     GHOST_OVERFLOW: "more images of particles across the faces of their periodic box than the plan has room for; make a new "
     "plan with `jaxsph.plan`",
     BAD_BOX: "a periodic box must have sides > 0 and finite, and none shorter than the largest support radius; give a larger "
     "box, or smaller supports",
     TOLERANCE_MISSED: "the finest segments are too long for the tolerance where `error_bound` is above it; give more `samples`",
 }
-OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | OCTREE_OVERFLOW | GHOST_OVERFLOW
+OVERFLOWS = TILE_OVERFLOW | LIST_OVERFLOW | GHOST_OVERFLOW
 TOLD = TOLERANCE_MISSED  # the image is as good as can be: eager rendering warns
 UNUSABLE = BAD_CAMERA | BAD_TRANSFER  # with these, no number of the image means anything
 

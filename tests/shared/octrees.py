@@ -1,20 +1,18 @@
-"""Octrees that tests look into: spheres that are hard to keep apart, in trees of one shape."""
+"""Octrees that tests look into: spheres that are hard to keep apart, in trees of few shapes."""
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import QUICKLY
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from jaxsph.engine.access.octree_build import LevelSizes, OctreePlan, build_octree
+from jaxsph.engine.access.octree import build_octree
 
-SPHERES = 40
-PLAN = OctreePlan(2, 4096, 4096, tuple(LevelSizes(256, 6144) for _ in range(2)), 16384, most=2)
+SPHERES, NODES, ENTRIES = 40, 4096, 16384
 STYLES = "uniform", "clump", "borders", "sizes", "points", "giant"
 seeds, styles = st.integers(0, 2**32 - 1), st.sampled_from(STYLES)
 in_both = pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
@@ -39,9 +37,12 @@ def spheres(seed, style, dtype):
     return (centre + offset).astype(dtype), radius.astype(dtype)
 
 
-@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def built(centre, radius, live=None, plan=PLAN):
-    return build_octree(centre, radius, live, plan=plan)
+def built(centre, radius, live=None, **how):
+    """A deep tree of few spheres, with room for any, such that looking it up is compiled a few times."""
+    live = np.ones(len(radius), bool) if live is None else live
+    tree = build_octree(centre, radius, live, **({"most": 2, "max_level": 4} | how))
+    node = jnp.pad(tree.node, ((0, NODES - len(tree.node)), (0, 0)))
+    return dataclasses.replace(tree, node=node, entry=jnp.pad(tree.entry, (0, ENTRIES - len(tree.entry))))
 
 
 def members(tree, begin, length):

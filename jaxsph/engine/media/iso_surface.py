@@ -133,9 +133,11 @@ class IsoSurface(Medium):
         """
         grid, _ = self._viewed()
         ends = _ends(task)
-        inside, front, back = _clipped(grid, *(grid.coordinates(place) for place in ends))
+        first, last = (grid.coordinates(place) for place in ends)
+        enter, leave = lax.stop_gradient(grid.clipped(first, last))
+        front, back = _between(first, last, enter), _between(first, last, leave)
         begin, end = (grid.interpolate(place) - self.level for place in (front, back))
-        met = inside & ((begin >= 0) != (end >= 0))
+        met = (enter < leave) & ((begin >= 0) != (end >= 0))
         pieces = front, back, begin, end, _ray(ends)
         front, back, begin, end, ray = jax.tree.map(lambda of_samples: _first(met, of_samples), pieces)
         share = _crossing(grid, self.level, front, back, begin, end)
@@ -185,24 +187,6 @@ def _ends(task: SlabTask) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         border = jnp.concatenate([border[:, :1], (border[:, 1:] + border[:, :-1]) / 2, border[:, -1:]], 1)
     ends = (dataclasses.replace(task, depth=depth).positions() for depth in (border[:, :-1], border[:, 1:]))
     return tuple(ends)  # type: ignore[return-value]
-
-
-def _clipped(
-    grid: VolumeGrid, front: Coordinates, back: Coordinates
-) -> tuple[Bool[Array, "tasks samples rays"], Coordinates, Coordinates]:
-    """Whether pieces have a part in the box of the grid, and the ends of that part, in grid coordinates."""
-    enter, leave = jnp.zeros_like(front[0]), jnp.ones_like(front[0])
-    for begin, end, points in zip(front, back, grid.values.shape, strict=True):
-        step = end - begin
-        moves = step != 0
-        safe = jnp.where(moves, step, 1)
-        faces = (0 - begin) / safe, (points - 1 - begin) / safe
-        beside = ~moves & ((begin < 0) | (begin > points - 1))
-        enter = jnp.where(moves, jnp.maximum(enter, jnp.minimum(*faces)), jnp.where(beside, jnp.inf, enter))
-        leave = jnp.where(moves, jnp.minimum(leave, jnp.maximum(*faces)), leave)
-    inside = enter < leave
-    enter, leave = (lax.stop_gradient(jnp.where(inside, end, 0)) for end in (enter, leave))
-    return inside, _between(front, back, enter), _between(front, back, leave)
 
 
 def _between(front: Coordinates, back: Coordinates, share: Array) -> Coordinates:

@@ -1,4 +1,4 @@
-"""Every point is in one leaf, and that leaf has every sphere it is in; what is far from all spheres is told to be empty."""
+"""Every point is in one leaf, and that leaf has every sphere it is in; cells that no sphere meets are told to be empty."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from derivatives import QUICKLY
 from hypothesis import given
-from octrees import PLAN, SPHERES, built, few, in_both, members, probes, seeds, spheres, styles
+from octrees import SPHERES, built, few, in_both, members, probes, seeds, spheres, styles
 
 from jaxsph.engine.access.octree import INNER
 
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
 def looked_up(tree, x, y, z):
-    return tree.leaf_at(x, y, z)
-
-
-@functools.partial(jax.jit, compiler_options=QUICKLY)
-def may_meet(tree, lower, upper):
-    return tree.may_meet(list(lower), list(upper))
+    """The leaf of each position, and its coordinates in the unit cube."""
+    coordinates = [(at - zero) * (1 / tree.side) for at, zero in zip((x, y, z), tree.lower, strict=True)]
+    return tree.leaf_at(coordinates), coordinates
 
 
 @in_both
@@ -30,14 +27,12 @@ def may_meet(tree, lower, upper):
 def test_the_leaf_of_a_point_has_every_sphere_that_the_point_is_in(seed, style, dtype):
     with jax.enable_x64(dtype == np.float64):
         centre, radius = spheres(seed, style, dtype)
-        tree = built(jnp.asarray(centre), jnp.asarray(radius))
-        assert int(tree.fault) == 0
+        tree = built(centre, radius)
         at = probes(np.random.default_rng(seed), centre, radius, tree)
         leaf, _ = looked_up(tree, *jnp.asarray(at).T)
         has = members(tree, leaf.begin, leaf.length)
     exact = at.astype(np.float64)[:, None] - centre.astype(np.float64)
     touched = (exact**2).sum(-1) <= radius.astype(np.float64) ** 2
-    assert np.asarray(leaf.inside)[touched.any(1)].all()
     assert not (touched & ~has).any()
     assert touched.any()
 
@@ -51,7 +46,7 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
     ends = np.array([[-1, -1, -1], [1, 1, 1]]) + rng.choice([0, 3])
     with jax.enable_x64(dtype == np.float64):
         centre, radius = np.repeat(ends, SPHERES // 2, axis=0).astype(dtype), np.full(SPHERES, 0.01, dtype)
-        empty = built(jnp.asarray(centre), jnp.asarray(radius))
+        empty = built(centre, radius)
         lower, side = np.asarray(empty.lower, np.float64), float(empty.side)
         axis = np.eye(3)[rng.integers(3, size=SPHERES)] > 0
         at = lower + side * np.where(axis, 0.25, rng.uniform(0.1, 0.2, (SPHERES, 3)))
@@ -64,7 +59,7 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
         centre = np.where(kept[:, None], np.repeat(ends, SPHERES // 2, axis=0), moved).astype(dtype)
         close = exact.astype(dtype)
         close = np.where(close.astype(np.float64) < exact, np.nextafter(close, dtype(np.inf)), close)
-        tree = built(jnp.asarray(centre), jnp.asarray(np.where(kept, dtype(0.01), close)))
+        tree = built(centre, np.where(kept, dtype(0.01), close))
         leaf, _ = looked_up(tree, *jnp.asarray(at).T)
         has = members(tree, leaf.begin, leaf.length)
     assert has[np.arange(SPHERES), np.arange(SPHERES)][free].all()
@@ -76,55 +71,50 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
 def test_leaves_tile_the_box_and_have_no_sphere_that_is_far_from_them(seed, style, dtype):
     with jax.enable_x64(dtype == np.float64):
         centre, radius = spheres(seed, style, dtype)
-        tree = built(jnp.asarray(centre), jnp.asarray(radius))
-        at = probes(np.random.default_rng(seed), centre, radius, tree)
-        leaf, cells = looked_up(tree, *jnp.asarray(at).T)
-        has = members(tree, leaf.begin, leaf.length)
-        node = np.asarray(tree.node)
-    volume, row, todo = 0.0, 0, [(row, PLAN.top) for row in range(1 << 3 * PLAN.top)]
-    rows = set()
+        tree = built(centre, radius)
+        node, dense = np.asarray(tree.node), 1 << tree.top
+        lower, length = np.asarray(tree.lower, np.float64), float(tree.side)
+    todo = [(row, tree.top, np.array(np.unravel_index(row, (dense,) * 3)) / dense) for row in range(dense**3)]
+    rows, leaves = set(), []
     while todo:
-        row, level = todo.pop()
+        row, level, corner = todo.pop()
         assert row not in rows  # a tree: no node has two parents
         rows.add(row)
         if node[row, 1] == INNER:
-            todo += [(node[row, 0] + k, level + 1) for k in range(8)]
+            half = 0.5 ** (level + 1)
+            todo += [(node[row, 0] + k, level + 1, corner + half * np.array([k >> 2, k >> 1 & 1, k & 1])) for k in range(8)]
         else:
-            volume += 8.0**-level
-            assert level <= int(tree.deepest)
-    assert volume == 1
-    assert sum(node[row, 1] != INNER for row in rows) == int(tree.num_leaves)
-    assert sum(max(node[row, 1], 0) for row in rows) == int(tree.num_entries)
-    side = 1 << (PLAN.deepest - np.asarray(leaf.level))
-    low = np.stack([np.asarray(cell) & -side for cell in cells], -1) / 2**PLAN.deepest
-    high = low + side[:, None] / 2**PLAN.deepest
-    lower, length = np.asarray(tree.lower, np.float64), float(tree.side)
+            assert level <= tree.levels
+            leaves.append((row, 0.5**level, corner))
+    assert sum(side**3 for _, side, _ in leaves) == 1
+    assert sum(node[row, 1] for row, *_ in leaves) == np.maximum(node[:, 1], 0).sum()
+    has = members(tree, *node[[row for row, *_ in leaves]].T)
+    low, side = np.array([corner for *_, corner in leaves]), np.array([[side] for _, side, _ in leaves])
     scaled = (centre.astype(np.float64) - lower) / length
-    off = np.maximum(np.maximum(low[:, None] - scaled, scaled - high[:, None]), 0)
+    off = np.maximum(np.maximum(low[:, None] - scaled, scaled - (low + side)[:, None]), 0)
     slack = 80 * np.finfo(dtype).eps * (1 + np.abs(lower).max() / length)
     assert not (has & (np.sqrt((off**2).sum(-1)) > radius / length * (1 + slack) + slack)).any()
 
 
 @given(seeds, styles)
 @few
-def test_a_box_that_may_meet_nothing_meets_nothing(seed, style):
+def test_cells_that_hold_any_of_a_sphere_are_occupied(seed, style):
     rng = np.random.default_rng(seed)
     centre, radius = spheres(seed, style, np.float32)
-    tree = built(jnp.asarray(centre), jnp.asarray(radius))
+    tree = built(centre, radius)
     at = probes(rng, centre, radius, tree)
-    extent = (float(tree.side) * rng.choice([0, 0.01, 0.3], (len(at), 1)) * rng.uniform(size=(len(at), 3))).astype(np.float32)
-    lower, upper = at - extent, at + extent
-    may = np.asarray(may_meet(tree, lower.T, upper.T))
-    a, b, c = (value.astype(np.float64) for value in (lower, upper, centre))
-    off = np.maximum(np.maximum(a[:, None] - c, c - b[:, None]), 0)
-    meets = ((off**2).sum(-1) <= radius.astype(np.float64) ** 2).any(1)
-    assert not (meets & ~may).any()
+    coordinates = looked_up(tree, *jnp.asarray(at).T)[1]
+    macrocells = [np.clip(place, 0, 1 - 1e-6) * tree.occupancy_cells for place in coordinates]
+    occupied = np.asarray(tree.occupancy.any_in(macrocells, macrocells))
+    away = at.astype(np.float64)[:, None] - centre.astype(np.float64)
+    touched = ((away**2).sum(-1) <= radius.astype(np.float64) ** 2).any(1)
+    assert occupied[touched].all() and touched.any()
 
 
 def test_empty_space_is_told():
     """Between two clusters, a corner of the box each."""
     ends = np.repeat([[0.0, 0, 0], [1, 1, 1]], SPHERES // 2, axis=0).astype(np.float32)
-    tree = built(jnp.asarray(ends), jnp.asarray(np.full(SPHERES, 0.05, np.float32)))
-    box = jnp.asarray([[0.6], [0.1], [0.4]], jnp.float32), jnp.asarray([[0.7], [0.2], [0.6]], jnp.float32)
-    assert not bool(may_meet(tree, *box)[0])
+    tree = built(ends, np.full(SPHERES, 0.05, np.float32))
+    low, high = ([jnp.float32(part * tree.occupancy_cells) for part in corner] for corner in ((0.6, 0.1, 0.4), (0.7, 0.2, 0.6)))
+    assert not bool(tree.occupancy.any_in(low, high))
     assert int(looked_up(tree, *jnp.full((3, 1), 0.5))[0].length[0]) == 0

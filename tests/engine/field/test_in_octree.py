@@ -11,16 +11,13 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.access.octree_build import OctreePlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.media.octree_particles import OctreeParticles
-from jaxsph.engine.media.octree_points import OctreePoints
+from jaxsph.engine.media.octree_medium import OctreeParticles, OctreePoints
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 STEPS = js.Settings(samples=32, integrator="step_doubling", step_tolerance=1e-3)
 COUNT, WIDTH, HEIGHT = 16, 14, 12
-PLANS = (OctreePlan(2, 2048, 2048, (), 2048),) * 2
 RNG = np.random.default_rng(1)
 POSITION, COLOR = RNG.uniform(-0.7, 0.7, (COUNT, 3)).astype(np.float32), RNG.uniform(0, 1, (COUNT, 3))
 
@@ -75,7 +72,7 @@ def test_particles_by_step_doubling_are_the_reference_of_many_samples():
 
 def test_parts_become_media_and_the_rest_stays():
     scene = js.Scene(**PARTICLES, points=(POINTS["points"],), mix="opacity")
-    found = jax.eval_shape(lambda scene: js.in_octree(scene, PLANS), scene)
+    found = js.in_octree(scene)
     assert [type(medium) for medium in found.media] == [OctreeParticles, OctreePoints]
     assert found.particles is found.points is found.transfer is None and found.mix == "opacity"
     assert js.in_octree(found).media == found.media  # nothing is left to do
@@ -99,29 +96,42 @@ def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
         shown = js.Scene(**parts)
         with pytest.raises(ValueError, match=rf"`Scene\({name}=...\)` cannot answer; .*`jaxsph.in_octree`"):
             jax.eval_shape(lambda view, shown=shown: color(view, shown), camera())
-    inside = jax.eval_shape(lambda scene: color(camera(), js.in_octree(scene, PLANS[:1])), js.Scene(**PARTICLES))
+    inside = jax.eval_shape(lambda scene: color(camera(), scene), js.in_octree(js.Scene(**PARTICLES)))
     assert inside.shape == (HEIGHT, WIDTH, 3)
 
 
-def test_under_a_trace_plans_are_needed_one_for_each_set():
+def test_under_a_trace_no_octree_is_built_and_it_says_where_to_build_it():
     scene = js.Scene(**PARTICLES)
-    with pytest.raises(ValueError, match=r"`plan` is needed under jit.*octree_plans"):
+    with pytest.raises(ValueError, match=r"`scene` must be of concrete arrays.*outside of `jax.jit` and `jax.grad`"):
         jax.eval_shape(js.in_octree, scene)
-    with pytest.raises(ValueError, match="outside jit"):
-        jax.eval_shape(lambda shown: len(js.octree_plans(shown)) * shown.particles.support, scene)
-    with pytest.raises(ValueError, match="one for each of particles and point sets, 1, got 2"):
-        js.in_octree(scene, PLANS)
-    built = jax.eval_shape(lambda shown: js.in_octree(shown, PLANS[:1]).media[0].octree.entry, scene)
-    assert built.shape == (PLANS[0].entries,)
+    quantity = scene.particles.quantity
+    with pytest.raises(ValueError, match=r"`scene` must be of concrete arrays.*give them the scene that it returns"):
+        jax.grad(lambda value: js.in_octree(js.Scene(**moved(quantity=value))).media[0].octree.side)(quantity)
+
+
+def moved(**columns):
+    """The particles with other columns."""
+    return PARTICLES | {"particles": dataclasses.replace(PARTICLES["particles"], **columns)}
 
 
 @pytest.mark.slow
-def test_plans_have_room_for_what_they_were_made_for():
-    scene = js.Scene(**PARTICLES, **POINTS)
-    plans = js.octree_plans(scene)
-    assert len(plans) == 2
-    found = jax.jit(lambda shown: js.in_octree(shown, plans))(scene)
-    assert [int(medium.faults()) for medium in found.media] == [0, 0]
+def test_images_are_differentiated_by_what_the_octree_holds():
+    """By particles and transfer function as without an octree, under `jit`."""
+    settings, shown, slopes = js.Settings(samples=16), js.Scene(**PARTICLES), []
+    for scene in (js.in_octree(shown), shown):
+        plan = js.plan(scene, camera(), settings)
+
+        def total(scene, plan=plan):
+            return js.render(scene, camera(), settings, plan=plan).color.sum()
+
+        slopes.append(jax.jit(jax.grad(total, allow_int=True))(scene))
+    (inside,), outside = slopes[0].media, slopes[1]
+    for name in ("position", "support", "quantity", "volume"):
+        wanted = getattr(outside.particles, name)
+        np.testing.assert_allclose(getattr(inside.particles, name), wanted, atol=1e-3 * np.abs(wanted).max())
+    for name in ("values", "colors", "extinction"):
+        wanted = getattr(outside.transfer, name)
+        np.testing.assert_allclose(getattr(inside.transfer, name), wanted, atol=1e-3 * np.abs(wanted).max())
 
 
 @pytest.mark.slow
