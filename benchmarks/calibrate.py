@@ -19,8 +19,8 @@ constant is asked to be:
 - `DEVIATIONS_AROUND`: deviations by which quantities between nodes lie beyond those at the nodes; in 99 of 100 slabs, of the
   worst frame.
 
-Costs, not errors, are what `WORTHWHILE` of `pilot` and `probe` are about: neither is measured here. Writes
-`results/calibration.json`; ends in asserts on the validation scenes.
+Costs, not errors, are what `MIN_RESOLVED_SHARE` of `pilot` and `MIN_PROMISING_SHARE` of `probe` are about: not measured
+here. Writes `results/calibration.json`; ends in asserts on the validation scenes.
 
     python benchmarks/calibrate.py [--size 256] [--kinds waves foam] [--quick]
 """

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
-from jaxsph.engine.control.bounds import Footprint, SampleBounds, sample_bounds, spheres
+from jaxsph.engine.control.bounds import SampleBounds, sample_bounds, spheres
 from jaxsph.engine.control.errors import DEPTH_ROUNDING, EXPONENTIAL
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.model.camera.camera import Camera
@@ -82,7 +82,7 @@ def bundle_bounds(
             edges = jnp.broadcast_to(edges[:, None], (slab_samples + 1, bundles))
             window = begin[:, slab], length[:, slab]
             places = tuple(tuple(jnp.broadcast_to(end, (bundles,)) for end in ends) for ends in extremes)
-            footprint = Footprint(u, v[::-1])
+            footprint = u, v[::-1]
             settings = tables, camera.is_perspective, subdivisions
             found.append(sample_bounds(balls, lists.rank, window, footprint, edges, places, *settings))
         bounds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)

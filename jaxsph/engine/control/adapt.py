@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, slab_windows_with_borders
 from jaxsph.engine.control.analysis import analyse
-from jaxsph.engine.control.levels import Offer, bound, choose
-from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels, uncoarsened
+from jaxsph.engine.control.levels import bound, choose
+from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.runtime.tuning import Tuning
@@ -69,37 +69,30 @@ def adapt(
     cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
-    tables = tables_of_parts(transfer)
+    tables, windows = tables_of_parts(transfer), coarser_windows(cells, slab_samples)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 
-    def decide() -> tuple[SlabSchedule, Array, Array]:
-        windows = coarser_windows(cells, slab_samples)
+    def decide() -> tuple[Array, Array, Array]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
         full = next(cost for cost in costs if cost is not None)
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
         rounding = 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * ((~empty).sum(0) + 1)).astype(dtype)
-        offer = Offer(saving, on_offer & ~empty & whole, rounding)
         beside = slab_windows_with_borders(grid.ordered, grid.lists)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
-        analysis = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
-        chosen = choose(analysis, offer, tolerance, plan.allocation)
+        errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
+        chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
         free = _nowhere(beside, num_cells, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
-        largest = bound(analysis.error, jnp.where(empty, 0, final), rounding)
-        paint = analysis.paint if plan.super_pixels else None
-        return coarse_schedule(windows, final, references, paint, slab_samples), largest, final
+        return final, bound(errors.error, jnp.where(empty, 0, final), rounding), errors.paint
 
-    def leave() -> tuple[SlabSchedule, Array, Array]:
-        return (
-            uncoarsened(cells, references, plan.super_pixels),
-            jnp.zeros(bundles, dtype),
-            untouched(cells, slab_samples),
-        )
+    def at_full_rate() -> tuple[Array, Array, Array]:
+        return jnp.zeros((num_cells, bundles), jnp.int32), jnp.zeros(bundles, dtype), jnp.zeros((4, num_cells, bundles), dtype)
 
-    work, largest, final = lax.cond(wanted.any(), decide, leave)
-    return work, largest, jnp.where(empty, EMPTY, final)
+    final, largest, paint = lax.cond(wanted.any(), decide, at_full_rate)
+    schedule = coarse_schedule(windows, final, references, paint if plan.super_pixels else None, slab_samples)
+    return schedule, largest, jnp.where(empty, EMPTY, final)
 
 
 def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:

@@ -38,14 +38,7 @@ COVERERS = 96  # particles in the middle of a window, that is nearest in depth, 
 SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
 
 
-@dataclasses.dataclass(frozen=True)
-class Footprint:
-    """Where a bundle's rays lie between two borders: ray coordinates ascend along the first axis."""
-
-    columns: Float[Array, "8 bundles"]
-    rows: Float[Array, "8 bundles"]
-
-
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SampleBounds:
     """Bounds over each sample slab, for all rays of a bundle.
@@ -62,6 +55,7 @@ class SampleBounds:
     hi: list[Float[Array, "samples bundles"]]
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Spheres:
     """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities.
@@ -90,7 +84,7 @@ def sample_bounds(
     balls: Spheres,
     rank: Int[Array, " pairs"],
     window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
-    footprint: Footprint,
+    footprint: tuple[Float[Array, "8 bundles"], Float[Array, "8 bundles"]],
     borders: Float[Array, "samples_and_one bundles"],
     references: tuple[tuple[Float[Array, " bundles"], Float[Array, " bundles"]], ...],
     tables: tuple[RangeTables, ...],
@@ -100,16 +94,15 @@ def sample_bounds(
     """Bounds for the samples between `borders`, from the particles of a window.
 
     Args:
+        footprint: ray coordinates of each bundle's columns and of its rows, ascending.
         references: of each quantity, the least and the greatest that the sums of these samples may be taken relative to.
         tables: of the parts of the transfer function.
         subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
     """
     lateral_scales = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
     total = window[1].sum(0)
-    samples, bundles = borders.shape[0] - 1, borders.shape[1]
-    dtype = borders.dtype
-    box = _boxes(footprint.columns, lateral_scales, 1), _boxes(footprint.rows, lateral_scales, 1)
-    boxes = _boxes(footprint.columns, lateral_scales, subdivisions), _boxes(footprint.rows, lateral_scales, subdivisions)
+    samples, bundles, dtype = borders.shape[0] - 1, borders.shape[1], borders.dtype
+    box, boxes = ([_boxes(rays, lateral_scales, parts) for rays in footprint] for parts in (1, subdivisions))
     sides = jnp.asarray([-1, 1], dtype)[:, None, None]
     one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
@@ -159,9 +152,8 @@ def sum_rounding(terms: Array, dtype: Any) -> Array:
 def _boxes(rays: Array, lateral_scales: tuple[Array, Array], parts: int) -> tuple[Array, Array]:
     """Least and greatest view coordinate of each part of the footprint, (parts, bundles)."""
     first, last = rays[:: BUNDLE // parts], rays[BUNDLE // parts - 1 :: BUNDLE // parts]
-    return jnp.minimum(lateral_scales[0] * first, lateral_scales[1] * first), jnp.maximum(
-        lateral_scales[0] * last, lateral_scales[1] * last
-    )
+    near, far = lateral_scales
+    return jnp.minimum(near * first, far * first), jnp.maximum(near * last, far * last)
 
 
 def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Array) -> Spheres:
@@ -172,7 +164,7 @@ def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Arra
     return dataclasses.replace(found, outer=outer, inner=inner)
 
 
-def _nearest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, Array]:
+def _nearest(ball: Spheres, boxes: list[tuple[Array, Array]], borders: Array) -> tuple[Array, Array]:
     """Squared distances, in outer radii, to the nearest points of slabs: across (particles, bundles) and along depth."""
     (left, right), (bottom, top) = boxes
     x = jnp.maximum(jnp.maximum(left - ball.x, ball.x - right), 0)
@@ -182,7 +174,7 @@ def _nearest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Arr
     return _square(x, ball.outer) + _square(y, ball.outer), _square(z, ball.outer[:, None])
 
 
-def _farthest(ball: Spheres, boxes: tuple[tuple[Array, Array], ...], borders: Array) -> tuple[Array, ...]:
+def _farthest(ball: Spheres, boxes: list[tuple[Array, Array]], borders: Array) -> tuple[Array, ...]:
     """Squared distances, in inner radii, to the farthest points of parts of slabs: across columns, rows, and along depth."""
     places = [(ball.x, *boxes[0]), (ball.y, *boxes[1]), (ball.z, borders[:-1], borders[1:])]
     inner = ball.inner[:, None]
@@ -194,7 +186,3 @@ def _square(distance: Array, inverse: Array) -> Array:
     """(distance / radius)^2, infinite where the particle does not count."""
     share = distance * jnp.minimum(inverse, jnp.finfo(inverse.dtype).max)
     return jnp.where(inverse < jnp.inf, share * share, jnp.inf)
-
-
-for _kind in (Footprint, SampleBounds, Spheres):
-    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

@@ -22,6 +22,7 @@ two middle slabs, so its optics lie in the ranges of both.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -44,24 +45,26 @@ def fits(slab_samples: int) -> int:
     return (CELL_SAMPLES // slab_samples).bit_length() - 1
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CellErrors:
-    """Of single cells, as seen from right in front of them.
+    """Of single cells: as seen from right in front of them, or by the bundle's pixels.
 
     Attributes:
-        error: for every candidate (levels 0 to 4, super-pixel), how much the light that leaves the cell can change;
-            ascends with the level.
-        strict: the same without relaxation.
+        error: for every candidate (levels 0 to 4, super-pixel), how much the light that is seen of the cell can change;
+            ascends with the level. An estimate if relaxed, else a bound.
+        strict: the same, never relaxed.
         paint: red, green, blue and extinction of the super-pixel.
         tau_lo: least optical thickness.
     """
 
-    error: Float[Array, "candidates bundles"]
-    strict: Float[Array, "candidates bundles"]
-    paint: Float[Array, "4 bundles"]
-    tau_lo: Float[Array, " bundles"]
+    error: Float[Array, "candidates *cells"]
+    strict: Float[Array, "candidates *cells"]
+    paint: Float[Array, "4 *cells"]
+    tau_lo: Float[Array, "*cells"]
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Optics:
     """Ranges of what the fine samples of a layer of cells are, and of the light that they take away."""
@@ -133,10 +136,7 @@ def _filled(lo: Array, hi: Array, touched: Array) -> tuple[Array, Array]:
 
 
 def _sum_in_front(depth: Array) -> Array:
-    sums = [jnp.zeros_like(depth[0])]
-    for k in range(CELL_SAMPLES - 1):
-        sums.append(sums[-1] + depth[k])
-    return jnp.stack(sums)
+    return jnp.stack(list(itertools.accumulate(depth[:-1], initial=jnp.zeros_like(depth[0]))))
 
 
 def _opacity(depth: Array) -> Array:
@@ -202,7 +202,3 @@ def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
     lost = jnp.exp(-optics.tau_lo.sum(0)) * _opacity(off_depth)
     rounding = (CELL_SAMPLES + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
     return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding
-
-
-for _kind in (CellErrors, _Optics):
-    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])

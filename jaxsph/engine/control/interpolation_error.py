@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -47,9 +47,12 @@ MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
 SUBSAMPLED_SHARE = 0.2  # of the variance across, what is left between rays of `SUBSAMPLE`, where it is most: at free surfaces
 DEVIATIONS_AROUND = 10.0  # of Q, by which quantities between nodes are taken to lie beyond those at the nodes
 MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
+AXES = 2, 1, 0  # of a lattice: columns, rows, layers
 Combine = Callable[[Array, Array], Array]
+Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; first layer
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class InterpolationError:
     """Of the slabs of a band.
@@ -65,309 +68,198 @@ class InterpolationError:
     bend: Float[Array, "slabs bundles"]
 
 
-class AtNodes(NamedTuple):
-    """What the nodes of some layers tell of one quantity; of one layer, without the first axis.
+class NodeValues(NamedTuple):
+    """What the nodes of some layers tell of one quantity.
 
     Attributes:
         variance: of Q between nodes: that of one sample, times how many in a row err as one. Infinite where the sum of weights
             is not clear of zero.
         across: the part of it that is across.
         quantity: Q.
-        red, green, blue, extinction: its optics; of two quantities, the first tells colours, the last extinction.
+        optics: red, green, blue and extinction of Q.
     """
 
-    variance: Float[Array, "layers nodes"]
-    across: Float[Array, "layers nodes"]
-    quantity: Float[Array, "layers nodes"]
-    red: Float[Array, "layers nodes"]
-    green: Float[Array, "layers nodes"]
-    blue: Float[Array, "layers nodes"]
-    extinction: Float[Array, "layers nodes"]
-
-
-class Sweep(NamedTuple):
-    """What a slab takes over from the one before it, at the nodes of a layer.
-
-    Attributes:
-        tau: optical thickness in front.
-        light: what reaches the eye from a unit of length, one layer before, see `spacing.second_differences`.
-        first: the slab's first layer, of each quantity.
-    """
-
-    tau: Float[Array, " nodes"]
-    light: Float[Array, "4 nodes"]
-    first: tuple[AtNodes, ...]
-
-
-class OfBundles(NamedTuple):
-    """A slab's nodes, pooled over each bundle.
-
-    Attributes:
-        deviation: root mean square error of Q.
-        share: see `InterpolationError.subsampled_share`.
-        low, high: least and greatest Q.
-        front: most of the light that is let through in front.
-        taken: most of what the slab takes of it.
-    """
-
-    deviation: Float[Array, "rows columns"]
-    share: Float[Array, "rows columns"]
-    low: Float[Array, "rows columns"]
-    high: Float[Array, "rows columns"]
-    front: Float[Array, "rows columns"]
-    taken: Float[Array, "rows columns"]
+    variance: Float[Array, "layers rows columns"]
+    across: Float[Array, "layers rows columns"]
+    quantity: Float[Array, "layers rows columns"]
+    optics: tuple[Float[Array, "layers rows columns"], ...]
 
 
 def interpolation_error(
     grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int
 ) -> InterpolationError:
     """Of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
+    region, spacing, dtype = lattice.region, lattice.region.spacing, lattice.weight.dtype
+    shape = grid.windows.count.shape[0], region.rows, region.columns
 
-    def nothing() -> InterpolationError:
-        shape, dtype = grid.windows.count.shape, lattice.weight.dtype
-        return InterpolationError(
-            jnp.full(shape, jnp.inf, dtype), jnp.full(shape, SUBSAMPLED_SHARE, dtype), jnp.zeros(shape, dtype)
-        )
+    def nothing() -> tuple[Array, Array, Array]:
+        return jnp.full(shape, jnp.inf, dtype), jnp.full(shape, SUBSAMPLED_SHARE, dtype), jnp.zeros(shape, dtype)
 
-    found = functools.partial(_swept, grid, lattice, camera, transfer, slab_samples)
-    return lax.cond((lattice.evaluations > 0).any(), found, nothing)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Nodes:
-    """The lattice in memory, and what all slabs of a band are judged by.
-
-    Attributes:
-        segments, squares: of the parts of the transfer function.
-        path: path length of the nodes' rays a unit of depth, longest of each bundle as `longest`.
-        edges: depths of layers.
-        within: layers of a slab.
-        pixel: size of a pixel at depth 1 (perspective) or any depth.
-    """
-
-    weight: Float[Array, " nodes"]
-    weighted: tuple[Float[Array, " nodes"], ...]
-    lattice: Lattice
-    segments: tuple[Segments, ...]
-    squares: tuple[SquaredSlopes, ...]
-    path: Float[Array, " nodes"]
-    longest: Float[Array, "rows columns"]
-    edges: Float[Array, " layers"]
-    pixel: Float[Array, ""]
-    within: int
-    perspective: bool
-
-    @property
-    def down_across(self) -> tuple[int, int]:
-        """Nodes of a layer, without the gap."""
-        rows, columns = self.lattice.weight.shape[1:]
-        return rows - GAP, columns - GAP
-
-    @property
-    def layer(self) -> int:
-        """How far apart in memory neighbours in depth are."""
-        _, rows, columns = self.lattice.weight.shape
-        return rows * columns
-
-    def pooled(self, value: Float[Array, " nodes"], combine: Combine) -> Float[Array, "rows columns"]:
-        """Nodes of a layer combined over each bundle."""
-        down, across = self.down_across
-        return _pooled(value, combine, down=down, across=across, of_bundle=self.lattice.region.spacing.across)
-
-    def judge(self, sweep: Sweep, slab: Array) -> tuple[Sweep, tuple[Array, Array, Array]]:
-        """Variance, share and bend of a slab, (rows, columns); and what the next takes over."""
-        spacing, within, always = self.lattice.region.spacing, self.within, slab >= 0
-        begin, number = (slab * within + 1) * self.layer, (within + 2 * REACH) * self.layer
-        weight, *weighted = (lax.dynamic_slice_in_dim(value, begin, number) for value in (self.weight, *self.weighted))
-        border = lax.dynamic_slice(self.edges, (slab * within,), (within + 1,))
-        slab_samples = within * spacing.samples
-        node_distance = spacing.pixels * self.pixel * (border[-1] if self.perspective else 1)
-        correlated = jnp.maximum(slab_samples * node_distance / (border[-1] - border[0]), 1)
-        at_nodes = functools.partial(
-            _at_nodes, columns=self.lattice.weight.shape[2], layer=self.layer, node_samples=spacing.samples
-        )
-        looks = zip(weighted, self.lattice.references, self.segments, strict=True)
-        new: list[AtNodes] = [fusion_barrier(always, at_nodes, weight, *one, correlated) for one in looks]
-        layers = [
-            AtNodes(*([a, *b] for a, b in zip(*both, strict=True)))  # type: ignore[arg-type]
-            for both in zip(sweep.first, new, strict=True)
-        ]
-        extinction = list(layers[-1].extinction)
-        absorbed = sum(extinction[k] * (border[k + 1] - border[k]) for k in range(within)) * self.path
-        pool = functools.partial(_of_bundles, self.pooled, (within + 1) * (spacing.across + 1) ** 2)
-        bundles: list[OfBundles] = [
-            fusion_barrier(always, pool, list(one.variance), list(one.across), list(one.quantity), sweep.tau, absorbed)
-            for one in layers
-        ]
-        length = (border[-1] - border[0]) * self.longest
-        errors = (self._variance(*one, correlated, length) for one in zip(bundles, self.squares, strict=True))
-        variance = functools.reduce(jnp.add, errors) / slab_samples
-        colors = [list(layers[0].red), list(layers[0].green), list(layers[0].blue)]
-        step = (border[1:] - border[:-1])[:, None] * self.path
-        bends = fusion_barrier(always, second_differences, colors, extinction, step, sweep.tau, sweep.light)
-        bend = jnp.sqrt(self.pooled(bends[0] ** 2, jnp.add)) / (spacing.across + 1)
-        last = tuple(AtNodes(*(value[-1] for value in one)) for one in new)
-        share = functools.reduce(jnp.maximum, (bundle.share for bundle in bundles))
-        return Sweep(sweep.tau + absorbed, bends[1], last), (variance, share, bend)
-
-    def _variance(
-        self, bundle: OfBundles, squares: SquaredSlopes, correlated: Array, length: Array
-    ) -> Float[Array, "rows columns"]:
-        """Of a slab's light by one quantity, times its samples.
-
-        Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
-        falls so.
-        """
-        around = DEVIATIONS_AROUND * bundle.deviation / jnp.sqrt(correlated)
-        *of_colors, of_extinction = mean_square_slope(squares, bundle.low - around, bundle.high + around)
-        light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * bundle.taken**2
-        return bundle.front**2 * bundle.deviation**2 * light
-
-    def skip(self, sweep: Sweep, _: Array) -> tuple[Sweep, tuple[Array, Array, Array]]:
-        """An empty slab before an empty one."""
-        nothing = jnp.zeros_like(self.longest)
-        still = jax.tree.map(jnp.zeros_like, sweep)
-        return still._replace(tau=sweep.tau), (nothing, nothing + SUBSAMPLED_SHARE, nothing)
+    sweep = functools.partial(_sweep, grid, lattice, camera, transfer, slab_samples)
+    found = lax.cond((lattice.evaluations > 0).any(), sweep, nothing)
+    row, column, inside = region.place(grid)
+    at = jnp.where(inside, row * region.columns + column, 0)
+    variance, share, bend = (value.reshape(shape[0], -1)[:, at] for value in found)
+    # cubics of the first and of the last slab take nodes beyond the lattice, and so do those of bundles at its sides
+    slab, within = jnp.arange(shape[0], dtype=jnp.int32)[:, None], slab_samples // spacing.samples
+    deep = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // spacing.samples)
+    past = -(-2 // spacing.across)
+    inside &= (row > 0) & (row < region.rows - past) & (column > 0) & (column < region.columns - past)
+    variance += (MIN_DEVIATION * jnp.finfo(dtype).eps) ** 2
+    return InterpolationError(jnp.where(deep & inside, variance, jnp.inf), share, bend)
 
 
-def _swept(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> InterpolationError:
-    """Slab by slab from front to back, such that what is at hand stays in the cache."""
-    nodes = _nodes(grid, lattice, camera, transfer, slab_samples)
-    slabs, path = grid.windows.count.shape[0], nodes.path
-    # the first layer counts as empty: its slab is not interpolated anyway
-    nothing = jnp.zeros_like(path)
-    empty = (AtNodes(*[nothing] * len(AtNodes._fields)),) * len(nodes.segments)
-    start = Sweep(nothing, jnp.zeros((4, *path.shape), path.dtype), empty)
-    filled = jnp.append((grid.windows.count > 0).any(1), False)
-    judged = filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
-    each = jnp.arange(slabs, dtype=jnp.int32), judged
-    found = lax.scan(lambda sweep, x: lax.cond(x[1], nodes.judge, nodes.skip, sweep, x[0]), start, each)[1]
-    variance, share, bend = found
-    variance += (MIN_DEVIATION * jnp.finfo(variance.dtype).eps) ** 2
-    return _of_grid(grid, lattice, nodes.within, jnp.where(_spared(grid, lattice, nodes.within), variance, jnp.inf), share, bend)
-
-
-def _nodes(grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int) -> _Nodes:
+def _sweep(
+    grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int
+) -> tuple[Float[Array, "slabs rows columns"], ...]:
+    """Variance, share and bend of a region's bundles, slab by slab from front to back: what is at hand stays in the cache."""
     spacing, slabs = lattice.region.spacing, grid.windows.count.shape[0]
-    rows, columns = lattice.weight.shape[1:]
-    within = slab_samples // spacing.samples
-    weight, *weighted = (value.ravel() for value in (lattice.weight, *lattice.weighted))
-    path = _slant(lattice, camera, rows, columns).ravel()
-    longest = _pooled(path, jnp.maximum, down=rows - GAP, across=columns - GAP, of_bundle=spacing.across)
+    within = slab_samples // spacing.samples  # layers of a slab
+    sums = [jnp.pad(value, ((0, 0), (REACH, 0), (REACH, 0))) for value in (lattice.weight, *lattice.weighted)]
+    parts = transfer.parts()
+    segments, squares = [part.segments() for part in parts], [squared_slopes(part) for part in parts]
+    path, pool = _path_lengths(lattice, camera), functools.partial(_pooled, of_bundle=spacing.across)
+    longest = pool(path[None], jnp.maximum)
     # one more border than there are samples, and layers past the last
     last = grid.half_steps.shape[0] - 1
     edges = grid.half_steps[jnp.minimum(2 * spacing.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
     pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
-    parts = transfer.parts()
-    tables = tuple(part.segments() for part in parts), tuple(map(squared_slopes, parts))
-    return _Nodes(weight, tuple(weighted), lattice, *tables, path, longest, edges, pixel, within, camera.is_perspective)
 
+    def judge(carried: Carried, slab: Array) -> tuple[Carried, tuple[Array, ...]]:
+        (tau, light, first), always = carried, slab >= 0
+        weight, *weighted = (lax.dynamic_slice_in_dim(value, slab * within + 1, within + 2 * REACH) for value in sums)
+        edge = lax.dynamic_slice_in_dim(edges, slab * within, within + 1)
+        step, depth = edge[1:] - edge[:-1], edge[-1] - edge[0]
+        node_distance = spacing.pixels * pixel * (edge[-1] if camera.is_perspective else 1)
+        correlated = jnp.maximum(slab_samples * node_distance / depth, 1)
+        at_nodes = functools.partial(_at_nodes, node_samples=spacing.samples)
+        looks = zip(weighted, lattice.references, segments, strict=True)
+        new = [fusion_barrier(always, at_nodes, weight, *one, correlated) for one in looks]
+        layers: list[NodeValues] = jax.tree.map(lambda front, behind: jnp.concatenate([front[None], behind]), first, new)
+        colors, extinction = layers[0].optics[:3], layers[-1].optics[3]
+        absorbed = sum(extinction[k] * step[k] for k in range(within)) * path
+        judged = [
+            _light_of_slab(one, slopes, tau, absorbed, correlated, depth * longest, spacing.across)
+            for one, slopes in zip(layers, squares, strict=True)
+        ]
+        variance = functools.reduce(jnp.add, [one for one, _ in judged]) / slab_samples
+        share = functools.reduce(jnp.maximum, [one for _, one in judged])
+        bend, light = fusion_barrier(always, second_differences, colors, extinction, step[:, None, None] * path, tau, light)
+        bend = jnp.sqrt(pool(bend[None] ** 2, jnp.add)) / (spacing.across + 1)
+        return (tau + absorbed, light, jax.tree.map(lambda value: value[-1], new)), (variance, share, bend)
 
-def _spared(grid: Grid, lattice: Lattice, within: int) -> Array:
-    """Slabs (slabs, rows, columns) whose cubics take no nodes beyond the lattice: not the first, nor the last."""
-    region, spacing = lattice.region, lattice.region.spacing
-    slab, row, column = (jnp.arange(n, dtype=jnp.int32) for n in (grid.windows.count.shape[0], region.rows, region.columns))
-    inside = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // spacing.samples)
-    past = -(-2 // spacing.across)  # bundles at the far sides from which a cubic takes nodes beyond
-    inside_rows, inside_columns = (row > 0) & (row < region.rows - past), (column > 0) & (column < region.columns - past)
-    return inside[:, None, None] & inside_rows[:, None] & inside_columns
+    def skip(carried: Carried, _: Array) -> tuple[Carried, tuple[Array, ...]]:
+        """An empty slab before an empty one."""
+        nothing = jnp.zeros_like(longest)
+        return (carried[0], *jax.tree.map(jnp.zeros_like, carried[1:])), (nothing, nothing + SUBSAMPLED_SHARE, nothing)
 
-
-def _of_grid(grid: Grid, lattice: Lattice, within: int, variance: Array, share: Array, bend: Array) -> InterpolationError:
-    """From the bundles of a region (slabs, rows, columns) to those of a grid; infinite variance elsewhere."""
-    row, column, inside = lattice.region.place(grid)
-    at = jnp.where(inside, row * lattice.region.columns + column, 0)
-    variance, share, bend = (value.reshape(value.shape[0], -1)[:, at] for value in (variance, share, bend))
-    return InterpolationError(jnp.where(inside, variance, jnp.inf), share, bend)
-
-
-def _of_bundles(
-    pooled: Callable[[Array, Combine], Array],
-    number: int,
-    variance: list[Array],
-    across: list[Array],
-    quantity: list[Array],
-    tau: Array,
-    absorbed: Array,
-) -> OfBundles:
-    """The nodes of a slab's layers, those of the next slab's first among them, pooled over bundles of `number` nodes."""
-
-    def pool(layers: Sequence[Array], combine: Combine) -> Array:
-        return pooled(functools.reduce(combine, layers), combine)
-
-    total, lateral = pool(variance, jnp.add), pool(across, jnp.add)
-    deviation = jnp.sqrt(total / number)
-    share = SUBSAMPLED_SHARE * jnp.clip(lateral / jnp.where(total > 0, total, 1), MIN_ACROSS, 1)
-    front, taken = jnp.exp(-pool([tau], jnp.minimum)), -jnp.expm1(-pool([absorbed], jnp.maximum))
-    return OfBundles(deviation, share, pool(quantity, jnp.minimum), pool(quantity, jnp.maximum), front, taken)
+    # the first layer counts as empty: its slab is not interpolated anyway
+    nothing = jnp.zeros_like(path)
+    empty = [NodeValues(nothing, nothing, nothing, (nothing,) * 4) for _ in parts]
+    filled = jnp.append((grid.windows.count > 0).any(1), False)
+    each = jnp.arange(slabs, dtype=jnp.int32), filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
+    start = nothing, jnp.stack([nothing] * 4), empty
+    return lax.scan(lambda carried, x: lax.cond(x[1], judge, skip, carried, x[0]), start, each)[1]
 
 
 def _at_nodes(
-    weight: Array,
-    weighted: Array,
-    reference: Array,
+    weight: Float[Array, "_ _ _"],
+    weighted: Float[Array, "_ _ _"],
+    reference: Float[Array, ""],
     segments: Segments,
-    correlated: Array,
-    *,
-    columns: int,
-    layer: int,
+    correlated: Float[Array, ""],
     node_samples: int,
-) -> AtNodes:
-    """What nodes in a row tell, without `REACH` layers on either side.
+) -> NodeValues:
+    """What nodes tell that have `REACH` others on every side: those have none of their own.
 
     Args:
         correlated: how many samples in a row err as one across.
-        columns, layer: how far apart in memory neighbours are down and in depth.
         node_samples: fine samples from one layer to the next, that err as one in depth.
     """
-    number = weight.shape[0] - 2 * REACH * layer
-
-    def shifted(value: Array, by: int) -> Array:
-        return value[REACH * layer + by :][:number]
-
-    def fourth(value: Array, stride: int) -> Array:
-        left2, left, middle, right, right2 = (shifted(value, by * stride) for by in range(-REACH, REACH + 1))
-        return (left2 + right2) - 4 * (left + right) + 6 * middle
-
-    here = shifted(weight, 0)
+    here, total = _shifted(weight), _shifted(weighted)
     inside = here > 0
     inverse = jnp.where(inside, 1 / jnp.where(inside, here, 1), 0)
-    ratio = shifted(weighted, 0) * inverse
-    variance, across, unsure = jnp.zeros_like(ratio), jnp.zeros_like(ratio), jnp.zeros_like(ratio)
-    for stride in (1, columns, layer):
-        across = variance
-        of_weight = fourth(weight, stride)
-        unsure += CUBIC * jnp.abs(of_weight)
-        error = (CUBIC * (fourth(weighted, stride) - ratio * of_weight)) ** 2
-        variance += (node_samples if stride == layer else correlated) * error
-    clear = inside & (here > MIN_CLEARANCE * unsure)
-    variance, across = jnp.where(clear, variance * inverse**2, jnp.inf), across * inverse**2
+    ratio = total * inverse
+    of_weight = [_fourth_difference(weight, axis) for axis in AXES]
+    of_weighted = [_fourth_difference(weighted, axis) for axis in AXES]
+    along_columns, along_rows, along_layers = (
+        (CUBIC * (b - ratio * a)) ** 2 for a, b in zip(of_weight, of_weighted, strict=True)
+    )
+    across = correlated * along_columns + correlated * along_rows
+    variance = across + node_samples * along_layers
+    clear = inside & (here > MIN_CLEARANCE * sum(CUBIC * jnp.abs(change) for change in of_weight))
     quantity = reference + ratio
     place = fusion_barrier(correlated > 0, find, segments, quantity)
     *colors, extinction = read(segments, place)
-    found = variance, across, quantity, *colors, jnp.where(inside, extinction, 0)
-    return AtNodes(*(value.reshape(-1, layer) for value in found))
+    optics = *colors, jnp.where(inside, extinction, 0)
+    return NodeValues(jnp.where(clear, variance * inverse**2, jnp.inf), across * inverse**2, quantity, optics)
 
 
-def _slant(lattice: Lattice, camera: Camera, down: int, across: int) -> Array:
-    """Path length of the nodes' rays a unit of depth, (down, across)."""
-    dtype = lattice.weight.dtype
+def _shifted(value: Float[Array, "_ _ _"], axis: int = 0, by: int = 0) -> Float[Array, "_ _ _"]:
+    """The neighbours, so many nodes further along an axis, of all nodes that have `REACH` others on every side."""
+    starts = [REACH + by * (axis == other) for other in range(3)]
+    return value[tuple(slice(start, start + size - 2 * REACH) for start, size in zip(starts, value.shape, strict=True))]
+
+
+def _fourth_difference(value: Float[Array, "_ _ _"], axis: int) -> Float[Array, "_ _ _"]:
+    """Along an axis, at all nodes that have `REACH` others on every side."""
+    left2, left, middle, right, right2 = (_shifted(value, axis, by) for by in range(-REACH, REACH + 1))
+    return (left2 + right2) - 4 * (left + right) + 6 * middle
+
+
+def _light_of_slab(
+    layers: NodeValues,
+    squares: SquaredSlopes,
+    tau: Float[Array, "rows columns"],
+    absorbed: Float[Array, "rows columns"],
+    correlated: Float[Array, ""],
+    length: Float[Array, "rows columns"],
+    of_bundle: int,
+) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
+    """Variance of a slab's light by one quantity, times its samples; and the share of it that is left at a few rays.
+
+    Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
+    falls so.
+
+    Args:
+        layers: of the slab's nodes, the first of the next slab among them.
+        tau, absorbed: optical thickness in front of the slab, and its own, at the nodes.
+        length: of the slab along the longest of a bundle's rays.
+        of_bundle: nodes of a bundle, down and across.
+    """
+    pool = functools.partial(_pooled, of_bundle=of_bundle)
+    number = layers.variance.shape[0] * (of_bundle + 1) ** 2
+
+    def pooled() -> tuple[Array, ...]:
+        total, lateral = pool(layers.variance, jnp.add), pool(layers.across, jnp.add)
+        front, taken = jnp.exp(-pool(tau[None], jnp.minimum)), -jnp.expm1(-pool(absorbed[None], jnp.maximum))
+        share = SUBSAMPLED_SHARE * jnp.clip(lateral / jnp.where(total > 0, total, 1), MIN_ACROSS, 1)
+        low, high = pool(layers.quantity, jnp.minimum), pool(layers.quantity, jnp.maximum)
+        return jnp.sqrt(total / number), share, low, high, front, taken
+
+    deviation, share, low, high, front, taken = fusion_barrier(correlated > 0, pooled)
+    around = DEVIATIONS_AROUND * deviation / jnp.sqrt(correlated)
+    *of_colors, of_extinction = mean_square_slope(squares, low - around, high + around)
+    light = of_extinction * length**2 + functools.reduce(jnp.maximum, of_colors) * taken**2
+    return front**2 * deviation**2 * light, share
+
+
+def _path_lengths(lattice: Lattice, camera: Camera) -> Float[Array, "rows columns"]:
+    """Of the nodes' rays a unit of depth."""
+    region, dtype = lattice.region, lattice.weight.dtype
+    rows, columns = (number - GAP + 1 for number in lattice.weight.shape[1:])  # with those on the far borders of bundles
     if not camera.is_perspective:
-        return jnp.ones((down, across), dtype)
-    region = lattice.region
-    row, column = (region.spacing.pixels * jnp.arange(number, dtype=jnp.int32) for number in (down, across))
+        return jnp.ones((rows, columns), dtype)
+    row, column = (region.spacing.pixels * jnp.arange(number, dtype=jnp.int32) for number in (rows, columns))
     u, v = camera.column((region.column + column).astype(dtype) + 0.5), camera.row((region.row + row).astype(dtype) + 0.5)
     return jnp.sqrt(1 + u**2 + v[:, None] ** 2)
 
 
-def _pooled(
-    value: Float[Array, " nodes"], combine: Combine, *, down: int, across: int, of_bundle: int
-) -> Float[Array, "rows columns"]:
-    """Nodes of a layer combined over each bundle, those on the far borders as well."""
-    for stride in (1, across + GAP):
-        number = value.shape[0] - of_bundle * stride
-        value = functools.reduce(combine, (value[k * stride : k * stride + number] for k in range(of_bundle + 1)))
-    return value[: down * (across + GAP)].reshape(down, -1)[::of_bundle, :across:of_bundle]
-
-
-jax.tree_util.register_dataclass(InterpolationError, data_fields=["variance", "subsampled_share", "bend"], meta_fields=[])
+def _pooled(value: Float[Array, "layers rows columns"], combine: Combine, of_bundle: int) -> Float[Array, "_ _"]:
+    """Nodes combined over the layers and over each bundle, those on its far borders as well."""
+    value = functools.reduce(combine, value)
+    for axis in (1, 0):
+        last = value.shape[axis] - of_bundle
+        parts = [lax.slice_in_dim(value, k, k + last, of_bundle, axis) for k in range(of_bundle + 1)]
+        value = functools.reduce(combine, parts)
+    return value

@@ -14,58 +14,46 @@ Decisions carry no gradient.
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.control.analysis import Analysis
-from jaxsph.engine.control.errors import CANDIDATES
+from jaxsph.engine.control.errors import CANDIDATES, CellErrors
 
 CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
 HALVINGS = 20
 
 
-@dataclasses.dataclass(frozen=True)
-class Offer:
-    """What can be chosen for each cell.
-
-    Attributes:
-        saving: kernel evaluations a ray that a candidate saves against level 0.
-        allowed: whether it is on offer; level 0 always is.
-        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
-    """
-
-    saving: Float[Array, "candidates cells bundles"]
-    allowed: Bool[Array, "candidates cells bundles"]
-    rounding: Float[Array, " bundles"]
-
-
-def choose(analysis: Analysis, offer: Offer, tolerance: Float[Array, ""], allocation: str) -> Int[Array, "cells bundles"]:
+def choose(
+    errors: CellErrors,
+    saving: Float[Array, "candidates cells bundles"],
+    on_offer: Bool[Array, "candidates cells bundles"],
+    rounding: Float[Array, " bundles"],
+    tolerance: Float[Array, ""],
+    allocation: str,
+) -> Int[Array, "cells bundles"]:
     """The candidate of every cell: level 0 to 4, or super-pixel.
 
     Args:
-        analysis: errors of all candidates.
-        offer: what they save, and which can be had.
+        errors: of all candidates.
+        saving: kernel evaluations a ray that a candidate saves against level 0.
+        on_offer: candidates that can be had; level 0 always can.
+        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
         tolerance: largest error of a pixel.
         allocation: `"budget"`, or `"greedy"` (back to front).
     """
-    allowed = offer.allowed & (analysis.strict + offer.rounding <= tolerance)
-    error = jnp.where(allowed, analysis.error, jnp.inf).at[0].set(0)
+    allowed = on_offer & (errors.strict + rounding <= tolerance)
+    error = jnp.where(allowed, errors.error, jnp.inf).at[0].set(0)
     if allocation == "greedy":
-        chosen = _back_to_front(offer.saving, error, tolerance - offer.rounding)
+        chosen = _back_to_front(saving, error, tolerance - rounding)
     else:
-        chosen = _at_best_price(offer, error, tolerance)
+        chosen = _at_best_price(saving, error, rounding, tolerance)
     return lax.stop_gradient(chosen)
 
 
 def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
     """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
-    taken = error[0]
-    for candidate in range(1, CANDIDATES):
-        taken = jnp.where(chosen == candidate, error[candidate], taken)
+    taken = jnp.take_along_axis(error, chosen[None], 0)[0]
     return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0)
 
 
@@ -81,17 +69,17 @@ def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Arr
     return chosen, taken
 
 
-def _at_best_price(offer: Offer, error: Array, tolerance: Array) -> Array:
+def _at_best_price(saving: Array, error: Array, rounding: Array, tolerance: Array) -> Array:
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        keeps = _best(offer.saving, error, jnp.exp2(middle))[1].sum(0) + offer.rounding <= tolerance
+        keeps = _best(saving, error, jnp.exp2(middle))[1].sum(0) + rounding <= tolerance
         return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
 
-    low, high = (jnp.full_like(offer.rounding, end) for end in (CHEAPEST, DEAREST))
+    low, high = (jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST))
     _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
-    chosen, taken = _best(offer.saving, error, jnp.exp2(high))
-    return jnp.where(taken.sum(0) + offer.rounding <= tolerance, chosen, 0)
+    chosen, taken = _best(saving, error, jnp.exp2(high))
+    return jnp.where(taken.sum(0) + rounding <= tolerance, chosen, 0)
 
 
 def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
@@ -102,6 +90,3 @@ def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
 
     cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
     return lax.scan(step, left, cells, reverse=True)[1]
-
-
-jax.tree_util.register_dataclass(Offer, data_fields=["saving", "allowed", "rounding"], meta_fields=[])

@@ -10,15 +10,12 @@ them allow it. A cell whose neighbours do not falls back to the last level that 
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, SlabWindows, Window, pad_slabs
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, Window
 from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, fits
-from jaxsph.engine.field.schedule import SlabSchedule, full_rate
+from jaxsph.engine.field.schedule import SlabSchedule
 
 
 def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
@@ -72,32 +69,22 @@ def coarse_schedule(
     """
     per_cell = CELL_SAMPLES // slab_samples
     classes, slabs, bundles = windows[0].begin.shape
-    level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, slabs - levels.shape[0] * per_cell), (0, 0)))
+    missing = slabs - levels.shape[0] * per_cell
+    level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, missing), (0, 0)))
     place = jnp.arange(slabs, dtype=jnp.int32)[:, None]
     painted = (level == SUPER_PIXEL) & (place % per_cell == 0)
-    begin, length = (jnp.zeros((classes, slabs, bundles), jnp.int32) for _ in range(2))
+    begin = length = jnp.zeros((classes, slabs, bundles), jnp.int32)
     for step, window in enumerate(windows):
         here = (level == step) & (place % (1 << step) == 0)
-        begin, length = (
-            jnp.where(here, jnp.repeat(union, 1 << step, 1), value)
-            for union, value in ((window.begin, begin), (window.length, length))
-        )
+        begin = jnp.where(here, jnp.repeat(window.begin, 1 << step, 1), begin)
+        length = jnp.where(here, jnp.repeat(window.length, 1 << step, 1), length)
     count = length.sum(0).astype(jnp.int32)
     references = tuple(_shared_references(reference, windows, level) for reference in references)
     level = jnp.where(level == SUPER_PIXEL, MAX_LEVEL, level)
     if paint is None:
         return SlabSchedule(count > 0, level, begin, length, count, references)
-    colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, slabs - paint.shape[1] * per_cell), (0, 0)))
+    colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, missing), (0, 0)))
     return SlabSchedule((count > 0) | painted, level, begin, length, count, references, painted, colors)
-
-
-def uncoarsened(cells: SlabWindows, references: tuple[Float[Array, "slabs bundles"], ...], super_pixels: bool) -> SlabSchedule:
-    """The reference image's schedule, in the shape of `coarse_schedule`."""
-    schedule = jax.tree.map(lambda leaf: pad_slabs(leaf, cells), full_rate(cells, references))
-    if not super_pixels:
-        return schedule
-    paint = jnp.zeros((4, *schedule.count.shape), references[0].dtype)
-    return dataclasses.replace(schedule, painted=jnp.zeros_like(schedule.filled), paint=paint)
 
 
 def _shared_references(reference: Array, windows: list[Window], level: Array) -> Array:

@@ -25,7 +25,7 @@ from jaxsph.model.camera.camera import Camera
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
-WORTHWHILE = 0.25  # least share of a band's work that the lattice must resolve: sampling it costs up to a tenth
+MIN_RESOLVED_SHARE = 0.25  # of a band's work, that the lattice must resolve: sampling it costs up to a tenth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,8 @@ def pilot(
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)
     allowed = allowed if able is None else allowed & able
     budget = jnp.broadcast_to((tolerance / DEVIATIONS) ** 2, count.shape[1:])
-    # a slab is first marched at fewer rays, then at none: the second step is always the dearer, so never taken without the first
+    # a slab is first marched at fewer rays, then at none: the second step has most of the variance and saves least, so its price
+    # is the higher one and it is never taken without the first
     steps = jnp.concatenate([found.subsampled_share * found.variance, (1 - found.subsampled_share) * found.variance])
     gain, rays = jnp.maximum(count, 1).astype(budget.dtype), len(SUBSAMPLE) ** 2 / BUNDLE**2
     gains = jnp.concatenate([(1 - rays) * gain, rays * gain])
@@ -86,7 +87,7 @@ def pilot(
 def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
     """Whether the lattice resolves enough of a band's work to be sampled at all."""
     count = grid.windows.count.astype(jnp.float32)
-    return jnp.where(_resolved(grid, camera, slab_samples, nodes), count, 0).sum() > WORTHWHILE * count.sum()
+    return jnp.where(_resolved(grid, camera, slab_samples, nodes), count, 0).sum() > MIN_RESOLVED_SHARE * count.sum()
 
 
 def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, "slabs bundles"]:

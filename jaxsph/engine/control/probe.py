@@ -27,9 +27,10 @@ from jaxsph.engine.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
 
 PROBES = 8  # particles of each slab, from the middle half of its window
-WORTHWHILE = 0.1  # least share of a band's work that promising cells must hold: the analysis costs up to a third of their cast
+MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Probe:
     """What a look at the bundles of a band, or of a shard of it, has found.
@@ -48,7 +49,7 @@ class Probe:
 def worthwhile(shares: Sequence[tuple[Array, Array]]) -> Bool[Array, ""]:
     """Whether promising cells hold enough of a band's work to be analysed, by `held` and `all_held` of all of its shards."""
     held, all_held = (functools.reduce(jnp.add, works) for works in zip(*shares, strict=True))
-    return held >= WORTHWHILE * all_held
+    return held >= MIN_PROMISING_SHARE * all_held
 
 
 def probe(
@@ -118,6 +119,3 @@ def _varies(ends: list[tuple[Array, Array]], steps: Array, tables: tuple[RangeTa
     middle = 0.5 * (thin + thick)
     change = jnp.exp(-middle) * -jnp.expm1(-0.5 * (thick - thin)) - 0.5 * off * jnp.expm1(-middle)
     return jnp.stack([jnp.where(filled, change, 0).sum(0), jnp.where(filled, thin, 0).sum(0)])
-
-
-jax.tree_util.register_dataclass(Probe, data_fields=["promising", "held", "all_held"], meta_fields=[])

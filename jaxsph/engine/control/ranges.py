@@ -23,6 +23,7 @@ ROUNDING = 8  # eps: a looked up value is a sum and a product away from its cont
 ROUNDING_OF_PLACE = 16  # eps of the largest value: where evenly spaced points are taken to lie
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class RangeTables:
     """Transfer function with extremes of runs of control points.
@@ -115,8 +116,3 @@ def transfer_ranges(
         least.append(jnp.maximum(low - rounding[channel], 0))
         greatest.append(high + rounding[channel])
     return least, greatest
-
-
-jax.tree_util.register_dataclass(
-    RangeTables, data_fields=[field.name for field in dataclasses.fields(RangeTables)], meta_fields=[]
-)

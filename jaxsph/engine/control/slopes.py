@@ -20,6 +20,7 @@ from jaxsph.numerics.fusion import fusion_barrier
 BUCKETS = 1024  # of the transfer function's domain: a slope is averaged over one at least
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SquaredSlopes:
     """Squared slopes of a transfer function, such that they are read without a search.
@@ -72,6 +73,3 @@ def mean_square_slope(squares: SquaredSlopes, low: Array, high: Array) -> list[A
     extent = jnp.maximum(high - low, jnp.where(squares.rate > 0, 1 / squares.rate, 1))
     *inside, (jumps, _) = (fusion_barrier(always, between, row, first, past) for row in squares.integral)
     return [jnp.where(jumps > 0, jnp.inf, (sum_of + lost * upper) / extent) for sum_of, upper in inside]
-
-
-jax.tree_util.register_dataclass(SquaredSlopes, data_fields=["start", "rate", "integral"], meta_fields=[])

@@ -3,10 +3,9 @@ r"""Wider spaced samples in interpolated slabs: where light bends little along t
 Flow: interpolation_error -> [spacing] -> schedule -> cast.
 
 Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
-for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean, and twice w also resolves a kink of g that much worse. The nodes
-of the lattice know g, thus their second differences along a ray, so that is known without any sample more. They are taken at
-the nodes only and the rays between may meet a kink that those miss: `DEVIATION_PER_BEND` times their root mean square is one
-deviation.
+for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean. The nodes of the lattice know g, and so its second differences
+along their rays, without any sample more. Rays between nodes may meet a kink that those miss: `DEVIATION_PER_BEND` times the
+nodes' root mean square is one deviation.
 """
 
 from __future__ import annotations
@@ -19,9 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.control.knapsack import select_under_budget
 from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
 
-DEVIATION_PER_BEND = (
-    3.0  # times the root mean square bend over the nodes that the light of rays is taken to bend by, as one deviation
-)
+DEVIATION_PER_BEND = 3.0  # times the root mean square bend over the nodes that rays are taken to bend by, as one deviation
 MIN_DEVIATION = 8  # eps: what they differ by, at least
 
 

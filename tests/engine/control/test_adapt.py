@@ -13,8 +13,7 @@ import jaxsph as js
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES
 from jaxsph.engine.control.adapt import EMPTY, ControlPlan, adapt, untouched
 from jaxsph.engine.control.errors import SUPER_PIXEL
-from jaxsph.engine.control.merge import uncoarsened
-from jaxsph.engine.field.schedule import evaluations
+from jaxsph.engine.field.schedule import evaluations, full_rate
 from jaxsph.engine.runtime.tuning import CPU
 
 
@@ -44,7 +43,7 @@ ALIKE, MIXED = np.full(24, 0.5), np.tile([0.0, 1.0], 12)
 
 def test_what_is_alike_is_coarsened_within_the_tolerance(adapted):
     (schedule, bound, levels), grid, reference = adapted(ALIKE, 0.1)
-    full = uncoarsened(grid.windows, reference, True)
+    full = full_rate(grid.windows, reference)
     assert (np.asarray(bound) <= 0.1).all() and (np.asarray(bound) > 0).any()
     spent, most = (evaluations(one, grid.samples, 4).sum() for one in (schedule, full))
     assert 0 < float(spent) < 0.9 * float(most)
@@ -59,10 +58,12 @@ def test_a_smaller_tolerance_never_saves_more(adapted):
 @pytest.mark.parametrize(("tolerance", "wanted"), [(0.3, False), (0.0, True)])
 def test_what_is_not_wanted_or_not_allowed_is_the_reference_image(adapted, tolerance, wanted):
     (schedule, bound, levels), grid, reference = adapted(MIXED, tolerance, wanted)
-    full = uncoarsened(grid.windows, reference, True)
+    full, slabs = full_rate(grid.windows, reference), len(grid.windows.count)
     for name in ("filled", "length", "count"):
         found, expected = (np.asarray(getattr(one, name)) for one in (schedule, full))
-        np.testing.assert_array_equal(found, expected, err_msg=name)
+        np.testing.assert_array_equal(found[..., :slabs, :], expected, err_msg=name)
+        assert not found[..., slabs:, :].any(), "slabs past the last have nothing"
+    assert not (schedule.painted | schedule.filled & (schedule.level > 0)).any()
     assert not np.asarray(bound).any()
     at_full_rate = np.asarray(untouched(grid.windows, 4))
     np.testing.assert_array_equal(np.asarray(levels)[at_full_rate == 0], 0)

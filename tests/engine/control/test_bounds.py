@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
-from jaxsph.engine.control.bounds import Footprint, Spheres, sample_bounds
+from jaxsph.engine.control.bounds import Spheres, sample_bounds
 from jaxsph.engine.control.ranges import tables_of_parts
 
 RAYS = np.linspace(-0.1, 0.1, 8, dtype=np.float32)[:, None]
@@ -20,7 +20,7 @@ def bounds(*balls, subdivisions=2):
     spheres = Spheres(x, y, z, 1 / radius, 1 / radius, (quantity,))
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 0.5, 0]], [1.0, 3.0])
     window = jnp.zeros((1, 1), jnp.int32), jnp.full((1, 1), len(balls), jnp.int32)
-    rank, footprint = jnp.arange(len(balls), dtype=jnp.int32), Footprint(jnp.asarray(RAYS), jnp.asarray(RAYS))
+    rank, footprint = jnp.arange(len(balls), dtype=jnp.int32), (jnp.asarray(RAYS), jnp.asarray(RAYS))
     reference = jnp.full(1, 0.5, jnp.float32)
     find = jax.jit(sample_bounds, static_argnames=("perspective", "subdivisions"))
     tables, how = tables_of_parts(transfer), {"perspective": False, "subdivisions": subdivisions}

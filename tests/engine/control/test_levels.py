@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jaxsph.engine.control.analysis import Analysis
-from jaxsph.engine.control.errors import CANDIDATES
-from jaxsph.engine.control.levels import Offer, bound, choose
+from jaxsph.engine.control.errors import CANDIDATES, CellErrors
+from jaxsph.engine.control.levels import bound, choose
 
 CELLS, BUNDLES = 4, 6
 UNIT = st.floats(0, 1, width=16)
@@ -39,9 +38,10 @@ def chosen_by(allocation, drawn, tolerance):
     """Candidates, and what is taken of the tolerance and saved by them, (cells, bundles); the best that each cell could do."""
     error, saving, on_offer, rounding = drawn
     with jax.enable_x64(True):
-        offer = Offer(*(jnp.asarray(value) for value in (saving, on_offer, rounding)))
-        analysis = Analysis(jnp.asarray(error), jnp.asarray(error), jnp.zeros((4, CELLS, BUNDLES)))
-        chosen = choosing(analysis, offer, jnp.asarray(tolerance), allocation=allocation)
+        nothing = jnp.zeros((4, CELLS, BUNDLES))
+        errors = CellErrors(jnp.asarray(error), jnp.asarray(error), nothing, nothing[0])
+        given = (jnp.asarray(value) for value in (saving, on_offer, rounding, tolerance))
+        chosen = choosing(errors, *given, allocation=allocation)
         largest = np.asarray(bounding(offer_errors(error), chosen, jnp.asarray(rounding)))
     chosen = np.asarray(chosen)
     taken, gain = (np.take_along_axis(value, chosen[None], 0)[0] for value in (offer_errors(error), saving))
