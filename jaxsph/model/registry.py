@@ -21,8 +21,8 @@ AT_POINTS = {"step_doubling"}
 """Integrators that choose for themselves where they ask media: made with a tolerance and the samples of a ray."""
 ESTIMATING = {"segments"}
 """Integrators that estimate their error against the light integral, and are refined for a tolerance."""
-SCREENS = {"pixels": "jaxsph.engine.screen.pixels:EveryPixel", "quadtree": "jaxsph.engine.screen.quadtree:Quadtree"}
-"""Classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`."""
+SCREENS = dict.fromkeys(("pixels", "quadtree"), "jaxsph.engine.screen.pixels:EveryPixel")
+"""Classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`; a quadtree chooses of every pixel's (`refinement`)."""
 
 
 def integrator(name: str, *arguments: Any) -> Any:
