@@ -1,8 +1,8 @@
 """Refinement of an image that is known already: which rays would be cast, and how wrong the image would be, exactly.
 
-No ray is cast: marking and estimators are those of `jaxsph.engine.screen`, and what they may see of the finest image is what
-has been asked for. The rules are those of Kratz et al. 2011, section 5, and nothing else: every pixel counts, none is known to
-be empty, and no bundle is cast whole.
+No ray is cast: marking and the hierarchical estimator are those of `jaxsph.engine.screen`; its rival, the variance of corners,
+is here. What they may see of the finest image is what has been asked for. The rules are those of Kratz et al. 2011, section 5,
+and nothing else: every pixel counts, none is known to be empty, and no bundle is cast whole.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.engine.screen.canvas import LIGHT, Canvas
-from jaxsph.engine.screen.estimators import ESTIMATORS, Hierarchical
-from jaxsph.engine.screen.marking import Leaves, holding, leaves_of, wanted_by, worst
-from jaxsph.engine.screen.pyramid import at_nodes, halved, lattices, num_leaves, over_pixels, places
+from jaxsph.engine.screen.canvas import Canvas
+from jaxsph.engine.screen.estimators import leaf_errors
+from jaxsph.engine.screen.marking import Leaves, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.pyramid import at_nodes, corners_of, halved, lattices, num_leaves, over_pixels, places
 
 COLORS = 3  # channels of u in the paper; estimators see transmittance too
 SMOOTH = (
@@ -46,14 +46,25 @@ def relative(picture: Float[Array, "channels height width"], truth: Float[Array,
 
 
 def canvas_of(value: Image, known: Known) -> Canvas:
-    return Canvas(value, known, jnp.zeros(known.shape), known.sum(dtype=jnp.float32))
+    nothing = jnp.zeros(known.shape)
+    return Canvas(value, known, nothing, known.sum(dtype=jnp.float32), nothing, nothing)
 
 
 def open_leaves(canvas: Canvas, coarsest: int, estimator: str) -> tuple[list[Leaves], Float[Array, ""]]:
     """Leaves that have a pixel left, and the estimated error; what looks empty is left alone."""
-    nothing = jnp.zeros(canvas.shape, canvas.value.dtype)
-    found, quality = leaves_of(canvas, sides(coarsest), coarsest, ESTIMATORS[estimator], jnp.float32(-1), nothing)
-    return [leaves._replace(hidden=jnp.zeros_like(leaves.hidden)) for leaves in found], quality.l2
+    found, quality = leaves_of(canvas, sides(coarsest), jnp.float32(-1))
+    found = [leaves._replace(hidden=jnp.zeros_like(leaves.hidden)) for leaves in found]
+    if estimator == "hierarchical":
+        return found, quality.l2
+    *every, picture = lattices(canvas.light, canvas.known, 1, coarsest)
+    norms = (jnp.where(leaves.split, varied(at, leaves.side), 0) for leaves, at in zip(found, every[1:], strict=True))
+    found = [leaves._replace(norm=norm) for leaves, norm in zip(found, norms, strict=True)]
+    return found, jnp.sqrt(sum((leaves.norm**2).sum() for leaves in found) / (picture**2).sum())
+
+
+def varied(nodes: Float[Array, "channels rows columns"], side: int) -> Float[Array, "rows columns"]:
+    """How much colours vary at the corners of each leaf (Levoy 1990, as in Kratz et al. 2011, section 7.3)."""
+    return side * jnp.sqrt(jnp.stack(corners_of(nodes)).var(0).sum(0))
 
 
 def sides(coarsest: int) -> tuple[int, ...]:
@@ -81,7 +92,7 @@ def refine(
         by_regularity, by_truth = with_parabolas(canvas, found, leaves, coarsest)
         smoothed, best = relative(by_regularity[:COLORS], truth), relative(by_truth[:COLORS], truth)
     leaves = [some._replace(split=some.split & (some.norm > 0)) for some in leaves]
-    marked = holding(leaves, share) if number is None else worst(leaves, number)
+    marked = worst(leaves, number, share)
     error, true = relative(picture, truth), relative(found[-1], canvas.light)
     stage = Stage(known.sum(dtype=jnp.float32), error, estimated, true, smoothed, best)
     return known | wanted_by(marked, canvas, sides(coarsest)), stage
@@ -92,7 +103,7 @@ def with_parabolas(canvas: Canvas, found: list[Array], leaves: list[Leaves], coa
     by_regularity = by_truth = found[-1]
     previous = None
     for side, here, coarser, corners in zip(sides(coarsest), leaves, found[:-2], found[1:-1], strict=True):
-        errors = Hierarchical()(coarser, corners, canvas.shape, side).norm
+        errors, _ = leaf_errors(coarser, corners, canvas.shape, side)
         together = _of_four(here.split.astype(errors.dtype)) == 4
         curved = _parabolas(corners, canvas.shape, side)
         if previous is not None:
@@ -155,7 +166,7 @@ def errors_of_leaves(value: Image, known: Known, *, coarsest: int, estimator: st
     """Estimated and true norm of each leaf that has a pixel left; 0 for both where there is none."""
     canvas = canvas_of(value, known)
     leaves, _ = open_leaves(canvas, coarsest, estimator)
-    squares = ((lattices(canvas.light, known, 1, coarsest)[-1] - canvas.light)[:LIGHT] ** 2).sum(0)
+    squares = ((lattices(canvas.light, known, 1, coarsest)[-1] - canvas.light) ** 2).sum(0)
     return [
         (here.norm, jnp.where(here.split, jnp.sqrt(_of_four_pixels(squares, side)), 0))
         for here, side in zip(leaves, sides(coarsest), strict=True)

@@ -15,7 +15,6 @@ from jaxsph.numerics.trees import tree
 ESTIMATORS = ("interval", "pilot")
 NUMBERS = "tolerance", "relax", "min_transmittance"
 LEAF_PIXELS = 4, 8, 16, 32
-LEAF_ESTIMATORS = "hierarchical", "corner_variance", "uniform"  # see `screen.estimators`
 ALLOCATIONS = ("budget", "greedy")
 
 
@@ -54,8 +53,6 @@ class Settings:
             is expected to stay within the tolerance (Kratz et al. 2011): an estimate, which rays and interpolation share. Without
             a tolerance all leaves are split down to pixels.
         leaf_pixels: on each side of the quadtree's first leaves, 4, 8, 16 or 32.
-        leaf_estimator: by what leaves are split; `"hierarchical"` compares two approximations (Kratz et al. 2011, section 3),
-            `"corner_variance"` is that of Levoy 1990, `"uniform"` splits all.
         min_transmittance: rays end where all of their bundle let less through than this, in [0, 1/2): what is left out of a
             pixel is at most what is let through there, and is in its `error_bound`. A tolerance is kept with it, of which it
             takes so much; with 0 no ray ends.
@@ -74,7 +71,6 @@ class Settings:
     step_tolerance: float = 1e-3
     screen: str = "pixels"
     leaf_pixels: int = 8
-    leaf_estimator: str = "hierarchical"
     min_transmittance: Any = 0.0
     memory_limit: int | None = None
 
@@ -128,8 +124,6 @@ class Settings:
             )
         if self.leaf_pixels not in LEAF_PIXELS:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
-        if self.leaf_estimator not in LEAF_ESTIMATORS:
-            raise ValueError(f"`leaf_estimator` must be one of {', '.join(LEAF_ESTIMATORS)}, got {self.leaf_estimator!r}")
         if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
 

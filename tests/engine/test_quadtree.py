@@ -22,7 +22,7 @@ ROUNDING = 1e-6
 @pytest.fixture(scope="module")
 def screened(frames):
     """Settings and plan of a quadtree for all random frames, whose rays are cast in several turns."""
-    coarse = QuadtreePlan(8, "hierarchical", ListPlan(1, 1, 4 * frames.capacity, 16 * frames.capacity), 3)
+    coarse = QuadtreePlan(8, ListPlan(1, 1, 4 * frames.capacity, 16 * frames.capacity), 3)
     plan = dataclasses.replace(frames.plan(), screen="quadtree", quadtree=coarse)
     return dataclasses.replace(frames.settings, **QUADTREE), plan
 
@@ -150,7 +150,7 @@ def narrow(height=37, width=1):
     """An orthographic image, one pixel wide, in three bands."""
     camera = js.Camera.orthographic((0.1, 0.2, -3), (0, 0, 0), view_height=2.0, width=width, height=height, near=1.3, far=4.7)
     lists = ListPlan(1, -(-width // 16), 200, 600)
-    return camera, lists, QuadtreePlan(4, "hierarchical", ListPlan(-(-height // 32), 1, 200, 600), 4)
+    return camera, lists, QuadtreePlan(4, ListPlan(-(-height // 32), 1, 200, 600), 4)
 
 
 @pytest.mark.slow
@@ -203,7 +203,6 @@ def test_gradients_are_those_of_differences_in_both_modes(frames, screened, x64)
 
 @pytest.mark.parametrize(("given", "message"), [
     ({"leaf_pixels": 12}, r"`leaf_pixels` must be one of 4, 8, 16, 32, got 12"),
-    ({"leaf_estimator": "best"}, r"`leaf_estimator` must be one of hierarchical, corner_variance, uniform, got 'best'"),
     ({"screen": "octree"}, r"`screen` must be one of .*quadtree.*, got 'octree'"),
 ])  # fmt: skip
 def test_what_leaves_cannot_be_is_refused_with_what_they_can(given, message):
@@ -211,7 +210,7 @@ def test_what_leaves_cannot_be_is_refused_with_what_they_can(given, message):
         js.Settings(**given)
 
 
-@pytest.mark.parametrize("other", [{"leaf_pixels": 16}, {"leaf_estimator": "uniform"}, {"screen": "pixels"}])
+@pytest.mark.parametrize("other", [{"leaf_pixels": 16}, {"screen": "pixels"}])
 def test_a_plan_for_other_leaves_is_refused_by_name(frames, screened, other):
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match=f"settings.{next(iter(other))} = .*make a new one"):

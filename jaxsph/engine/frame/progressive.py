@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.layers import Drawn
-from jaxsph.engine.frame.refinement import Decisions, Refinement, counted
+from jaxsph.engine.frame.layers import Band, Drawn
+from jaxsph.engine.frame.refinement import begun, finished, opened, shot, sizes_of, tolerance_of
+from jaxsph.engine.frame.refinement_stages import Decisions, mark
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock, Executor, Forecast
@@ -25,10 +26,11 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
+Bands = tuple[Decisions, ...]
+Queues = tuple[tuple[Queue, Queue], ...]
 
 
 def progressive(
@@ -41,8 +43,8 @@ def progressive(
     leaf is expected to be over `settings.tolerance`, or without one when every pixel has a ray that is not certain to be empty.
 
     Args:
-        scene, camera, settings: as for `jaxsph.render`; `settings.leaf_pixels` and `leaf_estimator` choose the first leaves and
-            by what leaves are judged; `settings.screen` is taken to be `"quadtree"`.
+        scene, camera, settings: as for `jaxsph.render`; `settings.leaf_pixels` chooses the first leaves, and `settings.screen` is
+            taken to be `"quadtree"`.
         worst: leaves that a stage splits, m of the paper; all with an error as large as the last of them.
         share: if `worst` is not given, each stage splits as few leaves as hold this share in (0, 1] of the sum of all squared
             errors.
@@ -73,127 +75,101 @@ class Progressive:
     """
 
     def __init__(self, scene: Scene, camera: Camera, settings: Settings, worst: int | None, share: float) -> None:
-        self._scene, self._camera, self._settings = scene, camera, _with_quadtree(settings)
+        self._scene, self._camera, self._settings = scene, camera, settings
         self._worst, self._share = worst, share
-        self._state: _State | None = None
+        self.restart()
 
     def restart(self, scene: Scene | None = None, camera: Camera | None = None, settings: Settings | None = None) -> Progressive:
         """Begin anew, with another scene, view or settings if given; for a similar frame nothing is compiled."""
         self._scene, self._camera = scene or self._scene, camera or self._camera
-        self._settings = self._settings if settings is None else _with_quadtree(settings)
-        self._state = None
+        self._settings = dataclasses.replace(settings or self._settings, screen="quadtree")
+        self._stage: _Stage | None = None
         return self
 
     def __iter__(self) -> Progressive:
         return self
 
     def __next__(self) -> Image:
-        if self._state is None:
-            self._state = _begun(self._scene, self._camera, self._settings, self._worst)
-        elif self._state.done:
+        if self._stage is None:
+            stage = self._begun()
+        elif self._stage.done:
             raise StopIteration
         else:
-            self._state = self._state.refined(self._worst, self._share)
-        return self._state.image(self._settings)
+            stage = self._refined(self._stage, self._frame, self._clock)
+        image = self._image(stage)
+        self._stage = stage
+        return image
+
+    def _begun(self) -> _Stage:
+        """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
+        self._clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
+        plan, self._seen = PLANS.for_frame(asked, self._clock)
+
+        def frame_by(run: Executor) -> Frame:
+            shards = shards_at_hand(plan.cast.tuning)
+            return Frame.begun(self._seen, self._camera, self._settings, plan, asked.scene.formulas, shards, run)
+
+        def rehearse(known: list[bool]) -> None:
+            run = Forecast(known)
+            frame = frame_by(run)
+            finished(self._refined(self._coarse(frame, run), frame, run).canvas, frame, run)
+
+        self._clock.foresee(rehearse)
+        self._frame = frame_by(self._clock)
+        return self._coarse(self._frame, self._clock)
+
+    def _coarse(self, frame: Frame, run: Executor) -> _Stage:
+        canvas, grid = begun(frame, run)
+        return _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), frame, run))
+
+    def _refined(self, stage: _Stage, frame: Frame, run: Executor) -> _Stage:
+        """After another stage; before the first, bands are opened."""
+        number, canvas, grids, bands, queues, _ = stage
+        if not bands:
+            for row in _first_rows(frame):
+                canvas, decisions, grid = opened(canvas, frame, jnp.int32(row), run)
+                grids, bands = (*grids, grid), (*bands, decisions)
+            queues, _ = self._marked(canvas, bands, frame, run)
+        for decisions, wanted in zip(bands, queues, strict=True):
+            canvas = shot(canvas, frame, decisions, wanted, run)
+        return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, run))
+
+    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Executor) -> tuple[Queues, Quality]:
+        """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
+        tolerance, plan = tolerance_of(frame), frame.plan
+        inputs = canvas, tolerance, jnp.asarray(self._share, tolerance.dtype)
+        static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst, "tuning": plan.cast.tuning}
+        return run.one("adapt", mark, inputs, first_rows=_first_rows(frame) if bands else (), **static)  # type: ignore[no-any-return]
+
+    def _image(self, stage: _Stage) -> Image:
+        """What it looks like."""
+        layers = finished(stage.canvas, self._frame, self._clock)
+        drawn = Drawn.of(layers, stage.grids, self._seen.viewed.faults)
+        told: dict[str, Any] = {
+            "stage": stage.number,
+            "rays_left": int((~stage.canvas.known).sum()),
+            "l2_error": float(stage.quality.l2),
+            "max_error": float(stage.quality.largest),
+            "leaves_over": int(stage.quality.over),
+        }
+        return image_of(drawn, self._camera, self._settings, self._frame.plan, self._clock, **told)
 
 
-class _Band(NamedTuple):
-    """What is known of a band, and the rays that its leaves want next."""
+class _Stage(NamedTuple):
+    """What is known after a stage; no band is after that of the coarse lattice."""
 
-    decisions: Decisions
-    scattered: Queue
-    whole: Queue
-
-
-@dataclasses.dataclass(frozen=True)
-class _State:
-    """What is known after a stage; no band is before the first. Of `grids` there are faults and counts, and no layers."""
-
-    filling: Refinement
-    clock: Clock
-    grids: Drawn
+    number: int
     canvas: Canvas
+    grids: tuple[Band, ...]
+    bands: Bands
+    queues: Queues
     quality: Quality
-    bands: tuple[_Band, ...]
-    stage: int
 
     @property
     def done(self) -> bool:
         """Whether there is nothing left to split."""
-        return self.stage > 0 and not float(self.quality.over) > 0
-
-    def refined(self, worst: int | None, share: float) -> _State:
-        """After another stage."""
-        state = self if self.bands else self._opened(worst, share)
-        canvas = state.canvas
-        for band in state.bands:
-            canvas = self.filling.shot(canvas, *band)
-        state = dataclasses.replace(state, stage=self.stage + 1)
-        return state._marked(canvas, [band.decisions for band in state.bands], worst, share)
-
-    def _opened(self, worst: int | None, share: float) -> _State:
-        """With all bands known, and what their leaves want."""
-        made = [self.filling.decided(row) for row in self._rows]
-        of_bands = Drawn.of(None, [counted(grid) for _, grid in made], self.grids.faults)
-        faults.raise_for(of_bands.faults, True)
-        grids = of_bands._replace(filled=self.grids.filled + of_bands.filled, pairs=self.grids.pairs + of_bands.pairs)
-        return dataclasses.replace(self, grids=grids)._marked(self.canvas, [one for one, _ in made], worst, share)
-
-    def _marked(self, canvas: Canvas, decisions: list[Decisions], worst: int | None, share: float) -> _State:
-        bands, quality = [], self.quality
-        for row, one in zip(self._rows, decisions, strict=True):
-            canvas, scattered, whole, quality = self.filling.marked(canvas, one, row, worst, share)
-            bands.append(_Band(one, scattered, whole))
-        return dataclasses.replace(self, canvas=canvas, quality=quality, bands=tuple(bands))
-
-    @property
-    def _rows(self) -> list[Any]:
-        plan = self.filling.frame.plan
-        return [jnp.int32(nth * plan.band_height) for nth in range(plan.bands)]
-
-    def image(self, settings: Settings) -> Image:
-        """What it looks like."""
-        layers = self.filling.finished(self.canvas, [band.decisions for band in self.bands])
-        plan = self.filling.frame.plan
-        told: dict[str, Any] = {
-            "stage": self.stage,
-            "rays": int(self.canvas.rays),
-            "rays_left": int((~self.canvas.known).sum()),
-            "l2_error": float(self.quality.l2),
-            "max_error": float(self.quality.largest),
-            "leaves_over": int(self.quality.over),
-        }
-        drawn = self.grids._replace(layers=layers)
-        return image_of(drawn, self.filling.frame.camera, settings, plan, self.clock, **told)
+        return self.number > 0 and not float(self.quality.over) > 0
 
 
-def _with_quadtree(settings: Settings) -> Settings:
-    return dataclasses.replace(settings, screen="quadtree")
-
-
-def _begun(scene: Scene, camera: Camera, settings: Settings, worst: int | None) -> _State:
-    clock, asked = Clock(), Request.of(scene, camera, settings)
-    plan, seen = PLANS.for_frame(asked, clock)
-    shards = shards_at_hand(plan.cast.tuning)
-
-    def filling(run: Executor) -> Refinement:
-        frame = Frame.begun(seen, camera, settings, plan, asked.scene.formulas, shards, run)
-        return Refinement.of(frame, run)
-
-    clock.foresee(lambda known: _rehearse(filling(Forecast(known)), worst))
-    begun = filling(clock)
-    canvas, made = begun.begun()
-    grids = Drawn.of(None, [counted(made)], seen.viewed.faults)
-    faults.raise_for(grids.faults, True)
-    return _State(begun, clock, grids, canvas, begun.judged(canvas), (), 0)
-
-
-def _rehearse(filling: Refinement, worst: int | None) -> None:
-    """All that will be run, once."""
-    canvas, _ = filling.begun()
-    filling.judged(canvas)
-    filling.finished(canvas, [])
-    decisions, _ = filling.decided(jnp.int32(0))
-    canvas, scattered, whole, _ = filling.marked(canvas, decisions, jnp.int32(0), worst, SHARE)
-    filling.shot(canvas, decisions, scattered, whole)
-    filling.finished(canvas, [decisions] * filling.frame.plan.bands)
+def _first_rows(frame: Frame) -> tuple[int, ...]:
+    return tuple(nth * frame.plan.band_height for nth in range(frame.plan.bands))

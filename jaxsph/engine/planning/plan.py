@@ -122,7 +122,6 @@ class Plan:
         }
         if self.quadtree is not None:
             given["settings.leaf_pixels"] = (settings.leaf_pixels, self.quadtree.leaf)
-            given["settings.leaf_estimator"] = (settings.leaf_estimator, self.quadtree.estimator)
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan`")
@@ -315,7 +314,7 @@ def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, li
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in measures.of_lattice)
     coarse = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     packets = max(lists.num_bundles // shape.tuning.turns, min(lists.num_bundles, MIN_PACKETS))
-    return QuadtreePlan(settings.leaf_pixels, settings.leaf_estimator, coarse, packets)
+    return QuadtreePlan(settings.leaf_pixels, coarse, packets)
 
 
 def _fullest_band(counts: np.ndarray, rows: int, bands: int) -> int:

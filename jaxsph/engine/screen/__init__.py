@@ -2,4 +2,4 @@
 
 from jaxsph.model import registry
 
-registry.SCREENS |= {"pixels": "jaxsph.engine.screen.pixels:EveryPixel", "quadtree": "jaxsph.engine.screen.quadtree:Quadtree"}
+registry.SCREENS |= dict.fromkeys(("pixels", "quadtree"), "jaxsph.engine.screen.pixels:EveryPixel")  # of which a quadtree chooses

@@ -1,4 +1,4 @@
-r"""Which leaves are split next: the worst, or the fewest that hold a share of the error.
+r"""Which leaves are split next: those over the tolerance, the worst of them, or the fewest that hold a share of the error.
 
 Flow: canvas, estimators -> [marking] -> wanted pixels -> packets.
 
@@ -15,19 +15,20 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.engine.screen.canvas import LIGHT, Canvas, unseen
-from jaxsph.engine.screen.estimators import Estimator, allowed
-from jaxsph.engine.screen.pyramid import at_nodes, lattices, nodes_of_leaves, pixels_of_nodes
+from jaxsph.engine.screen.canvas import Canvas
+from jaxsph.engine.screen.estimators import allowed, leaf_errors
+from jaxsph.engine.screen.pyramid import at_nodes, lattices, nodes_of_leaves, of_corners, over_pixels, pixels_of_nodes
 
 HALVINGS = 32  # of the range of norms, when the least that is split is sought
 FEWEST = 1000  # leaves that a stage splits, if there are so many
+TWICE = 2.0  # times what is allowed, beyond which all pixels of a leaf are cast at once: it would be split again
 
 
 class Leaves(NamedTuple):
-    """Whole leaves with sides of one length that could be split.
+    """Leaves with sides of one length.
 
     Attributes:
-        norm, largest: see `estimators.LeafErrors`; 0 where there is no such leaf.
+        norm, largest: see `estimators.leaf_errors`.
         split: those that are to be: they are over the tolerance, or hidden.
         hidden: those that look empty and may not be.
         side: pixels.
@@ -54,46 +55,54 @@ class Quality(NamedTuple):
     over: Float[Array, ""]
 
 
-def leaves_of(
-    canvas: Canvas,
-    sides: tuple[int, ...],
-    coarsest: int,
-    estimator: Estimator,
-    tolerance: Array,
-    bound: Float[Array, "height width"],
-) -> tuple[list[Leaves], Quality]:
-    """All leaves, the largest first, and what they say of the image."""
-    light = lax.stop_gradient(canvas.light)
+def wanted_by_tolerance(canvas: Canvas, side: int, coarsest: int, tolerance: Array) -> Bool[Array, "height width"]:
+    """Pixels to cast that splitting all leaves of one side asks for, whose error may be over what is allowed."""
+    coarser, corners = lattices(canvas.light, canvas.known, side, coarsest)[-2:]
+    leaves = _of_side(canvas, coarser, corners, side, tolerance)
+    wanted = wanted_by([leaves.split], canvas, (side,))
+    if side > 2:
+        far = leaves.largest > TWICE * allowed(tolerance, canvas.bound, side)
+        wanted |= over_pixels(far, canvas.shape, side) & ~canvas.known
+    return wanted
+
+
+def leaves_of(canvas: Canvas, sides: tuple[int, ...], tolerance: Array) -> tuple[list[Leaves], Quality]:
+    """All whole leaves that could be split, the largest first, and what they say of the image; errors elsewhere are 0."""
     found: list[Leaves] = []
     there = whole = jnp.ones((), bool)
-    every = lattices(light, canvas.known, 1, coarsest)
+    every = lattices(canvas.light, canvas.known, 1, 2 * sides[0])
     for side, (coarser, corners) in zip(sides, itertools.pairwise(every[:-1]), strict=True):
-        errors = estimator(coarser, corners, canvas.shape, side)
-        there = _children(there & ~whole, _two(errors.norm)) if found else jnp.ones(errors.norm.shape, bool)
-        whole = there & _has_unknown(canvas, _two(errors.norm), side)
-        norm, largest = (jnp.where(whole, error, 0) for error in errors.both)
-        hidden = whole & unseen(canvas, corners, side)
-        over = (whole & (errors.largest > allowed(tolerance, bound, side))) | hidden
-        found.append(Leaves(norm, largest, over, hidden, side))
+        norm, largest, split, hidden, _ = _of_side(canvas, coarser, corners, side, tolerance)
+        there = _children(there & ~whole, norm.shape) if found else jnp.ones(norm.shape, bool)
+        whole = there & _has_unknown(canvas, norm.shape, side)
+        found.append(Leaves(jnp.where(whole, norm, 0), jnp.where(whole, largest, 0), whole & split, whole & hidden, side))
     squares = jnp.stack([(leaves.norm**2).sum() for leaves in found]).sum()
-    total = jnp.maximum((every[-1][:LIGHT] ** 2).sum(), jnp.finfo(light.dtype).tiny)
+    total = jnp.maximum((every[-1] ** 2).sum(), jnp.finfo(canvas.value.dtype).tiny)
     largest = jnp.stack([leaves.largest.max() for leaves in found]).max()
     over = jnp.stack([leaves.split.sum(dtype=jnp.float32) for leaves in found]).sum()
     return found, Quality(jnp.sqrt(squares / total), largest, over)
 
 
-def worst(leaves: list[Leaves], number: int) -> list[Bool[Array, "rows columns"]]:
-    """The most urgent leaves, so many of those that are to be split (and all that are as urgent as the last)."""
-    urgency = _urgency(leaves)
-    flat = jnp.concatenate([some.ravel() for some in urgency])
-    least = _largest(lambda level: (flat >= level).sum() >= number, flat)
-    return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
+def _of_side(canvas: Canvas, coarser: Array, corners: Array, side: int, tolerance: Array) -> Leaves:
+    """Of all squares of one side, whether they are leaves or not; `coarser` and `corners`: see `estimators.leaf_errors`."""
+    norm, largest = leaf_errors(coarser, corners, canvas.shape, side)
+    hidden = _unseen(canvas, corners, side)
+    return Leaves(norm, largest, (largest > allowed(tolerance, canvas.bound, side)) | hidden, hidden, side)
 
 
-def holding(leaves: list[Leaves], share: Array) -> list[Bool[Array, "rows columns"]]:
-    """As few as hold a share of the sum of all squared norms (Doerfler 1996), of those that are to be split.
+def _unseen(canvas: Canvas, corners: Float[Array, "4 rows columns"], side: int) -> Bool[Array, "rows columns"]:
+    """Leaves that look empty, though rays between their corners may meet something."""
+    empty = of_corners(corners[3] == 1, jnp.logical_and)
+    pads = [(0, count * side - size) for count, size in zip(empty.shape, canvas.shape, strict=True)]
+    inside = jnp.pad(~canvas.known, [(0, max(pad, 0)) for _, pad in pads])[: empty.shape[0] * side, : empty.shape[1] * side]
+    return empty & inside.reshape(empty.shape[0], side, empty.shape[1], side).any((1, 3))
 
-    But not fewer than `FEWEST`: a stage takes some time however little is done in it.
+
+def worst(leaves: list[Leaves], number: int | None, share: Array) -> list[Bool[Array, "rows columns"]]:
+    """The most urgent leaves of those that are to be split: `number` of them, and all that are as urgent as the last.
+
+    Without a number, as few as hold a share of the sum of all squared norms (Doerfler 1996); but not fewer than `FEWEST`: a stage
+    takes some time however little is done in it.
     """
     urgency = _urgency(leaves)
     flat = jnp.concatenate([some.ravel() for some in urgency])
@@ -101,6 +110,8 @@ def holding(leaves: list[Leaves], share: Array) -> list[Bool[Array, "rows column
 
     def enough(level: Array) -> Array:
         chosen = flat >= level
+        if number is not None:
+            return chosen.sum() >= number
         return (jnp.where(chosen, squares, 0).sum() >= share * squares.sum()) & (chosen.sum() >= FEWEST)
 
     least = _largest(enough, flat)
@@ -137,16 +148,12 @@ def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: 
     return wanted & ~canvas.known
 
 
-def _two(leaves: Array) -> tuple[int, int]:
-    return leaves.shape[0], leaves.shape[1]
-
-
-def _children(split: Bool[Array, "rows columns"], shape: tuple[int, int]) -> Bool[Array, "rows columns"]:
+def _children(split: Bool[Array, "rows columns"], shape: tuple[int, ...]) -> Bool[Array, "rows columns"]:
     """The leaves that split ones were split into."""
     return jnp.repeat(jnp.repeat(split, 2, 0), 2, 1)[: shape[0], : shape[1]]
 
 
-def _has_unknown(canvas: Canvas, leaves: tuple[int, int], side: int) -> Bool[Array, "rows columns"]:
+def _has_unknown(canvas: Canvas, leaves: tuple[int, ...], side: int) -> Bool[Array, "rows columns"]:
     """Whether any of the nine nodes is unknown that splitting leaves of one side makes or needs."""
     unknown = ~at_nodes(canvas.known, side // 2)
     rows, columns = (max(2 * count + 1 - have, 0) for count, have in zip(leaves, unknown.shape, strict=True))

@@ -20,6 +20,7 @@ from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.camera.camera import Camera
 
 SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
+PIXELS = BUNDLE * BUNDLE  # of a bundle, and rays of one that is cast whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,16 +47,37 @@ class Chosen:
 
 @dataclasses.dataclass(frozen=True)
 class Queue:
-    """Bundles of which rays are wanted, one after the other.
+    """Bundles of which rays are wanted, one after the other; `packets` of them are cast together, from the `first` on.
 
     Attributes:
         wanted: of each bundle, which of its pixels.
         bundle: the bundles that are to be cast, and past `number` any.
+        rays: of a packet; static, as is `packets`.
     """
 
     wanted: Bool[Array, "bundles 64"]
     bundle: Int[Array, " bundles"]
     number: Int[Array, ""]
+    first: Int[Array, ""]
+    rays: int
+    packets: int = 1
+
+    def turn(self, nth: int, packets: int) -> Queue:
+        """The same, with the `nth` so many packets to be cast."""
+        return dataclasses.replace(self, first=jnp.int32(nth * packets), packets=packets)
+
+    def chosen(self) -> Chosen:
+        """The packets to be cast."""
+        nth = self.first + jnp.arange(self.packets, dtype=jnp.int32)
+        bundle, inside = self.bundle[jnp.minimum(nth, self.bundle.shape[0] - 1)], nth < self.number
+        pixel = jnp.arange(PIXELS, dtype=jnp.int32)[:, None]
+        if self.rays == PIXELS:
+            return Chosen(bundle, *(jnp.broadcast_to(one, (PIXELS, self.packets)) for one in (pixel, inside)))
+        wanted = self.wanted[bundle].T & inside
+        slot = jnp.arange(self.rays, dtype=jnp.int32)[:, None, None]
+        mine = wanted & (jnp.cumsum(wanted, 0, dtype=jnp.int32) - 1 == slot)
+        place, real = jnp.where(mine, pixel, 0).sum(1), mine.any(1)
+        return Chosen(bundle, jnp.where(real, place, place[0]), real)
 
 
 def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"]) -> Bool[Array, "bundles 64"]:
@@ -63,58 +85,35 @@ def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"]) -> Bool[Array
     rows, columns = lists.bundles
     image = jnp.pad(image, ((0, max(rows * BUNDLE - image.shape[0], 0)), (0, max(columns * BUNDLE - image.shape[1], 0))))
     parts = image[: rows * BUNDLE, : columns * BUNDLE].reshape(lists.tile_rows, 2, BUNDLE, lists.tile_columns, 2, BUNDLE)
-    return parts.transpose(0, 3, 1, 4, 2, 5).reshape(lists.num_bundles, BUNDLE * BUNDLE)
+    return parts.transpose(0, 3, 1, 4, 2, 5).reshape(lists.num_bundles, PIXELS)
 
 
 def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
     """What is cast as scattered rays, and what as whole bundles."""
     count = wanted.sum(1)
-    scattered, whole = (count > 0) & (count <= SCATTERED), count > SCATTERED
-    everything = jnp.ones_like(wanted)
-    return _queue(wanted, scattered), _queue(everything, whole)
+
+    def queue(some: Bool[Array, " bundles"], rays: int) -> Queue:
+        (bundle,) = jnp.nonzero(some, size=some.shape[0], fill_value=0)
+        return Queue(wanted, bundle.astype(jnp.int32), some.sum(dtype=jnp.int32), jnp.int32(0), rays)
+
+    return queue((count > 0) & (count <= SCATTERED), SCATTERED), queue(count > SCATTERED, PIXELS)
 
 
-def _queue(wanted: Array, some: Bool[Array, " bundles"]) -> Queue:
-    (bundle,) = jnp.nonzero(some, size=some.shape[0], fill_value=0)
-    return Queue(wanted, bundle.astype(jnp.int32), some.sum(dtype=jnp.int32))
+def packets_of(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
+    """Their rays: whole bundles as tensor products; of scattered ones, those that are room go where the first one does.
 
-
-def scattered(queue: Queue, first: Int[Array, ""], packets: int) -> Chosen:
-    """The wanted rays of so many bundles of a queue."""
-    bundle, inside = _next(queue, first, packets)
-    wanted = queue.wanted[bundle].T & inside
-    nth = jnp.cumsum(wanted, 0, dtype=jnp.int32) - 1
-    slot, pixel = jnp.arange(SCATTERED, dtype=jnp.int32)[:, None, None], jnp.arange(wanted.shape[0], dtype=jnp.int32)[:, None]
-    mine = wanted & (nth == slot)
-    place = jnp.where(mine, pixel, 0).sum(1)
-    real = mine.any(1)
-    return Chosen(bundle, jnp.where(real, place, place[0]), real)
-
-
-def whole(queue: Queue, first: Int[Array, ""], packets: int) -> Chosen:
-    """All rays of so many bundles of a queue."""
-    bundle, inside = _next(queue, first, packets)
-    place = jnp.arange(queue.wanted.shape[1], dtype=jnp.int32)[:, None]
-    return Chosen(bundle, jnp.broadcast_to(place, (place.shape[0], packets)), jnp.broadcast_to(inside, (place.shape[0], packets)))
-
-
-def _next(queue: Queue, first: Int[Array, ""], packets: int) -> tuple[Int[Array, " packets"], Bool[Array, " packets"]]:
-    nth = first + jnp.arange(packets, dtype=jnp.int32)
-    return queue.bundle[jnp.minimum(nth, queue.bundle.shape[0] - 1)], nth < queue.number
-
-
-def scattered_packets(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
-    """Their rays; those that are room go where the first one does. Differentiable by the camera."""
+    Differentiable by the camera.
+    """
+    real = chosen.real.any(0)
+    if chosen.place.shape[0] == PIXELS:
+        return RayPackets(*grid.rays(camera, chosen.bundle), chosen.bundle, real)
     dtype = grid.half_steps.dtype
     u = camera.column((grid.column[chosen.bundle] + chosen.place % BUNDLE).astype(dtype) + 0.5)
     v = camera.row((grid.row[chosen.bundle] + chosen.place // BUNDLE).astype(dtype) + 0.5)
-    return RayPackets(u, v, chosen.bundle, chosen.real.any(0), scattered=True)
+    return RayPackets(u, v, chosen.bundle, real, scattered=True)
 
 
-def whole_packets(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
-    """Their rays, as tensor products. Differentiable by the camera."""
-    return RayPackets(*grid.rays(camera, chosen.bundle), chosen.bundle, chosen.real.any(0))
-
-
-for _kind in (Chosen, Queue):
-    jax.tree_util.register_dataclass(_kind, data_fields=[field.name for field in dataclasses.fields(_kind)], meta_fields=[])
+_STATIC = {Chosen: [], Queue: ["rays", "packets"]}
+for _kind, _static in _STATIC.items():
+    _names = [field.name for field in dataclasses.fields(_kind) if field.name not in _static]
+    jax.tree_util.register_dataclass(_kind, data_fields=_names, meta_fields=_static)

@@ -8,13 +8,6 @@ from __future__ import annotations
 import dataclasses
 
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.screen.pixels import EveryPixel
-
-
-class Quadtree(EveryPixel):
-    """Rays through the nodes of a coarse lattice, and then through the corners of leaves that are split."""
-
-    refines = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +16,11 @@ class QuadtreePlan:
 
     Attributes:
         leaf: pixels on each side of the leaves that it begins with; nodes of the first lattice are half as far apart.
-        estimator: name of how errors of leaves are estimated, see `screen.estimators.ESTIMATORS`.
         lists: sizes of the lists of that lattice's bundles, which is cast in one band.
         packets: bundles that are cast together.
     """
 
     leaf: int
-    estimator: str
     lists: ListPlan
     packets: int
 

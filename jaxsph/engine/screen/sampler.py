@@ -6,7 +6,6 @@ Flow: grid, camera -> [sampler: packets] -> cast -> [sampler: resolve] -> layers
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
 
 from jaxtyping import Array, Float
 
@@ -21,9 +20,6 @@ Pixels = tuple[Float[Array, "rows columns 3"], Float[Array, "rows columns"], Flo
 
 class ScreenSampler(abc.ABC):
     """How the rays of an image are chosen."""
-
-    refines: ClassVar[bool] = False
-    """Whether more rays are chosen as the frame is drawn (`jaxsph.engine.frame.refinement`), after those of `packets`."""
 
     @abc.abstractmethod
     def packets(self, grid: Grid, camera: Camera) -> RayPackets:

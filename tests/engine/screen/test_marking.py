@@ -6,10 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.canvas import blank, painted_on_lattice
-from jaxsph.engine.screen.estimators import Hierarchical
-from jaxsph.engine.screen.marking import FEWEST, Leaves, holding, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.canvas import of_lattice
+from jaxsph.engine.screen.marking import FEWEST, Leaves, leaves_of, wanted_by, worst
 from jaxsph.engine.screen.pyramid import places
+
+ALL = jnp.float32(1)
 
 
 def some_leaves(seed, hidden=0.0):
@@ -31,7 +32,7 @@ def flat(marked):
 @given(seed=st.integers(0, 10**6), number=st.integers(1, 600))
 def test_the_worst_leaves_are_so_many_and_none_that_is_left_is_worse(seed, number):
     leaves = some_leaves(seed)
-    marked, norm = flat(worst(leaves, number)), flat([some.norm for some in leaves])
+    marked, norm = flat(worst(leaves, number, ALL)), flat([some.norm for some in leaves])
     candidates = flat([some.split for some in leaves])
     assert not (marked & ~candidates).any()
     assert marked.sum() == min(number, candidates.sum())
@@ -43,7 +44,7 @@ def test_the_worst_leaves_are_so_many_and_none_that_is_left_is_worse(seed, numbe
 def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch, share):
     monkeypatch.setattr("jaxsph.engine.screen.marking.FEWEST", 1)
     leaves = some_leaves(3)
-    marked = flat(holding(leaves, jnp.float32(share)))
+    marked = flat(worst(leaves, None, jnp.float32(share)))
     candidates = flat([some.split for some in leaves])
     squares = flat([some.norm for some in leaves]) ** 2
     held, total = squares[marked].sum(), squares[candidates].sum()
@@ -53,15 +54,15 @@ def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch, share):
 def test_a_stage_splits_all_where_there_are_few():
     leaves = some_leaves(4)
     assert sum(int(some.split.sum()) for some in leaves) < FEWEST
-    np.testing.assert_array_equal(flat(holding(leaves, jnp.float32(0.1))), flat([some.split for some in leaves]))
+    np.testing.assert_array_equal(flat(worst(leaves, None, jnp.float32(0.1))), flat([some.split for some in leaves]))
 
 
 def test_leaves_that_look_empty_compete_with_those_of_their_size():
     leaves = some_leaves(5, hidden=0.3)
-    hidden, marked = flat([some.hidden for some in leaves]), flat(worst(leaves, 60))
+    hidden, marked = flat([some.hidden for some in leaves]), flat(worst(leaves, 60, ALL))
     assert 0 < (hidden & marked).sum() < 60
     alone = [some._replace(split=some.hidden) for some in leaves]
-    assert (flat(worst(alone, 1)) == flat([some.hidden for some in leaves])).all()  # nothing tells them apart
+    assert (flat(worst(alone, 1, ALL)) == flat([some.hidden for some in leaves])).all()  # nothing tells them apart
 
 
 def canvas_of(image, stride):
@@ -70,18 +71,15 @@ def canvas_of(image, stride):
     value[..., 0], value[..., 3] = image, 0.5
     rows, columns = (places(size, stride) for size in image.shape)
     nodes = jnp.asarray(value[np.ix_(rows, columns)])
-    return painted_on_lattice(
-        blank(image.shape, jnp.float32), nodes, jnp.zeros(nodes.shape[:2]), jnp.ones(nodes.shape[:2]), stride
-    )
+    return of_lattice(image.shape, nodes, jnp.zeros(nodes.shape[:2]), jnp.ones(nodes.shape[:2]), stride)
 
 
 def test_a_linear_image_is_good_at_once_and_a_corner_is_split_where_it_is():
     rows, columns = np.mgrid[:33, :41].astype(np.float32)
-    bound = jnp.zeros((33, 41))
-    linear, quality = leaves_of(canvas_of(0.01 * rows + 0.005 * columns, 4), (4, 2), 8, Hierarchical(), jnp.float32(1e-3), bound)
+    linear, quality = leaves_of(canvas_of(0.01 * rows + 0.005 * columns, 4), (4, 2), jnp.float32(1e-3))
     assert not flat([some.split for some in linear]).any() and float(quality.over) == 0 and float(quality.l2) < 1e-6
     canvas = canvas_of((columns > 20).astype(np.float32), 4)
-    leaves, quality = leaves_of(canvas, (4, 2), 8, Hierarchical(), jnp.float32(1e-3), bound)
+    leaves, quality = leaves_of(canvas, (4, 2), jnp.float32(1e-3))
     split = np.asarray(leaves[0].split)
     assert float(quality.over) == split.sum() > 0 and split.any(0).sum() <= 4 and split.any(0)[5]
     wanted = np.asarray(wanted_by([some.split for some in leaves], canvas, (4, 2)))

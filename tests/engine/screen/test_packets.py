@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, bundle_origins
-from jaxsph.engine.screen.packets import SCATTERED, by_bundle, queued, scattered, whole
+from jaxsph.engine.screen.packets import SCATTERED, by_bundle, queued
 
 LISTS = ListPlan(2, 2, 1, 1)
 SHAPE = 29, 27  # less than the band
@@ -22,11 +22,11 @@ def corners():
     return types.SimpleNamespace(row=row, column=column)
 
 
-def cast(queue, pick):
+def cast(queue):
     """How often each pixel of the image is cast, and the packets."""
     count, parts = np.zeros(SHAPE[0] * SHAPE[1] + 1, int), []
     for turn in range(-(-int(queue.number) // PACKETS)):
-        chosen = pick(queue, jnp.int32(turn * PACKETS), PACKETS)
+        chosen = queue.turn(turn, PACKETS).chosen()
         pixel = np.asarray(chosen.pixels(corners(), SHAPE))
         real = np.asarray(chosen.real).T
         assert (pixel[~real] == SHAPE[0] * SHAPE[1]).all(), "room is painted past the last pixel"
@@ -45,7 +45,7 @@ def test_every_wanted_pixel_is_in_exactly_one_packet(seed, counts):
     wanted = np.stack([rng.permutation(BUNDLE * BUNDLE) < count for count in counts])
     image = np.asarray(LISTS.as_image(wanted.reshape(-1, BUNDLE, BUNDLE)))[: SHAPE[0], : SHAPE[1]]
     apart, together = queued(by_bundle(LISTS, jnp.asarray(image)))
-    (few, parts), (many, wholes) = cast(apart, scattered), cast(together, whole)
+    (few, parts), (many, wholes) = cast(apart), cast(together)
     assert ((few + many)[image] == 1).all()
     assert (few[~image] == 0).all() and many.max(initial=0) <= 1
     assert len(set(parts)) == len(parts) and len(set(wholes)) == len(wholes) and not set(parts) & set(wholes)
