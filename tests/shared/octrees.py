@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from derivatives import QUICKLY
-from hypothesis import settings
+from examples import examples
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.octree_build import LevelSizes, OctreePlan, build_octree
@@ -18,7 +18,7 @@ PLAN = OctreePlan(2, 4096, 4096, tuple(LevelSizes(256, 6144) for _ in range(2)),
 STYLES = "uniform", "clump", "borders", "sizes", "points", "giant"
 seeds, styles = st.integers(0, 2**32 - 1), st.sampled_from(STYLES)
 in_both = pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-few = settings(max_examples=20)
+few = examples(20)
 
 
 def spheres(seed, style, dtype):
