@@ -1,4 +1,4 @@
-# make setup: .venv with everything. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README. make demo: one picture.
+# make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README. make demo: one picture.
 # Nothing but Python is needed.
 # make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
 SHELL := /bin/bash
@@ -11,7 +11,7 @@ PYTEST_ARGS ?=
 SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.1 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
-.PHONY: setup test test-slow test-slow-share test-endurance notebooks lint format demo results clean
+.PHONY: setup check test test-slow test-slow-share test-nightly test-endurance notebooks lint format demo results clean
 
 setup: $(VENV)/.installed-all
 
@@ -35,22 +35,36 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@$(PIP) install --editable '.[all]'
 	@touch $(VENV)/.installed-test $@
 
-SUITE = compiled=$$(mktemp -d) && trap 'rm -rf $$compiled' EXIT && $(SHARE_COMPILED)=$$compiled \
+# What the tests compile is kept for the next run: `make clean` or another COMPILED begins anew.
+COMPILED ?= $(VENV)/compiled-tests
+SUITE = compiled=$$($(VENV)/bin/python tests/shared/kept_programs.py $(COMPILED) $(JOBS)) && $(SHARE_COMPILED)=$$compiled \
 	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal
+# Programs that the whole suite may compile: new tests use the shapes of others. Other numbers of processes share fewer or more.
+MOST_PROGRAMS ?= 2000
+ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--most-programs=$(MOST_PROGRAMS)))
+
+check: lint
+	@$(SUITE) -m core $(PYTEST_ARGS)
 
 test: lint
-	@$(SUITE) $(PYTEST_ARGS)
+	@$(SUITE) $(ALL_OF_IT) $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test
 	@$(SUITE) -m 'not endurance' $(PYTEST_ARGS)
 
-# Of the tests marked slow, a part that changes with the week, so that all have their turn in as many weeks as there are parts.
+# The slow ones too, with ten times the examples, other ones each time, and nothing compiled before.
+test-nightly: $(VENV)/.installed-test
+	@rm -rf $(VENV)/compiled-tests
+	@$(SUITE) -m 'not endurance' --hypothesis-profile=nightly --timeout 3600 $(PYTEST_ARGS)
+
+# Of the tests marked slow, a part that changes with every commit, so that all have their turn in as many runs as there are parts;
+# of a shallow clone, whose commits cannot be counted, with every hour.
 SLOW_PARTS ?= 8
-SLOW_SHARE ?= $(shell echo $$(( ($$(date -u +%s) / 86400 + 3) / 7 % $(SLOW_PARTS) )))/$(SLOW_PARTS)
+SLOW_RUN ?= $(shell [ "$$(git rev-parse --is-shallow-repository 2>/dev/null)" = false ] && git rev-list --count HEAD || echo $$(( $$(date -u +%s) / 3600 )))
 SLOW_SECONDS ?= 300
 test-slow-share: $(VENV)/.installed-test
-	@echo "week $$(date -u +%G-W%V): share $(SLOW_SHARE) of the tests marked slow, none begun after $(SLOW_SECONDS) s"
-	@$(SUITE) -m slow --share=$(SLOW_SHARE) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
+	@echo "run $(SLOW_RUN): one in $(SLOW_PARTS) of the tests marked slow, none begun after $(SLOW_SECONDS) s"
+	@$(SUITE) -m slow --share=$(SLOW_RUN)/$(SLOW_PARTS) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
 
 test-endurance: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q --timeout 0 -m endurance $(PYTEST_ARGS) tests/test_endurance.py

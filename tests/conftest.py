@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY as UNOPTIMIZED
+from examples import EXAMPLES, USUAL
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
@@ -26,13 +27,19 @@ from jaxsph.engine.frame.stages import make_grid
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory_maps, programs
 
-pytest_plugins = ["share"]
+pytest_plugins = ["compiled", "core", "share"]
 
 QUICKLY = UNOPTIMIZED | {"xla_cpu_parallel_codegen_split_count": 1}
-hypothesis.settings.register_profile("jaxsph", deadline=None, max_examples=40, print_blob=True)
-hypothesis.settings.load_profile("jaxsph")
 
-MAX_MAPS = 15_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
+# `dev` tries other examples each time, and what failed before first; `ci` the same ones; `nightly` (`--hypothesis-profile`) ten
+# times as many.
+DEV = hypothesis.settings(deadline=None, max_examples=EXAMPLES, print_blob=True)
+hypothesis.settings.register_profile("dev", DEV)
+hypothesis.settings.register_profile("ci", DEV, derandomize=True)
+hypothesis.settings.register_profile("nightly", DEV, max_examples=10 * EXAMPLES)
+hypothesis.settings.load_profile(USUAL)
+
+MAX_MAPS = 24_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
 CAPACITY = 24
 WIDTH, HEIGHT, SAMPLES = 21, 18, 37
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
+from jaxsph.engine.asked import require_asked
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
-from jaxsph.model.asked import require_asked
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

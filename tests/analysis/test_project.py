@@ -47,8 +47,13 @@ def camera_of(projection="orthographic", near=0.5, far=6.0, **more):
     return js.Camera.look_at(fov_degrees=55.0, **place)
 
 
-@pytest.mark.parametrize("projection", ["orthographic", "perspective"])
-@pytest.mark.parametrize("kernel", NAMES)
+PROJECTIONS = "orthographic", "perspective"
+IN_TURN = set(zip(NAMES, itertools.cycle(PROJECTIONS))) | {("cubic_spline", projection) for projection in PROJECTIONS}
+
+
+@pytest.mark.parametrize(("kernel", "projection"), [
+    pytest.param(*pair, marks=() if pair in IN_TURN else pytest.mark.slow) for pair in itertools.product(NAMES, PROJECTIONS)
+])  # fmt: skip
 def test_rays_are_those_of_the_oracle(kernel, projection):
     particles, camera = particles_of(1, kernel), camera_of(projection)
     truth = js.reference.project(particles, camera, pixel="ray").values
@@ -101,7 +106,7 @@ def test_no_mass_is_lost_however_small_supports_are(kernel):
     for size in (4.0, 1e-3, 0.3, 1.7):
         position = rng.uniform(-1, 1, (200, 3)) * (2 - size * pixel, 1.3 - size * pixel, 1)
         particles = js.Particles.from_arrays(position, size * pixel, 0.0, mass, kernel, capacity=CAPACITY)
-        assert abs(float(project(particles, camera).total()) / mass.sum() - 1) < 1e-4
+        assert abs(float(project(particles, camera).total()) / mass.sum() - 1) < 1.5e-6  # 1e-6, to its digit
 
 
 def test_mass_between_two_depths_is_kept_where_they_cut_small_supports():
@@ -115,14 +120,14 @@ def test_mass_between_two_depths_is_kept_where_they_cut_small_supports():
 @pytest.mark.parametrize(
     ("kernel", "spacings"), [("cubic_spline", 4.2), pytest.param("wendland_c2", 5.2, marks=pytest.mark.slow)]
 )
-def test_a_uniform_box_has_its_column_density_to_1e_4(kernel, spacings):
+def test_a_uniform_box_has_its_column_density_to_7e_5(kernel, spacings):
     axis = (np.arange(24) + 0.5) / 12 - 1
     position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
     particles = js.Particles.from_arrays(position, spacings / 12, 0.0, 3.0 * 12.0**-3, kernel)
     turned = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=0.7, near=1, far=9, **SIZE)
     plan = js.plan_projection(particles, turned)
     plan = dataclasses.replace(plan, rays=plan.shares)  # where depths cut
-    np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=1e-4)
+    np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=7e-5)
     part = js.project(particles, turned, plan=plan, depth_range=(4.6, 5.3)).values
     np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
 

@@ -1,6 +1,7 @@
 """The command line: what it writes, what it says, and how it refuses."""
 
 import argparse
+import dataclasses
 import subprocess
 import sys
 import warnings
@@ -29,6 +30,22 @@ def file(tmp_path, monkeypatch):
     return path
 
 
+@pytest.fixture
+def by_reference(monkeypatch):
+    """Images that commands ask for are made by the reference renderer, which compiles nothing; what is asked of it."""
+    asked = []
+
+    def render(scene, camera, settings, **_):
+        asked.append(settings)
+        image = js.reference.render(scene, camera, dataclasses.replace(settings, tolerance=None))
+        certified = {} if settings.tolerance is None else {"error_bound": np.full(image.shape, 0.003), "certified": True}
+        seconds = {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}
+        return dataclasses.replace(image, stats={"seconds": seconds, **image.stats}, **certified)
+
+    monkeypatch.setattr(js, "render", render)
+    return asked
+
+
 def test_render_writes_an_exr_and_says_what_it_picked(file, tmp_path, capsys):
     code, out, err = run(capsys, "render", file, "-o", "out.exr", *TINY)
     assert (code, err) == (0, [])
@@ -48,7 +65,8 @@ def test_render_writes_an_exr_and_says_what_it_picked(file, tmp_path, capsys):
         assert said in out
 
 
-def test_without_output_the_picture_lands_here_and_is_named(file, tmp_path, capsys):
+@pytest.mark.core
+def test_without_output_the_picture_lands_here_and_is_named(file, tmp_path, by_reference, capsys):
     code, out, _ = run(capsys, "render", file, *TINY)
     assert code == 0 and (tmp_path / "drop.png").stat().st_size > 0 and "drop.png" in out
 
@@ -77,7 +95,7 @@ def test_colour_and_opacity_are_by_the_quantities_asked_for(file, capsys):
     assert code == 1 and "no quantity 'dust'" in err[0]
 
 
-def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
+def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, by_reference, capsys):
     run(capsys, "render", file, "-o", "framed.exr", *TINY)
     _, out, _ = run(capsys, "render", file, "-o", "placed.exr", *TINY, "--eye", 0, 0, 9, "--target", 0, 0, 0, "--fov", 30)
     assert "--eye 0 0 9" in out and "--fov 30" in out
@@ -87,6 +105,16 @@ def test_a_camera_that_is_said_is_the_one_used(file, tmp_path, capsys):
     pasted = line.split("camera")[1].split(",")[0].split()
     assert run(capsys, "render", file, "-o", "pasted.exr", *TINY, *pasted)[0] == 0  # what it says can be said to it
     assert np.abs(placed - np.asarray(io.read_image(tmp_path / "pasted.exr").color)).max() < 1e-3
+
+
+@pytest.mark.core
+def test_a_tolerance_is_what_the_renderer_is_asked_for_and_its_bound_is_told(file, by_reference, capsys):
+    more = ["--integrator", "samples", "--tolerance", 0.01, "--estimator", "interval"]
+    code, out, err = run(capsys, "render", file, "-o", "out.exr", *TINY, *more)
+    (settings,) = by_reference
+    assert (code, err) == (0, []) and (settings.tolerance, settings.estimator, settings.samples) == (0.01, "interval", 16)
+    assert "at most 0.003 (certified), tolerance 0.01" in out
+    assert np.asarray(io.read_image("out.exr").error_bound).max() == np.float32(0.003)
 
 
 @pytest.mark.slow
@@ -107,12 +135,13 @@ def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_
     assert "(certified), tolerance 0.01" in out
 
 
-def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, capsys):
+def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, by_reference, capsys):
     monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, "render", "scene:dam_break", "--particles", 60, "--frame", 0, *TINY)
     assert (code, err) == (0, []) and "60 particles" in out and (tmp_path / "dam_break.png").exists()
 
 
+@pytest.mark.core
 def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
     code, out, err = run(capsys, "info", file)
     assert (code, err) == (0, [])
@@ -122,8 +151,9 @@ def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
     assert run(capsys, "info", "scene:radial")[0] == 0
 
 
-@pytest.mark.slow
-def test_the_demo_prints_paths_tolerance_error_and_time(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("renderer", ["by_reference", pytest.param("file", marks=pytest.mark.slow)])
+def test_the_demo_prints_paths_tolerance_error_and_time(tmp_path, monkeypatch, capsys, request, renderer):
+    request.getfixturevalue(renderer)
     monkeypatch.setattr(cli, "DEMO_CHECK", 8)
     load = js.scenes.load
     monkeypatch.setattr(js.scenes, "load", lambda name, **sizes: load(name, 300, **sizes))
@@ -160,11 +190,13 @@ WRONG_USAGE = [
 
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG_USAGE, ids=[" ".join(case[0]) for case in WRONG_USAGE])
+@pytest.mark.core
 def test_wrong_usage_is_exit_code_2_and_one_line(file, capsys, arguments, message):
     code, _, err = run(capsys, *[file if argument == "FILE" else argument for argument in arguments])
     assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
 
 
+@pytest.mark.core
 def test_failures_are_exit_code_1_and_one_line(file, tmp_path, capsys):
     (tmp_path / "broken.npz").write_bytes(file.read_bytes()[:100])
     (tmp_path / "taken.png").mkdir()
@@ -199,6 +231,7 @@ def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, capsys):
     assert (code, err) == (0, []) and np.asarray(io.read_image(tmp_path / "none.exr").color).max() == 0
 
 
+@pytest.mark.core
 def test_help_and_version_are_exit_code_0(capsys):
     for arguments in (["--help"], ["render", "--help"], ["info", "--help"], ["--version"]):
         code, out, err = run(capsys, *arguments)

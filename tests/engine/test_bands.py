@@ -7,8 +7,9 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from examples import examples
 from forced import ran
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, bundle_origins
@@ -75,7 +76,7 @@ def test_bands_that_are_dealt_out_make_the_bits_of_those_of_one_device():
     assert told["bands"] > 1 and told["2"] and told["4"]
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(pairs=st.lists(st.integers(0, 1000), min_size=1, max_size=40), devices=st.integers(1, 8), least=st.sampled_from([1, 2, 4]))
 def test_every_band_is_dealt_once_and_every_device_is_in_one_group(pairs, devices, least):
     dealt = dealing(tuple(range(devices)), pairs, least)
@@ -94,7 +95,7 @@ def test_no_group_has_more_than_four_thirds_of_the_pairs_of_the_best_dealing(pai
     assert 3 * fullest <= 4 * best
 
 
-@settings(max_examples=8)
+@examples(8)
 @given(shards=st.integers(1, 12), rows=st.integers(1, 3), columns=st.integers(1, 4), bands=st.integers(1, 2))
 def test_every_pixel_is_of_exactly_one_shard(frames, shards, rows, columns, bands):
     plan = frames.plan()

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -61,7 +62,7 @@ def test_under_vmap_each_image_is_judged_alone(drawn):
     st.sampled_from([0.0, 1.0, -0.1, 2.0, np.nan]),
     st.sampled_from([0.0, 0.005, 0.01, 0.5, 1.5, -1.0, np.nan]),
 )
-@settings(max_examples=200)
+@examples(200)
 def test_traced_numbers_are_faults_where_known_ones_are_refused(tolerance, relax, least):
     values = {"tolerance": tolerance, "relax": relax, "min_transmittance": least}
     try:

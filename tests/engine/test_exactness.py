@@ -24,6 +24,7 @@ def test_the_same_input_gives_the_same_bits_eager_and_jitted(frames, jitted):
         assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("color", "transmittance", "depth"))
 
 
+@pytest.mark.core
 def test_the_order_of_particles_changes_a_pixel_by_rounding_alone(frames):
     scene, camera = Extreme(decades=4).scene(frames), Extreme().camera(frames)
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
@@ -57,6 +58,7 @@ def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(fram
         assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
 
 
+@pytest.mark.core
 def test_a_uniform_medium_obeys_beer_lambert(frames):
     """One support far larger than the view; and many of equal quantity that fill it. Optical depths from 1e-3 to 1e3."""
     rng = np.random.default_rng(0)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from adversary import cameras, scenes
 from derivatives import AGREE, CLOSE, along, anyhow, differ, filled, looked, pulled, towards, valued, weights
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 
@@ -60,7 +61,7 @@ def test_gradients_are_those_of_differences_when(frames, x64, phenomenon):
     ("poly6", "perspective"), ("wendland_c2", "orthographic"),
     pytest.param("cubic_spline", "perspective", marks=pytest.mark.slow),
 ])  # fmt: skip
-@settings(max_examples=15)
+@examples(15)
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
 def test_both_modes_agree_on_hard_scenes(frames, kernel, projection, data, seed):
     rng = np.random.default_rng(seed)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from adversary import cameras, scenes
 from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, looked, pulled, still, total, towards, weights
-from hypothesis import assume, given, settings
+from examples import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -73,7 +74,7 @@ def check_along(inputs, move, cotangent, asked, plan):
 
 
 @pytest.mark.slow
-@settings(max_examples=6)
+@examples(6)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_gradients_are_those_of_differences_wherever_borders_are(frames, seed):
     """In directions in which all moves, and what a camera is made of."""
@@ -148,7 +149,7 @@ def test_where_a_camera_stands_is_found_from_one_image_of_what_has_edges(seed):
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@examples(15)
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1))
 def test_both_modes_agree_on_hard_scenes(frames, data, seed):
     """Walls, jumps, clumps, supports over four decades, cameras among them; gradients are finite."""

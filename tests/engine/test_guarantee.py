@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given, target
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -62,6 +63,7 @@ def require_kept(image, truth, tolerance):
 
 @pytest.mark.parametrize(("dtype", "kernel", "how", "slab_samples", "projection", "render"), [
     (np.float64, "poly6", "budget", 4, "perspective", js.render),
+    pytest.param(np.float32, "poly6", "budget", 4, "perspective", js.render, marks=pytest.mark.core),
     pytest.param(np.float32, "wendland_c2", "alone", 16, "orthographic", js.render, marks=pytest.mark.slow),
     pytest.param(np.float32, "poly6", "levels", 4, "perspective", jitted, marks=pytest.mark.slow),
     pytest.param(np.float32, "cubic_spline", "greedy", 8, "perspective", js.render, marks=pytest.mark.slow),
@@ -76,13 +78,15 @@ def test_errors_keep_to_their_bound_it_to_the_tolerance_and_what_can_be_saved_is
     plan = frames.plan(slab_samples)
     smooth = st.none() | st.tuples(st.sampled_from([2.0, 6.0]), st.sampled_from([0.0, 1e-3, 0.03]))
 
-    @settings(max_examples=15)
+    @examples(15)
     @given(scenes(kernel, dtype), cameras(frames, projection, dtype), st.floats(1, 5), smooth)
     def holds(scene, camera, digits, smooth):
         scene, tolerance = scene if smooth is None else wide(scene, *smooth), 10**-digits
         truth = render(scene, camera, frames.settings, plan=plan)
         image = render(scene, camera, asking(frames, tolerance, how), plan=with_control(frames, how, slab_samples))
         require_kept(image, truth, tolerance)
+        bound = np.asarray(image.error_bound, np.float64)
+        target(float((error_of(image, truth) / np.maximum(bound, 1e-12)).max()))
 
     with jax.enable_x64(dtype is np.float64):
         holds()
@@ -131,7 +135,7 @@ def half_constant(frames, kernel, projection, dtype):
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@examples(10)
 @given(
     data=st.data(),
     relax=st.sampled_from([0.0, 1.0]),
@@ -164,6 +168,7 @@ def test_full_rate_asked_for_is_the_reference_image_bit_for_bit(frames, toleranc
     assert set(np.unique(image.levels)) <= {0, -1}
 
 
+@pytest.mark.core
 def test_a_tolerance_of_all_there_is_is_kept(frames):
     frames = frames.deep(4)
     scene, camera = half_constant(frames, "poly6", "perspective", np.float32)
@@ -188,6 +193,7 @@ def test_a_constant_quantity_costs_nothing_inside_and_errs_by_rounding_only(fram
     assert (error <= bound).all() and (bound <= 1e-3).all() and (bound < 1e-4).mean() > 0.5
 
 
+@pytest.mark.core
 def test_levels_say_what_each_cell_was_given_in_its_place(frames):
     """Against the particles themselves: a cell that is not at full rate holds one quantity only, an empty cell none at all."""
     frames = frames.deep(4)
@@ -221,6 +227,17 @@ def quantities_in_cells(scene, camera, samples):
             at = k // 16, row // 8, column // 8
             found[0][at], found[1][at] = min(found[0][at], quantity), max(found[1][at], quantity)
     return found
+
+
+@pytest.mark.core
+def test_another_tolerance_pose_particle_or_transfer_function_compiles_nothing(frames, compiled):
+    rng, frames = np.random.default_rng(4), frames.deep(4)
+    js.render(frames.scene(rng), frames.camera(rng), asking(frames, 0.01, "budget"), plan=with_control(frames, "budget"))
+    compiled.clear()
+    for tolerance, relax in ((1e-4, 0.0), (0.3, 0.0), (0.01, 0.5)):
+        asked = asking(frames, tolerance, "budget", relax=relax)
+        js.render(frames.scene(rng), frames.camera(rng), asked, plan=with_control(frames, "budget"))
+    assert not compiled
 
 
 def test_relaxing_gives_up_the_certificate(frames):

@@ -9,6 +9,8 @@ import pytest
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=16, tolerance=0.02)
 
 
@@ -40,15 +42,16 @@ def test_every_stage_is_better_and_the_last_keeps_the_tolerance(view):
     assert (np.abs(light(last) - reference).max(-1) > SETTINGS.tolerance).mean() <= 1e-3
 
 
-def test_it_goes_on_where_it_was_and_begins_anew_for_another_camera_without_compiling(view):
+def test_it_goes_on_where_it_was_and_begins_anew_for_another_camera_without_compiling(view, compiled):
     scene, camera = view
     stages = js.progressive(scene, camera, SETTINGS, worst=60)
     first, second = next(stages), next(stages)
     third = next(iter(stages))
     assert (first.stats["stage"], second.stats["stage"], third.stats["stage"]) == (0, 1, 2)
     moved = dataclasses.replace(camera, eye=camera.eye + np.float32([0.05, 0, 0]))
+    compiled.clear()
     again = next(stages.restart(camera=moved))
-    assert again.stats["stage"] == 0 and again.stats["seconds"]["compile"] < 0.5
+    assert again.stats["stage"] == 0 and not compiled
     assert np.abs(light(again) - light(first)).max() > 0
     assert next(stages).stats["stage"] == 1
 

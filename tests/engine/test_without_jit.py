@@ -12,20 +12,6 @@ import jaxsph as js
 from jaxsph.engine.runtime import memory_maps, programs
 
 
-@pytest.fixture
-def compiled():
-    """Programs that JAX compiles while this is looked at."""
-    begun = []
-
-    def told(event, seconds, **_):
-        if event.endswith("backend_compile_duration"):
-            begun.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(told)
-    yield begun
-    jax.monitoring.clear_event_listeners()
-
-
 def test_a_gradient_without_jit_compiles_the_first_time_only_and_is_that_with_it(frames, compiled):
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()

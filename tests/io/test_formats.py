@@ -5,7 +5,8 @@ import types
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -60,7 +61,7 @@ def test_an_empty_set_is_read_as_one(name, samples, tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 @given(fraction=st.floats(0, 1, exclude_max=True))
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_a_file_cut_anywhere_is_refused_by_name_or_read_right(name, fraction, written, samples, tmp_path_factory):
     whole, p = (written / name).read_bytes(), samples.particles()
     cut = tmp_path_factory.mktemp("cut") / name

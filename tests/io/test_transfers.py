@@ -5,7 +5,8 @@ import json
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -25,7 +26,7 @@ def written(path, **changes):
     return path
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(st.integers(0, 2**31), st.integers(1, 40), st.integers(-20, 20))
 def test_a_file_gives_the_same_numbers_again(tmp_path_factory, seed, points, decade):
     rng = np.random.default_rng(seed)

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -88,7 +89,7 @@ def test_ways_are_in_it_where_their_points_are(name):
     assert np.array_equal(found[clear], inside(clip, place)[clear])
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(WHERE, st.sampled_from(list(CLIPS)), st.sampled_from([1e-3, 0.1, 1.0]))
 def test_what_is_said_of_boxes_holds_for_each_of_their_points(seed, name, size):
     """Drawn from their corners and faces as often as from inside, with all rounding of float32."""

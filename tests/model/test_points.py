@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -106,7 +107,7 @@ def test_float64_is_kept_where_it_is_enabled(x64):
 
 @pytest.mark.parametrize(("profile", "mean"), [("gaussian", 0.4166435), ("ball", 1.0), (CONE, 0.5)])
 @given(st.floats(1e-6, 0.999999), st.floats(1e-3, 1e3))
-@settings(max_examples=20)
+@examples(20)
 def test_a_ray_through_the_centre_has_the_opacity_that_was_asked_for(profile, mean, opacity, radius):
     """`mean` of the profile along the diameter; of the Gaussian by erf(sqrt(4.5)) sqrt(pi / 4.5) / 2."""
     points = js.Points.from_arrays(np.zeros((1, 3)), radius, opacity=opacity, profile=profile, capacity=1)

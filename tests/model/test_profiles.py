@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.model.profiles import Ball, Chord, Gaussian, Profile, Shaped, Table, profile_of
@@ -28,7 +29,7 @@ def integral(name, square, start, end):
 
 @pytest.mark.parametrize("name", PROFILES)
 @given(parts, parts, parts)
-@settings(max_examples=25)
+@examples(25)
 def test_integrals_along_rays_are_those_of_the_profile(name, b, low, high):
     """A table's kinks are not met by nodes: within 2 % of its largest number."""
     half = np.sqrt(1 - b**2)
@@ -45,7 +46,7 @@ def test_through_the_centre_it_is_the_integral_along_a_whole_ray(name):
 
 @pytest.mark.parametrize("name", PROFILES)
 @given(parts)
-@settings(max_examples=25)
+@examples(25)
 def test_at_a_distance_it_is_what_its_definition_says(name, q):
     got = PROFILES[name].at_square(jnp.float32(q) ** 2)
     np.testing.assert_allclose(got, OF_DISTANCE[name](np.float64(q)), atol=1e-5)

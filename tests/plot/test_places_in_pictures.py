@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -16,7 +17,7 @@ def cameras():
 
 
 @pytest.mark.parametrize("camera", cameras(), ids=["perspective", "orthographic"])
-@settings(max_examples=20)
+@examples(20)
 @given(row=st.integers(0, 29), column=st.integers(0, 39), depth=st.floats(1.5, 19))
 def test_a_place_on_the_ray_of_a_pixel_is_in_its_middle(camera, row, column, depth):
     half = float(camera.half_height)

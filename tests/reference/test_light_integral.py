@@ -1,12 +1,14 @@
 """The light integral: against closed forms, a plain fine midpoint sum, its own tighter tolerance and the limit of samples."""
 
 import dataclasses
+import itertools
 import math
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -135,7 +137,7 @@ def test_two_balls_of_different_quantity_are_what_a_plain_sum_makes_of_them(kern
         assert np.abs(image.color - color).max() <= bound and abs(image.alpha - alpha) <= bound
 
 
-@settings(max_examples=6)
+@examples(6)
 @given(SEEDS, st.sampled_from(sorted(KERNELS)), st.sampled_from(PROJECTIONS), st.sampled_from([0.2, 3.0]))
 def test_random_particles_of_any_supports_are_what_a_plain_sum_makes_of_them(frames, seed, kernel, projection, distance):
     rng = np.random.default_rng(seed)
@@ -239,25 +241,39 @@ def test_it_is_what_ever_more_samples_tend_to(frames, projection, mix):
     assert errors[1] < errors[0] / 4 and errors[2] < errors[1] / 4 and errors[2] < 1e-3
 
 
-@settings(max_examples=25, derandomize=True)  # an estimate: one ray in thousands may be beyond it
-@given(SEEDS, st.sampled_from(sorted(KERNELS)), st.sampled_from(PROJECTIONS))
-def test_its_own_error_holds_what_a_tighter_tolerance_changes(frames, seed, kernel, projection):
-    rng = np.random.default_rng(seed)
-    scene, camera = everything(frames, rng), frames.camera(rng, projection, float(rng.choice([0.2, 1.5, 3.0])))
-    scene = dataclasses.replace(scene, particles=frames.scene(rng, kernel).particles)
-    loose, tight = (js.reference.integral(scene, camera, every=4, tolerance=tolerance) for tolerance in (1e-5, 1e-9))
-    assert (loose.error_bound <= 1e-5 + 1e-12).all() and (tight.error_bound <= 1e-9 + 1e-12).all()
-    assert (differences(loose, tight) <= loose.error_bound + tight.error_bound).all()
+def require_held(errors, bounds):
+    """An estimate: one ray in a thousand may be beyond it, and two by chance in so few."""
+    beyond = np.concatenate([np.ravel(error > bound) for error, bound in zip(errors, bounds, strict=True)])
+    assert beyond.size >= 400 and beyond.sum() <= 1 + beyond.size / 1000
 
 
-@settings(max_examples=25, derandomize=True)  # an estimate: one ray in thousands may be beyond it
-@given(SEEDS, st.sampled_from(sorted(KERNELS)), st.sampled_from(PROJECTIONS))
-def test_its_own_error_holds_for_walls_bands_and_jumps_too(frames, adversary, seed, kernel, projection):
-    rng = np.random.default_rng(seed)
-    scene, camera = adversary.scene(rng, kernel, np.float32), adversary.camera(rng, projection, np.float32)
-    loose, tight = (js.reference.integral(scene, camera, every=6, tolerance=tolerance) for tolerance in (1e-4, 1e-7))
-    assert np.isfinite(tight.color).all() and (tight.error_bound <= 1e-7 + 1e-12).all()
-    assert (differences(loose, tight) <= loose.error_bound + tight.error_bound).all()
+def looks(count):
+    """A generator, a kernel and a projection for each of `count` frames."""
+    pairs = itertools.cycle(itertools.product(sorted(KERNELS), PROJECTIONS))
+    return ((np.random.default_rng(seed), *pair) for seed, pair in zip(range(count), pairs, strict=False))
+
+
+def test_its_own_error_holds_what_a_tighter_tolerance_changes(frames):
+    errors, bounds = [], []
+    for rng, kernel, projection in looks(25):
+        scene, camera = everything(frames, rng), frames.camera(rng, projection, float(rng.choice([0.2, 1.5, 3.0])))
+        scene = dataclasses.replace(scene, particles=frames.scene(rng, kernel).particles)
+        loose, tight = (js.reference.integral(scene, camera, every=4, tolerance=tolerance) for tolerance in (1e-5, 1e-9))
+        assert (loose.error_bound <= 1e-5 + 1e-12).all() and (tight.error_bound <= 1e-9 + 1e-12).all()
+        errors.append(differences(loose, tight))
+        bounds.append(loose.error_bound + tight.error_bound)
+    require_held(errors, bounds)
+
+
+def test_its_own_error_holds_for_walls_bands_and_jumps_too(frames, adversary):
+    errors, bounds = [], []
+    for rng, kernel, projection in looks(50):
+        scene, camera = adversary.scene(rng, kernel, np.float32), adversary.camera(rng, projection, np.float32)
+        loose, tight = (js.reference.integral(scene, camera, every=6, tolerance=tolerance) for tolerance in (1e-4, 1e-7))
+        assert np.isfinite(tight.color).all() and (tight.error_bound <= 1e-7 + 1e-12).all()
+        errors.append(differences(loose, tight))
+        bounds.append(loose.error_bound + tight.error_bound)
+    require_held(errors, bounds)
 
 
 def test_pixels_rows_and_the_whole_image_are_the_same_light(frames):

@@ -3,7 +3,6 @@
 import argparse
 import os
 import signal
-import threading
 import time
 
 import jax
@@ -269,10 +268,11 @@ def test_a_worker_that_is_killed_is_replaced_and_its_frames_are_made(tmp_path):
 
     with local_client(2) as client:
         (victim, *_) = client.run(os.getpid).values()
-        killer = threading.Timer(6.0, os.kill, (victim, signal.SIGKILL))
-        killer.start()
-        frames = list(js.render_frames([slowly(n) for n in range(40)], CAMERA, SETTINGS, client, output=tmp_path / "on"))
-        killer.join()
+        frames = []
+        for frame in js.render_frames([slowly(n) for n in range(40)], CAMERA, SETTINGS, client, output=tmp_path / "on"):
+            frames.append(frame)
+            if len(frames) == 3:
+                os.kill(victim, signal.SIGKILL)
         assert victim not in client.run(os.getpid).values()
     assert [frame.number for frame in frames] == list(range(1, 41)) and all(frame.rendered for frame in frames)
     for frame, alone in zip(frames, js.render_frames(sources(40), CAMERA, SETTINGS, output=tmp_path / "alone"), strict=True):

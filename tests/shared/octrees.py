@@ -7,7 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import settings
+from examples import examples
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.octree import build_octree
@@ -16,7 +16,7 @@ SPHERES, NODES, ENTRIES = 40, 4096, 16384
 STYLES = "uniform", "clump", "borders", "sizes", "points", "giant"
 seeds, styles = st.integers(0, 2**32 - 1), st.sampled_from(STYLES)
 in_both = pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-few = settings(max_examples=20)
+few = examples(20)
 
 
 def spheres(seed, style, dtype):

@@ -1,8 +1,8 @@
 """A share of the tests: those whose names fall into one of several parts, as many as a budget of time allows.
 
-`--share=K/N` keeps the K-th of N parts (K from 0), so that N runs with another K each run every test once. `--budget=SECONDS`
-starts no test later than that, and says at the end which were not run. Files come in another order for every K: what a budget
-cuts off is not always the same.
+`--share=RUN/N` keeps one of N parts: N runs, numbered one after the other, each with a part of its own, run every test once.
+`--budget=SECONDS` starts no test later than that, and says at the end which were not run. Every run has another order, of files
+and of the tests in them, so that a budget cuts off other tests when a part has its next turn.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ STARTED = pytest.StashKey[float]()
 
 
 def share_of(text: str) -> tuple[int, int]:
-    """`"K/N"` as two numbers."""
+    """`"RUN/N"` as two numbers."""
     try:
-        which, parts = (int(number) for number in text.split("/"))
+        run, parts = (int(number) for number in text.split("/"))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not K/N, such as 0/8") from None
-    if not 0 <= which < parts:
-        raise argparse.ArgumentTypeError(f"K must lie in 0 .. N - 1, got {text!r}")
-    return which, parts
+        raise argparse.ArgumentTypeError(f"{text!r} is not RUN/N, such as 481/8") from None
+    if run < 0 or parts < 1:
+        raise argparse.ArgumentTypeError(f"RUN must be 0 or more and N 1 or more, got {text!r}")
+    return run, parts
 
 
 def digest(text: str) -> int:
@@ -35,7 +35,7 @@ def digest(text: str) -> int:
 
 def pytest_addoption(parser):
     group = parser.getgroup("share", "a share of the tests")
-    group.addoption("--share", type=share_of, help="K/N: only the K-th of N parts of the tests that are selected")
+    group.addoption("--share", type=share_of, help="RUN/N: only that of N parts of the selected tests whose turn it is")
     group.addoption("--budget", type=float, help="seconds after which no test is started")
 
 
@@ -47,11 +47,17 @@ def pytest_collection_modifyitems(config, items):
     share = config.getoption("--share")
     if share is None:
         return
-    which, parts = share
-    kept = [item for item in items if digest(item.nodeid) % parts == which]
-    kept.sort(key=lambda item: digest(f"{which} {item.path.name}"))  # stable: a file's tests stay together
-    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    run, parts = share
+    kept = [item for item in items if digest(item.nodeid) % parts == run % parts]
+    kept.sort(key=lambda item: in_order(run, item.nodeid))
+    chosen = set(kept)
+    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = kept
+
+
+def in_order(run: int, name: str) -> tuple[int, int]:
+    """Sorts tests by their names, anyhow and in every run otherwise; a file's tests stay together."""
+    return digest(f"{run} {name.partition('::')[0]}"), digest(f"{run} {name}")
 
 
 @pytest.hookimpl(tryfirst=True)

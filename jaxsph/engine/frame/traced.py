@@ -20,6 +20,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
+from jaxsph.engine.asked import require_asked
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import traced_image_of
@@ -32,7 +33,6 @@ from jaxsph.engine.runtime.device_executors import OnMesh
 from jaxsph.engine.runtime.devices import mesh_of
 from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
-from jaxsph.model.asked import require_asked
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene

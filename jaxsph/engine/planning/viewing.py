@@ -20,10 +20,10 @@ from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
+from jaxsph.engine.planning.in_range import scene_in_range
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.in_range import scene_in_range
 from jaxsph.model.medium import Medium
 from jaxsph.model.periodic import unfolded
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of

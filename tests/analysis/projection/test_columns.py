@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.analysis.projection import columns
@@ -40,7 +41,7 @@ def test_pieces_add_up_to_the_kernel(name):
 
 @pytest.mark.parametrize("name", NAMES)
 @given(b=st.one_of(st.floats(0, 1.1), st.sampled_from([0.0, 1e-9, 0.5, 1.0])), ends=st.tuples(*[st.floats(-1.5, 1.5)] * 2))
-@settings(max_examples=60)
+@examples(60)
 def test_integrals_are_those_of_the_kernel_to_1e_10(name, b, ends):
     start, end = sorted(ends)
     truth, peak = quadrature(name, b, start, end), columns.whole_column(name, np.float64(0), np)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 
 from jaxsph.engine.access.compaction import compact
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(hnp.arrays(bool, (5, 7)))
 def test_layers_hold_the_nth_filled_item_of_every_bundle_in_order_of_height(filled):
     slabs, bundles = filled.shape

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
+import dataclasses
+import os
 
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.engine.access.shards import shard, shard_of_grid, unshard
+from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.runtime.tuning import MAX_SHARDS
 
 
@@ -44,15 +46,40 @@ def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
         np.testing.assert_array_equal(found.lists.rank, grid.lists.rank)
 
 
-@pytest.mark.parametrize("estimator", ["interval", *(pytest.param(other, marks=pytest.mark.slow) for other in ("pilot", None))])
-def test_any_number_of_shards_makes_the_same_image(monkeypatch, estimator):
+@pytest.fixture
+def on_cores(monkeypatch):
+    """Have this process believe that it may use so many cores: an eager image is cast in as many shards."""
+    return lambda cores: monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+
+
+def require_alike(images):
+    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("tolerance", [None, 0.012])
+def test_two_shards_make_the_image_of_one(frames, on_cores, tolerance):
+    rng, images, frames = np.random.default_rng(2), [], frames.deep(4)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    settings = dataclasses.replace(frames.settings, tolerance=tolerance)
+    control = None if tolerance is None else ControlPlan(True, True, "budget")
+    for cores in (1, 2):
+        on_cores(cores)
+        images.append(js.render(scene, camera, settings, plan=dataclasses.replace(frames.plan(), control=control)))
+    assert float(images[0].alpha.max()) > 0.3
+    require_alike(images)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["interval", "pilot", None])
+def test_any_number_of_shards_makes_the_same_image(on_cores, estimator):
     scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
     settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.05, estimator=estimator)
     plan, images = js.plan(scene, camera, settings), []
-    for shards in (1, MAX_SHARDS):
-        monkeypatch.setattr(importlib.import_module("jaxsph.render"), "shards_at_hand", lambda _, shards=shards: shards)
+    for cores in (1, MAX_SHARDS):
+        on_cores(cores)
         images.append(js.render(scene, camera, settings, plan=plan))
     if estimator == "pilot":  # slabs are interpolated
         assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
-    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
-        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
+    require_alike(images)

@@ -36,6 +36,25 @@ def test_a_tolerance_is_kept_against_the_light_integral() -> None:
     assert not image.certified and image.faults in (0, faults.TOLERANCE_MISSED)
 
 
+@pytest.mark.core
+def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled) -> None:
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    settings = dataclasses.replace(SEGMENTS, samples=frames.samples)
+    plan, images = js.plan(scene, camera, settings), []
+    for tolerance in (0.1, 0.01):
+        compiled.clear()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            images.append(js.render(scene, camera, dataclasses.replace(settings, tolerance=tolerance), plan=plan))
+        found = errors(images[-1], scene, camera)
+        assert (found > tolerance).mean() <= 0.05 and found.max() < 3 * tolerance
+        assert not images[-1].certified and images[-1].faults in (0, faults.TOLERANCE_MISSED)
+    assert not compiled, "the second tolerance needs no other program"
+    assert images[1].stats["evaluations"] > images[0].stats["evaluations"]
+    assert np.asarray(images[1].error_bound).mean() < np.asarray(images[0].error_bound).mean()
+
+
 @pytest.mark.slow
 def test_a_smaller_tolerance_is_a_smaller_error_for_more_evaluations() -> None:
     scene, camera = frame()

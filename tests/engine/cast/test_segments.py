@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from chords import Rays, light
 from derivatives import QUICKLY
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -228,7 +229,7 @@ def test_thicknesses_of_points_particles_and_volumes_add_up():
     np.testing.assert_allclose(image.color, 0.5 * np.asarray(image.alpha)[..., None] * np.ones(3), atol=1e-6)
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_colours_never_exceed_alpha_and_what_has_one_colour_shows_it(seed):
     rng = np.random.default_rng(seed)

@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
 from enclosure import bundle_bounds
-from hypothesis import given
+from examples import examples
+from hypothesis import currently_in_test_context, given, target
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -121,6 +121,8 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
         found = looked(stages, scene, camera, wished, plan, form)
         assert (found.found >= found.lo[..., None, None]).all() and (found.found <= found.hi[..., None, None]).all()
         assert (found.lo <= found.hi).all()
+        if currently_in_test_context():
+            target(-float(np.minimum(found.found - found.lo[..., None, None], found.hi[..., None, None] - found.found).min()))
         error = np.abs(found.found - found.exact).max((0, 2, 3))
         assert (error <= found.off).all(), f"{error[error > found.off]} > {found.off[error > found.off]}"
         met.update(np.unique(found.levels[found.filled]).tolist())
@@ -131,9 +133,7 @@ def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
             np.broadcast_to(np.minimum(np.arange(bundles) % 7, SUPER_PIXEL), (cells, bundles)).astype(np.int32),
         )
         assert met == set(CANDIDATES), "every level occurs, and super-pixels"
-        hypothesis.settings(max_examples=15)(
-            given(scenes(kernel, dtype), cameras(frames, projection, dtype), wishes(cells, bundles))(holds)
-        )()
+        examples(15)(given(scenes(kernel, dtype), cameras(frames, projection, dtype), wishes(cells, bundles))(holds))()
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from windows import BUNDLES, CELLS, windows_of
@@ -53,7 +54,7 @@ def test_samples_past_the_last_are_not_evaluated_at_full_rate():
 
 
 @pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data())
 def test_cells_merge_at_the_highest_level_that_all_of_a_group_allow(slab_samples, data):
     every = st.sampled_from([SUPER_PIXEL, *range(MAX_LEVEL + 1), MAX_LEVEL, MAX_LEVEL])

@@ -12,7 +12,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import interpolation_error
-from jaxsph.engine.control.pilot import DEVIATIONS, pilot
+from jaxsph.engine.control.pilot import pilot
 from jaxsph.engine.field.lattice import FINEST, Spacing
 from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, SUBSAMPLED
 from jaxsph.engine.frame.stages import sum_shard
@@ -41,7 +41,6 @@ def require_kept(image, truth, tolerance):
     assert not error[estimate == 0].any(), "where nothing is estimated, nothing is left out"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "times_fewer"), [
     ("radial", 1.6), *(pytest.param(*slow, marks=pytest.mark.slow) for slow in (("mixer", 1.7), ("checker_board", 4.5))),
 ])  # fmt: skip
@@ -173,7 +172,7 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
         np.testing.assert_array_equal(method[taken], INTERPOLATED + np.asarray(schedule.level)[taken])
         np.testing.assert_array_equal(schedule.count, np.where(taken, 0, grid.windows.count))
         spent = np.where(taken, variance, np.where(some, np.asarray(found.subsampled_share) * variance, 0)).sum(0)
-        assert (DEVIATIONS * np.sqrt(spent) <= np.asarray(estimate) * (1 + 1e-5)).all()
+        assert (6 * np.sqrt(spent) <= np.asarray(estimate) * (1 + 1e-5)).all()
         assert (np.asarray(estimate) <= np.float32(tolerance)).all()
         assert taken.sum() > before
         before = taken.sum()

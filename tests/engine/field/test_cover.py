@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.ordering import Ordered
@@ -71,7 +72,7 @@ def covered(ordered, rank, task, inside, label):
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=5)
+@examples(5)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form, seed):
     with jax.enable_x64(True):
@@ -101,7 +102,7 @@ def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form
                     assert places == [first, last]
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_chord_reaches_over_the_pivot(seed):
     """It is an outer sample where there is one: the first behind an inner one, if any is."""

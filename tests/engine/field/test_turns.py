@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.field.schedule import SlabSchedule
@@ -21,7 +22,7 @@ def task_of(length):
     return SlabTask(entry, count, count, nothing, nothing, nothing, nothing, True)
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_each_block_of_each_slab_is_met_once_and_in_order(seed, sorted_first):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -91,7 +92,7 @@ draws = given(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @draws
 def test_means_are_those_of_the_exact_integral_in_float64(count, how, seed):
     with jax.enable_x64(True):
@@ -105,7 +106,7 @@ def test_means_are_those_of_the_exact_integral_in_float64(count, how, seed):
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @draws
 def test_float32_is_right_for_ends_moved_by_a_few_roundings(count, how, seed):
     rng, eps = np.random.default_rng(seed), np.finfo(np.float32).eps
@@ -119,7 +120,7 @@ def test_float32_is_right_for_ends_moved_by_a_few_roundings(count, how, seed):
     assert (got <= high + 8 * eps * largest).all()
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @draws
 def test_a_constant_stays_itself(count, how, seed):
     rng = np.random.default_rng(seed)
@@ -132,7 +133,7 @@ def test_a_constant_stays_itself(count, how, seed):
     assert np.abs(got / want - 1).max() <= rounded * np.finfo(np.float32).eps
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @draws
 def test_means_lie_between_least_and_largest_values_of_the_range(count, how, seed):
     rng, eps = np.random.default_rng(seed), np.finfo(np.float32).eps

@@ -53,13 +53,26 @@ def test_what_is_on_an_accelerator_is_tuned_for_one_and_may_take_half_of_it():
     assert memory_for(Held("cpu", 1 << 30)) == memory_for(Held("gpu")) == MEMORY
 
 
+SMALL = {"samples_at_once": 64, "samples_held": 256, "bundles_composited": 8, "half_depths_found": 4, "cells_of_nodes": 16}
+
+
+def test_how_much_is_done_at_once_changes_no_bit_of_few_particles(frames):
+    rng, images = np.random.default_rng(0), []
+    scene, camera, usual = frames.scene(rng), frames.camera(rng), frames.plan()
+    for tuning in (usual.cast.tuning, dataclasses.replace(usual.cast.tuning, **SMALL)):
+        plan = dataclasses.replace(usual, cast=dataclasses.replace(usual.cast, tuning=tuning))
+        images.append(js.render(scene, camera, frames.settings, plan=plan))
+    assert float(images[0].alpha.max()) > 0.1
+    for layer in ("color", "transmittance", "depth", "evaluations"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("asked", [pytest.param({}, marks=pytest.mark.slow), {"tolerance": 0.02, "estimator": "pilot"}])
+@pytest.mark.parametrize("asked", [{}, {"tolerance": 0.02, "estimator": "pilot"}])
 def test_how_much_is_done_at_once_changes_no_bit(asked):
     scene, camera = js.scenes.load("radial", 2000, width=72, height=60)
     settings, images = js.Settings(samples=64, **asked), []
-    small = {"samples_at_once": 64, "samples_held": 256, "bundles_composited": 8, "half_depths_found": 4, "cells_of_nodes": 16}
-    for tuning in (CPU, dataclasses.replace(CPU, **small)):
+    for tuning in (CPU, dataclasses.replace(CPU, **SMALL)):
         plan = js.plan(scene, camera, settings, tuning=tuning)
         assert plan.cast.tuning == tuning
         images.append(js.render(scene, camera, settings, plan=plan))

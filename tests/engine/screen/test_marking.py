@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.screen.canvas import of_lattice
@@ -28,7 +29,7 @@ def flat(marked):
     return np.concatenate([np.asarray(some).ravel() for some in marked])
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 10**6), number=st.integers(1, 600))
 def test_the_worst_leaves_are_so_many_and_none_that_is_left_is_worse(seed, number):
     leaves = some_leaves(seed)

@@ -15,8 +15,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from examples import examples
 from fuzzing import KINDS, counted, write_all
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 NUMBERS = (0, 1, -1, 2, 6, 8, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 10**10, 2**62, 2**63 - 1, 2**63, 10**25)
@@ -173,7 +174,7 @@ def replace_dataset(draw, file, name):
         dataset[...] = np.ones(shape, dataset.dtype)
 
 
-fuzzed = settings(deadline=1000 * SECONDS_A_FILE, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+fuzzed = examples(60, deadline=1000 * SECONDS_A_FILE, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.mark.parametrize("name", [*BYTES, *HDF5])

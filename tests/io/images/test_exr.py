@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
@@ -136,7 +137,7 @@ def test_an_image_without_colour_is_refused(tmp_path):
 
 
 @given(fraction=st.floats(0, 1, exclude_max=True))
-@settings(max_examples=15, deadline=None)
+@examples(15)
 def test_an_image_cut_anywhere_is_refused_by_name(fraction, tmp_path_factory):
     path = tmp_path_factory.mktemp("cut") / "a.exr"
     io.write_image(path, make_image())

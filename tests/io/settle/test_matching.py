@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.io.settle.matching import Matched, agree, between, ids_of, match
@@ -19,7 +20,7 @@ def snapshot(rng, ids):
     }
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.integers(0, 1000), st.floats(0.01, 0.99))
 def test_every_particle_is_where_its_own_two_places_lead(seed, share):
     rng = np.random.default_rng(seed)

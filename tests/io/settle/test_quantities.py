@@ -75,7 +75,8 @@ def test_a_missing_quantity_is_answered_with_those_there_are():
 
 def test_every_available_quantity_can_be_chosen():
     for name in available_quantities(table(a=one_to_three, velocity=velocity)):
-        choose_quantity(table(a=one_to_three, velocity=velocity), name, density=lambda: one_to_three)
+        values, chosen = choose_quantity(table(a=one_to_three, velocity=velocity), name, density=lambda: one_to_three)
+        assert chosen == name and values.shape == (3,) and np.isfinite(values).all()
 
 
 def test_a_vector_without_component_is_answered_with_its_components():

@@ -2,7 +2,8 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.io.settle import supports
@@ -37,7 +38,7 @@ def replicated(position):
 
 
 @given(st.integers(0, 2**31), st.integers(2, 60), st.integers(1, 40), st.booleans())
-@settings(max_examples=25, deadline=None)
+@examples(25)
 def test_in_a_periodic_box_neighbours_are_found_as_among_explicit_copies(seed, count, neighbours, outside):
     rng = np.random.default_rng(seed)
     position = rng.uniform(0, 1, (count, 3)) * SIDES
@@ -69,7 +70,7 @@ def test_one_particle_or_none_has_a_support_too():
     st.integers(1, 5),
     st.sampled_from([1.0, 1e-6, 1e12]),
 )
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_supports_are_positive_and_finite_however_particles_coincide(points, neighbours, unit):
     support = nearest_neighbour_supports(np.array(points) * unit, neighbours)
     assert np.isfinite(support).all() and (support > 0).all()
@@ -115,7 +116,7 @@ def test_a_progress_bar_is_shown_when_asked_and_otherwise_not(capsys):
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 2)] * 3), min_size=2, max_size=60), st.integers(1, 12), st.integers(1, 3))
-@settings(max_examples=50, deadline=None)
+@examples(50)
 def test_coincident_particles_are_neighbours_and_sources_each_on_its_own(points, neighbours, num_supports):
     position = np.array(points, float)
     distance = np.sort(np.linalg.norm(position[:, None] - position[None], axis=-1), axis=1)

@@ -5,7 +5,8 @@ import builtins
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph.io as io
@@ -178,7 +179,7 @@ TOKENS = st.sampled_from(
 )
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(st.one_of(st.lists(TOKENS, max_size=12).map(" ".join), st.lists(TOKENS, max_size=8).map("".join), st.text(max_size=30)))
 def test_whatever_is_written_it_is_a_selection_or_a_condition_error(text):
     try:

@@ -1,5 +1,6 @@
 """Promises of the camera: the contract's axes, rays and sample depths; framing shows everything; bad views are refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,8 +69,12 @@ def test_framing_shows_every_support_between_near_and_far(size, direction):
 
 
 def test_framing_of_nothing_and_of_one_particle_works():
-    js.Camera.framing(js.Particles.from_arrays([], 1.0, 0.0))
-    js.Camera.framing(js.Particles.from_arrays([[5, 5, 5]], 1e-3, 0.0))
+    for position, support in (([], 1.0), ([[5, 5, 5]], 1e-3)):
+        particles = js.Particles.from_arrays(position, support, 0.0)
+        camera = js.Camera.framing(particles)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(camera)) and 0 < camera.near < camera.far
+        depth = np.asarray(camera.to_view(particles.position))[: len(position), 2]
+        assert (camera.near <= depth - support).all() and (depth + support <= camera.far * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.leg import Turning, monotone, ordered, through
 
-FEW = settings(max_examples=25, deadline=None)
+FEW = examples(25)
 seeds = st.integers(0, 10_000)
 
 

@@ -1,7 +1,8 @@
 """What pixels of an image can see is never missed: spheres that a ray of theirs meets, and boxes of such."""
 
 import numpy as np
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -15,7 +16,7 @@ def camera_of(perspective, height):
     return js.Camera.orthographic(view_height=2.0, **place)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.booleans(), st.integers(0, 2**32 - 1), st.floats(-4, 0))
 def test_spheres_that_a_ray_of_a_pane_meets_are_met_and_so_are_boxes_around_them(perspective, seed, decade):
     rng, camera = np.random.default_rng(seed), camera_of(perspective, 32)

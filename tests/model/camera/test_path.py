@@ -4,12 +4,13 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
 
-FEW = settings(max_examples=20, deadline=None)
+FEW = examples(20)
 
 
 def camera(eye, target=(0, 0, 0), near=1.0, far=20.0, **more):

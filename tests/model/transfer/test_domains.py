@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from examples import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxsph.model.transfer.domains import DOMAINS, control_values, log_departure
@@ -74,7 +75,7 @@ def test_what_is_not_finite_is_not_counted():
         np.testing.assert_array_equal(control_values(domain, odd), control_values(domain, QUANTITY))
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(st.floats(1.01, 1e6), st.integers(2, 20), st.randoms(use_true_random=False))
 def test_the_departure_from_a_logarithm_is_a_bound_that_is_reached(span, points, random):
     values = control_values("log", low=1e-3, high=1e-3 * span, points=points)

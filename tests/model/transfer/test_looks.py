@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
@@ -16,7 +17,7 @@ def block(count=1500, size=1.0, shift=0.0, values=None):
     return Particles.from_arrays(position.astype(np.float32), 2 * size * count ** (-1 / 3), quantity)
 
 
-@settings(deadline=None, max_examples=10)
+@examples(10)
 @given(st.floats(-3, 6))
 def test_a_block_of_any_size_is_readable(decades):
     particles = block(size=10.0**decades, shift=10.0**decades)

@@ -130,6 +130,7 @@ def test_like_is_of_the_same_image_and_error_control(settings):
         js.plan(*snapshot(100), dataclasses.replace(SETTINGS, **settings), like=plan)
 
 
+@pytest.mark.core
 def test_a_plan_checks_its_own_choices_no_less_than_those_of_the_frame():
     """Lattices and coverage are the plan's to choose; merging, super-pixels and allocation are the user's."""
     scene, camera = snapshot(100)
@@ -229,5 +230,6 @@ def test_at_full_rate_media_screens_and_integrators_are_free_to_choose(monkeypat
 
 
 @pytest.mark.parametrize("count", [1, 5, 100, 4097, 10**6])
+@pytest.mark.core
 def test_the_next_class_is_the_least_larger_one(count):
     assert capacity_class(count) < next_class(count) <= 1.25 * capacity_class(count) + 1

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
@@ -128,7 +129,7 @@ def test_a_part_without_its_looks_is_refused_by_name(parts, missing):
         js.render(some, camera(), SETTINGS)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_no_extinction_lies_in_a_slab_that_is_called_empty(seed, many_points):
     """Slabs of random extents; samples in their corners, on their faces and inside; values are often control points."""
