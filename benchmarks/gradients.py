@@ -30,7 +30,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 
 import jaxsph as js
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 MOST_BACKWARD = 4.0  # frames
 MOST_MEMORY = 2.0  # times a frame's

@@ -18,7 +18,7 @@ from jaxsph.engine.render import render
 from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.camera.framing import along_axis
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
-from jaxsph.model.held import emission
+from jaxsph.model.particles.held import emission
 from jaxsph.model.projection import Projection
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.numerics.faults import CapacityError

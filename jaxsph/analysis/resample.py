@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model import kernels
-from jaxsph.model.particles import Particles, capacity_class
-from jaxsph.model.periodic import with_ghosts
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
 from jaxsph.numerics.given import in_unit

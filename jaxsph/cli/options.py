@@ -15,7 +15,7 @@ from jaxsph import scenes
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.engine.runtime.devices import chosen_devices
 from jaxsph.model import Settings, registry
-from jaxsph.model.kernels import KERNELS
+from jaxsph.model.particles.kernels import KERNELS
 
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""

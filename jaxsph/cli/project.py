@@ -28,8 +28,8 @@ from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS, along_axis
-from jaxsph.model.held import emission
-from jaxsph.model.kernels import KERNELS
+from jaxsph.model.particles.held import emission
+from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.projection import NORMS, Projection
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"

@@ -32,7 +32,7 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.transfers import read_transfer, write_transfer
 from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.io.volumes.volume_table import VolumeTable
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 
 __all__ = [
@@ -117,7 +117,7 @@ def read_particles(
             these; `None` picks the first telling one of a concentration, temperature, internal energy, density, speed.
         support: support radius in the file's length unit; `None` means the file's own, else the distance to the 32nd
             neighbour.
-        kernel: its name, one of `jaxsph.model.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
+        kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.units import NO_UNITS, FileUnits
-from jaxsph.model.kernels import by_name
+from jaxsph.model.particles.kernels import by_name
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)

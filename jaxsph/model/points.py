@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.packing import columns_of, packed, rest_of
-from jaxsph.model.particles import Particles, room_for
+from jaxsph.model.particles.packing import columns_of, packed, rest_of
+from jaxsph.model.particles.particles import Particles, room_for
 from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit

@@ -18,7 +18,7 @@ from jax import lax
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.medium import Medium
-from jaxsph.model.particles import NOTHING, Particles
+from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.held import held_by
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
 from jaxsph.reference.where import integral_across, lines, ray_coordinates, to_view
 

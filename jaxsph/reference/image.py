@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.particles import kernels
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

@@ -10,10 +10,10 @@ import dataclasses
 
 import numpy as np
 
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
 

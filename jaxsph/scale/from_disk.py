@@ -32,7 +32,7 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.frusta import seen_by
 from jaxsph.model.image import Image
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction

@@ -21,7 +21,7 @@ from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.frusta import Planes, between_depths
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import TransferFunction
 
 SAMPLED = 1 << 16

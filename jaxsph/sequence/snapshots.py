@@ -18,7 +18,7 @@ from jaxsph import io, scenes
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.sequence.survey import Reading, Survey, Way, Who, surveyed, way_between

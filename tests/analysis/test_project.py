@@ -13,7 +13,7 @@ from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 from jaxsph.numerics import faults
 
 NAMES = sorted(kernels.KERNELS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 
 def drawn(kernel, decades=1.5, count=60):

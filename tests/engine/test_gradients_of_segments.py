@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 CAPACITY = 6
 RTOL = 1e-4

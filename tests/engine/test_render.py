@@ -12,7 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.kernels import KERNELS
+from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.numerics import faults
 
 ALL = list(itertools.product(KERNELS, ["perspective", "orthographic"]))

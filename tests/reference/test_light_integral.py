@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.kernels import KERNELS
+from jaxsph.model.particles.kernels import KERNELS
 
 PROJECTIONS = ["perspective", "orthographic"]
 SEEDS = st.integers(0, 2**32 - 1)

@@ -20,7 +20,7 @@ from jaxsph.engine.access.footprint import pixel_ranges
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.resolution import ROUNDING, unresolved
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import faults
 
 SMALL = (

@@ -21,8 +21,8 @@ from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import MAX_CAPACITY
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import Particles, capacity_class
-from jaxsph.model.periodic import between_faces, num_ghosts, sees_images, unfolded
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.particles.periodic import between_faces, num_ghosts, sees_images, unfolded
 from jaxsph.numerics.checks import is_traced
 
 PIXELS = ("mean", "ray")

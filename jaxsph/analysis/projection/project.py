@@ -28,9 +28,9 @@ from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, besi
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.held import Held, held_by, unit_held
-from jaxsph.model.particles import Particles
-from jaxsph.model.periodic import between_faces, with_sources
+from jaxsph.model.particles.held import Held, held_by, unit_held
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.periodic import between_faces, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced

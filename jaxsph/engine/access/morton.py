@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.engine.runtime.programs import compiled_quickly
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 
 DIGITS = 10  # binary ones of each coordinate: three times as many fit into a word
 NOWHERE = 1 << (3 * DIGITS)  # the key of particles without a place, past all others; that of padding is past it

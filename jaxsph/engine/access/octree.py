@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.macrocells import MACROCELL, Occupancy
 from jaxsph.engine.runtime.tuning import MEMORY
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 
 INNER = -1  # the length of a node that is split
 ROUNDING = 32  # eps of the cube's side that radii are widened by, and the box on either side

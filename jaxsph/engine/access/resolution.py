@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.kernels import Kernel
+from jaxsph.model.particles.kernels import Kernel
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow

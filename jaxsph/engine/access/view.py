@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.footprint import pixel_ranges
 from jaxsph.engine.access.resolution import ROUNDING, lift_of_sizes, unresolved, weakest
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import exponents, faults
 from jaxsph.numerics.trees import tree
 

@@ -23,7 +23,7 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import fetch, quantities_of
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 16  # particles unrolled in the inner loop

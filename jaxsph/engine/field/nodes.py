@@ -26,8 +26,8 @@ from jaxsph.engine.field.lattice import GAP, REACH, Lattice, Region, node_at
 from jaxsph.engine.field.schedule import SUBSAMPLE
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 8  # particles unrolled in the inner loop

@@ -21,7 +21,7 @@ from jaxsph.engine.field.fetch import Block, fetch, quantities_of
 from jaxsph.engine.field.gather import BLOCK, PARTS
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
 

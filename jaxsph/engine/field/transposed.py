@@ -22,7 +22,7 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 

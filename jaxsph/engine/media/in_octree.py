@@ -11,7 +11,7 @@ from jaxsph.engine.media.octree_medium import OctreeParticles, OctreePoints
 from jaxsph.engine.media.within import Within
 from jaxsph.model import registry
 from jaxsph.model.medium import Medium
-from jaxsph.model.periodic import with_ghosts
+from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced

@@ -28,16 +28,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.octree import Leaf, Octree, build_octree
-from jaxsph.engine.access.quantities import in_units_of
 from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.lookups.quantities import in_units_of
 from jaxsph.engine.media.point_rays import NUM_COLUMNS, Row
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.volume_grid import VolumeGrid
-from jaxsph.model import kernels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Shaped
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read

@@ -29,8 +29,8 @@ from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import Particles, capacity_class
-from jaxsph.model.periodic import num_ghosts
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.particles.periodic import num_ghosts
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced

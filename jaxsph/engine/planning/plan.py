@@ -26,7 +26,7 @@ from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning
 from jaxsph.engine.screen.quadtree import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene, num_spheres
 from jaxsph.model.settings import Settings
 

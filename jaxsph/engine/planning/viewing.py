@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.quantities import in_units_of, too_small
 from jaxsph.engine.access.resolution import too_fine
 from jaxsph.engine.access.view import Viewed, view_particles
+from jaxsph.engine.lookups.quantities import in_units_of, too_small
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
@@ -25,7 +25,7 @@ from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import Medium
-from jaxsph.model.periodic import unfolded
+from jaxsph.model.particles.periodic import unfolded
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults

@@ -19,7 +19,7 @@ from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, 
 from jaxsph.io.settle.supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import select
 from jaxsph.io.table import ParticleTable
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import plain
 
 ROUNDING_NOTED = 1e-3

@@ -19,7 +19,7 @@ import scipy
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.settle.supports import NEIGHBOURS, Sides, in_period
 from jaxsph.io.table import ParticleTable
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 SAMPLED = 512
 """Particles that are asked: the median of so many is known to a few per cent, and a search among all takes milliseconds."""

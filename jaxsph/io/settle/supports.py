@@ -17,7 +17,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 Sides = tuple[float, float, float]
 NEIGHBOURS = 32
@@ -100,7 +100,7 @@ def kernel_sum(
         position: (N, 3); distances are computed in float64.
         support: (N,) support radii $H > 0$, same unit as `position`.
         weight: (N,) weights $w$; `None` means 1.
-        kernel: name of a kernel of `jaxsph.model.kernels`.
+        kernel: name of a kernel of `jaxsph.model.particles.kernels`.
         box: sides of a periodic box, across whose faces sums go, to the nearest image of each particle; None for none.
         progress: show a progress bar; on a terminal large sets show one anyway.
 

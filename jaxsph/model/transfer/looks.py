@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, colormap, value_range

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.analysis.projection import columns
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)

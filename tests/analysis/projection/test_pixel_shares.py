@@ -7,7 +7,7 @@ import pytest
 
 from jaxsph.analysis.projection import columns
 from jaxsph.analysis.projection.columns import pixel_shares
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import barriers
 
 NAMES = sorted(kernels.KERNELS)

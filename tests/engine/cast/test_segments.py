@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 WIDTH, HEIGHT, SAMPLES, CAPACITY = 13, 10, 32, 8
 SETTINGS = js.Settings(samples=SAMPLES, integrator="segments")

@@ -16,7 +16,7 @@ from jaxsph.engine.field.lattice import FINEST, GAP, REACH, Region, Spacing, reg
 from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
 from jaxsph.engine.field.schedule import SUBSAMPLE, full_rate
 from jaxsph.engine.field.tasks import RayPackets
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 WIDER = Spacing(8, 4)
 

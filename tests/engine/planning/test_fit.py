@@ -15,7 +15,7 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.model import registry
 from jaxsph.model.medium import Medium
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 
 SETTINGS = js.Settings(samples=24)
 

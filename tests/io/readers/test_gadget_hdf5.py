@@ -6,7 +6,7 @@ import pytest
 import jaxsph as js
 import jaxsph.io as io
 from jaxsph.io.readers.gadget_hdf5 import GADGET4_KERNELS, GIZMO_KERNELS, SWIFT_KERNELS
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 h5py = pytest.importorskip("h5py")
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 
 def brute_force_sum(position, support, weight, kernel):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.particles import capacity_class
+from jaxsph.model.particles.particles import capacity_class
 
 good = {"position": np.zeros((3, 3)), "support": np.ones(3), "quantity": np.arange(3.0), "volume": np.ones(3)}
 

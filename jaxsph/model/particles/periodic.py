@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.shapes import Box
-from jaxsph.model.particles import Particles, capacity_class, sides_of
+from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import NO_UNITS, own, plain, unit_of
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate
 
-from jaxsph.model import kernels
+from jaxsph.model.particles import kernels
 
 names = pytest.mark.parametrize("name", kernels.KERNELS)
 formulas = {

@@ -16,9 +16,9 @@ import scipy
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model import kernels
 from jaxsph.model.clips.shapes import Box
-from jaxsph.model.packing import columns_of, packed, padded_to, rest_of
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.trees import tree
@@ -55,7 +55,7 @@ class Particles:
         quantity: the carried quantity q, the input of the transfer function; of two, that of colours.
         volume: V >= 0, any unit: only ratios between particles matter.
         valid: which entries are particles; the rest is padding and contributes nothing.
-        kernel: its name, one of `jaxsph.model.kernels.KERNELS`.
+        kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`.
         position_rest: what rounding float64 positions to `position` has left, length units; None where that is a negligible
             part of every support.
         extinction_quantity: the second carried quantity, by which extinction is looked up; None where there is one alone.

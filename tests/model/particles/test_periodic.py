@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.periodic import _unfolded as unfolded
-from jaxsph.model.periodic import num_ghosts, with_ghosts
+from jaxsph.model.particles.periodic import _unfolded as unfolded
+from jaxsph.model.particles.periodic import num_ghosts, with_ghosts
 from jaxsph.numerics import faults
 
 SIDES = np.array([1.0, 1.5, 0.8])

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.particles import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
 from jaxsph.numerics import exponents
 

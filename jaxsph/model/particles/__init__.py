@@ -1,0 +1,1 @@
+"""Particles: arrays of them, their kernels, their periods, and the amounts that they hold."""
