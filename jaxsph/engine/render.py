@@ -5,21 +5,32 @@ Flow: view_scene -> plan -> frame, band by band -> layers -> Image.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+import jax
+
+from jaxsph.engine.asked import require_asked
 from jaxsph.engine.frame.bands import Progress, Work
-from jaxsph.engine.frame.traced import traced_image
-from jaxsph.engine.planning.fit import PLANS, seen_by
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.images import traced_image_of
+from jaxsph.engine.frame.layers import Drawn, crop, of_band
+from jaxsph.engine.frame.over_mesh import drawn_over_mesh
+from jaxsph.engine.frame.refinement import refined
+from jaxsph.engine.planning.fit import PLANS, see, seen_by
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request
+from jaxsph.engine.request import Request, along_rays
 from jaxsph.engine.runtime.device_executors import OnDevices
-from jaxsph.engine.runtime.devices import chosen_devices
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
+from jaxsph.engine.runtime.executors import Clock, Traced
+from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
+
+MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
 
 def render(
@@ -73,7 +84,55 @@ def render(
     if plan is not None and not isinstance(plan, Plan):
         raise ValueError(f"`plan` must be a `jaxsph.Plan`, got {type(plan).__name__}; make one with `jaxsph.plan`")
     if is_traced(scene, camera, settings):
-        return traced_image(scene, camera, settings, plan, devices)
+        return _traced_image(scene, camera, settings, plan, devices)
     clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
     made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
     return Work(seen, camera, settings, made, asked.scene.formulas).image(clock, progress, planned=plan is None)
+
+
+def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:
+    """As one program of all that is traced: numbers of settings that are known stay so.
+
+    Raises:
+        ValueError: no plan, one for another image, or a quadtree over a mesh.
+    """
+    require_asked(scene, camera, settings)
+    if plan is None:
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
+    plan.check(scene, camera, along_rays(scene, settings))
+    if plan.quadtree is not None and devices is not None:
+        raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
+    PROGRAMS.make_room()
+    numbers, structure = jax.tree.flatten(settings)
+    known = tuple(None if is_traced(number) else number for number in numbers)
+    program = _program(plan, structure, known, None if devices is None else mesh_of(devices))
+    image: Image = program(scene, camera, [number for number in numbers if is_traced(number)])
+    return image
+
+
+@kept_while_there_is_room
+@functools.lru_cache(maxsize=MAX_TRACED)
+def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> Any:
+    """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
+
+    Within one, it is no call of its own.
+    """
+
+    def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
+        given = iter(numbers)
+        settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
+        drawn = _drawn(scene, camera, settings, plan) if mesh is None else drawn_over_mesh(scene, camera, settings, plan, mesh)
+        return traced_image_of(drawn, settings, plan)
+
+    return jax.jit(image, inline=True)
+
+
+def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
+    """All bands."""
+    run = Traced()
+    seen = see(scene, camera, plan, run)
+    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
+    if plan.quadtree is not None:
+        return refined(frame, run, seen.viewed.faults)
+    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
+    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)

@@ -63,7 +63,7 @@ def test_under_vmap_each_image_is_judged_alone(drawn):
     st.sampled_from([0.0, 0.005, 0.01, 0.5, 1.5, -1.0, np.nan]),
 )
 @examples(200)
-def test_traced_numbers_are_faults_where_known_ones_are_refused(tolerance, relax, least):
+def test_over_mesh_numbers_are_faults_where_known_ones_are_refused(tolerance, relax, least):
     values = {"tolerance": tolerance, "relax": relax, "min_transmittance": least}
     try:
         given, refused = js.Settings(**values), False

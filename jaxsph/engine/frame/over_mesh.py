@@ -1,15 +1,14 @@
-"""A frame as part of a trace, by one device or by each device of a mesh for its own shards.
+"""A frame as part of a trace over a mesh of devices, each of which runs the same program for its own shards.
 
-Flow: scene, plan -> [traced: Frame -> bands] -> layers -> Image.
+Flow: scene, mesh -> [over_mesh: Frame -> bands] -> layers.
 
-Over a mesh every device holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of
+Every device holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of
 one device, and each device decides and marches its own. Nothing is exchanged but what rays met, and with error control by bounds
 or the pilot what decisions for a whole band need. In reverse mode cotangents of what all devices share are added up.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,77 +19,18 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
-from jaxsph.engine.asked import require_asked
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.images import traced_image_of
 from jaxsph.engine.frame.layers import Drawn, Layers, OfShards, crop, of_band
-from jaxsph.engine.frame.refinement import refined
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import along_rays
 from jaxsph.engine.runtime.device_executors import OnMesh
-from jaxsph.engine.runtime.devices import mesh_of
-from jaxsph.engine.runtime.executors import Traced
-from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import is_traced
-
-MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
 
-def traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:
-    """As one program of all that is traced: numbers of settings that are known stay so.
-
-    Raises:
-        ValueError: no plan, one for another image, or a quadtree over a mesh.
-    """
-    require_asked(scene, camera, settings)
-    if plan is None:
-        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
-    plan.check(scene, camera, along_rays(scene, settings))
-    if plan.quadtree is not None and devices is not None:
-        raise ValueError('`devices` must be None under jit with `screen="quadtree"`; call it eagerly, or take "pixels"')
-    PROGRAMS.make_room()
-    numbers, structure = jax.tree.flatten(settings)
-    known = tuple(None if is_traced(number) else number for number in numbers)
-    program = _program(plan, structure, known, None if devices is None else mesh_of(devices))
-    image: Image = program(scene, camera, [number for number in numbers if is_traced(number)])
-    return image
-
-
-@kept_while_there_is_room
-@functools.lru_cache(maxsize=MAX_TRACED)
-def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Mesh | None) -> Any:
-    """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
-
-    Within one, it is no call of its own.
-    """
-
-    def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
-        given = iter(numbers)
-        settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
-        drawn = _drawn(scene, camera, settings, plan) if mesh is None else _drawn_over(mesh, scene, camera, settings, plan)
-        return traced_image_of(drawn, settings, plan)
-
-    return jax.jit(image, inline=True)
-
-
-def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
-    """All bands."""
-    run = Traced()
-    seen = see(scene, camera, plan, run)
-    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
-    if plan.quadtree is not None:
-        return refined(frame, run, seen.viewed.faults)
-    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
-    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)
-
-
-def _drawn_over(mesh: Mesh, scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
+def drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan, mesh: Mesh) -> Drawn:
     """On every device of a mesh, each for its own bundles; what is returned they all hold."""
     plan = plan.dealt(mesh.size)
 
