@@ -99,6 +99,7 @@ class SlabTask:
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether what is asked for are means of the intervals between samples, which then lie on borders.
         part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
+        measured: whether how much of rays supports cover is measured too, to tell what intervals miss of it.
     """
 
     entry: SlabSchedule
@@ -112,6 +113,7 @@ class SlabTask:
     scattered: bool = False
     between: bool = False
     part: Part | None = None
+    measured: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -244,5 +246,5 @@ jax.tree_util.register_dataclass(RayPackets, data_fields=["u", "v", "list_id", "
 jax.tree_util.register_dataclass(
     SlabTask,
     data_fields=["entry", "slab", "bundle", "u", "v", "depth", "border", "part"],
-    meta_fields=["perspective", "scattered", "between"],
+    meta_fields=["perspective", "scattered", "between", "measured"],
 )
