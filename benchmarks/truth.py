@@ -2,10 +2,11 @@
 
 Built-in scenes and particle files at 512 x 512, as points and segments of several numbers of samples render them, and segments
 refined for tolerances, against `jaxsph.reference.integral` at random pixels among those that any particle touches. A pixel's
-error is its largest difference over red, green, blue and alpha. Images are timed in turns, compiled programs only; what compiling
-takes is told apart, as the time of the first image. For each segments' image `points_time` is the time that uniform points take
-for the same 99.9 % error, by a power law between the two numbers of samples beside it. Integrals are kept in `--cache`. Writes
-`results/truth.json`; ends in an assert on mean errors.
+error is its largest difference over red, green, blue and alpha; `silent` are pixels over thrice the tolerance whose estimate is
+under a third of their error. Images are timed in turns, compiled programs only; what compiling takes is told apart,
+as the time of the first image. For each segments' image `points_time` is the time that uniform points take for the same 99.9 %
+error, by a power law between the two numbers of samples beside it. Integrals are kept in `--cache`. Writes `results/truth.json`;
+ends in an assert on mean errors.
 
     python benchmarks/truth.py [SCENE or FILE ...] [--samples 64 128 256 512] [--tolerances 0.03 0.01 0.004] [--cache FOLDER]
 """
@@ -109,6 +110,7 @@ def compared(image: js.Image, settings: js.Settings, truth: dict[str, np.ndarray
     told, wrong = np.asarray(image.error_bound)[place], error > ROUNDING
     ratio = np.quantile(told[wrong] / error[wrong], [0.01, 0.5, 0.99]).tolist() if wrong.any() else None
     over = {f"over_{times}": float((error > times * settings.tolerance).mean()) for times in (1, 3)}
+    over["silent"] = float(((error > 3 * settings.tolerance) & (told < error / 3)).mean())
     missed = float((told > settings.tolerance).mean())
     return found | over | {"estimate_over_error": ratio, "told_over": missed, "faults": int(image.faults)}
 
@@ -153,7 +155,7 @@ def line(name: str, row: Record) -> str:
     told = (
         ""
         if row["tolerance"] is None
-        else f"  over {row['over_1']:.4f} {row['over_3']:.4f} told/true {row['estimate_over_error']}"
+        else f"  over {row['over_1']:.4f} {row['over_3']:.4f} silent {row['silent']:.5f} told/true {row['estimate_over_error']}"
     )
     return (
         f"{name:24s} {row['integrator']:12s} {asked:>7s} {errors} {row['evaluations']:20.0f} {row['seconds']:8.3f}{saved}{told}"

@@ -47,8 +47,8 @@ from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
 MORE = "Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped."
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
-MAX_FRAMES = 1_000_000
-"""What a typing error goes beyond, and no movie: 11 hours at 24 frames a second."""
+MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
+"""What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
 ANSWER = 30.0
@@ -119,8 +119,8 @@ def _checked(options: argparse.Namespace) -> Path:
     if (options.frames or 0) > MAX_FRAMES:
         lasting = f"that is {options.frames / options.fps / 3600:,.4g} hours at --fps {options.fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
-    if options.orbit is not None and not (math.isfinite(options.orbit) and options.orbit):
-        raise UsageError(f"--orbit must be degrees other than 0, got {options.orbit:g}")
+    if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
+        raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
     if options.progressive:
         raise UsageError("--progressive is for one image; frames of a movie are rendered to their end")
     if len(options.source) == 1 and options.camera is None and options.orbit is None:

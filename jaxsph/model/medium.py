@@ -131,6 +131,13 @@ class Medium(abc.ABC):
         """What was gathered at samples, for intervals twice as long; by default of every other sample."""
         return jax.tree.map(lambda value: value[:, ::2], gathered)
 
+    def missed(self, gathered: Any, task: Any) -> Float[Array, "tasks rays"]:
+        """How optically thick what `intervals` are known to leave out or to count too often is; of tasks that are `measured`.
+
+        By default nothing is.
+        """
+        return jnp.zeros(task.shape[::2], task.depth.dtype)
+
     def met(self, gathered: Any, task: Any) -> list[Array]:
         """What an integrator makes light of: `optics` at samples or, of a task that is `between` them, all `means`."""
         if task.between:

@@ -126,6 +126,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, ca
     [
         (["s_0.npz"], "needs a camera that moves"),
         (["s_0.npz", "--orbit", 0], "--orbit must be"),
+        (["s_0.npz", "--orbit", 1e308], "--orbit must be"),
         (["s_0.npz", "--orbit", 9, "--camera", "keys.json"], "not allowed with"),
         (["s_0.npz", "--camera", "keys.json", "--eye", 0, 0, 9], "exclude each other"),
         (["s_0.npz", "s_1.npz", "-o", "m.avi"], ".mp4"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from examples import examples
+from forced import ran
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -55,6 +56,33 @@ def test_under_vmap_each_image_is_judged_alone(drawn):
     assert np.asarray(images.error_bound).max((1, 2)).tolist() == [0, 1, 0]
     with pytest.raises(js.CapacityError, match="too small"):
         images.check()
+
+
+OVER_DEVICES = """
+import dataclasses, json
+import jax
+import numpy as np
+import jaxsph as js
+
+scene, camera = js.scenes.load("checker_board", 400, width=40, height=24)
+settings = js.Settings(samples=16)
+plan = js.plan(scene, camera, settings)
+
+@jax.jit
+def draw(grown):
+    particles = dataclasses.replace(scene.particles, support=grown * scene.particles.support)
+    return js.render(dataclasses.replace(scene, particles=particles), camera, settings, plan=plan, devices="all")
+
+told = {}
+for grown in (1.0, 4.0):
+    image = draw(grown)
+    told[str(grown)] = [int(image.faults) != 0, bool(image.certified), np.unique(image.error_bound).tolist()]
+print(json.dumps(told))
+"""
+
+
+def test_over_devices_a_fault_of_any_is_one_of_the_image():
+    assert ran(OVER_DEVICES, devices=2) == {"1.0": [False, True, [0.0]], "4.0": [True, False, [1.0]]}
 
 
 @given(

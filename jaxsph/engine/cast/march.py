@@ -124,6 +124,7 @@ def segments_of(
     """What slabs emit and let through, with so many times as many samples; `compared`: and how wrong that may be."""
     task = batches.task(items)
     task = task if parts == 1 else task.refined(parts)
+    task = dataclasses.replace(task, measured=compared)
     gathered = medium.gather(task)
     if not compared:
         return integrator(medium, gathered, task)

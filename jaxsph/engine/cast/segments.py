@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
+from jaxsph.engine.cast.refine import CAUTION
 from jaxsph.engine.cast.samples import emitted, transmitted
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
@@ -84,6 +85,7 @@ class Segments(Integrator):
         for color, by_long in channels:
             more = color - by_long
             error = jnp.maximum(error, jnp.maximum(jnp.abs(more), jnp.abs(more + through)))
+        error = error + (1 - jnp.exp(-medium.missed(gathered, task))) / CAUTION
         red, green, blue = (color for color, _ in channels)
         return Segment((red, green, blue), left[:, -1], thickness, error)
 

@@ -44,6 +44,7 @@ class Cover(NamedTuple):
         of_front, of_back: quantities of the particles that make them, relative to the slab's reference.
         pivot: depth of an outer sample; infinite where there is none.
         others: of two quantities, what `of_front` and `of_back` are of the second; nothing of one.
+        length: of all chords in front of the pivot and behind it, cut off at the borders of the slab; nothing unless `measured`.
     """
 
     front: Float[Array, "2 tasks rays"]
@@ -52,6 +53,7 @@ class Cover(NamedTuple):
     of_back: Float[Array, "2 tasks rays"]
     pivot: Float[Array, "tasks rays"]
     others: tuple[Float[Array, "2 tasks rays"], ...] = ()
+    length: Float[Array, "2 tasks rays"] | None = None
 
 
 class Ends(NamedTuple):
@@ -137,18 +139,19 @@ def cover_of(
     far = jnp.finfo(pivot.dtype).max
     several = label == "quantity" and len(task.entry.references) > 1
     labels = 2 * len(task.entry.references) if several else 2
-    nothing = jnp.asarray([far, far, -far, -far, *[0] * 2 * labels], pivot.dtype)[None, :, None]  # to put rows takes long
+    rows = [far, far, -far, -far, *[0] * 2 * labels, *[0] * 2 * task.measured]
+    nothing = jnp.asarray(rows, pivot.dtype)[None, :, None]  # to put rows takes long
 
     def find(items: Array, some: SlabTask, found: Array) -> Array:
-        ends: tuple[Array, ...] = ends_of(
-            ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], "place" if several else label
-        )
-        ends = (*ends[:2], *_quantities_at(ordered, rank, some, ends[2:])) if several else ends
-        return found.at[items].set(jnp.moveaxis(jnp.concatenate(ends), 0, 1), mode="drop")
+        ends, length = ends_of(ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], "place" if several else label)
+        labeled = (*ends[:2], *_quantities_at(ordered, rank, some, ends[2:])) if several else ends
+        measured = () if length is None else (length,)
+        return found.at[items].set(jnp.moveaxis(jnp.concatenate((*labeled, *measured)), 0, 1), mode="drop")
 
     found = over_groups(find, jnp.broadcast_to(nothing, (tasks, nothing.size, rays)), task, inside)
     front, back, of_front, of_back, *others = (jnp.moveaxis(found[:, k : k + 2], 1, 0) for k in range(0, nothing.size, 2))
-    return Cover(front, back, of_front, of_back, pivot, tuple(others))
+    length = others.pop() if task.measured else None
+    return Cover(front, back, of_front, of_back, pivot, tuple(others), length)
 
 
 def _quantities_at(
@@ -191,8 +194,10 @@ def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]
     return dataclasses.replace(some, entry=dataclasses.replace(some.entry, length=length, count=count))
 
 
-def ends_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"], label: str) -> Ends:
-    """The ends (2, tasks, rays) of all chords in front of the pivot, and behind it, as depths."""
+def ends_of(
+    ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"], label: str
+) -> tuple[Ends, Float[Array, "2 tasks rays"] | None]:
+    """The ends (2, tasks, rays) of all chords in front of the pivot, and behind it, as depths; and see `Cover.length`."""
     entry, lines = task.entry, Lines.of(task)
     windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     shape = jnp.broadcast_shapes(lines.u.shape, lines.v.shape)
@@ -208,21 +213,28 @@ def ends_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "
         block, labels = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
         parts = fusion_barrier(nth >= 0, shared_parts, block, lines)
         begin, end = fusion_barrier(nth >= 0, chords, parts, lines)
-        return [
+        found = [
             _extreme(old, begin if front else end, end < apart if ahead else end >= apart, labels, front)
-            for old, (ahead, front) in zip(so_far, EXTREMES, strict=True)
+            for old, (ahead, front) in zip(so_far, EXTREMES, strict=False)
         ]
+        if not task.measured:
+            return found
+        inner = jnp.maximum(jnp.minimum(end, lines.back[:, None]) - jnp.maximum(begin, lines.front[:, None]), 0)
+        sides = end < apart, end >= apart
+        return found + [old + jnp.where(mine, inner, 0).sum(1) for old, mine in zip(so_far[len(EXTREMES) :], sides, strict=True)]
 
     blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
     nothing = jnp.zeros(shape, pivot.dtype)
     start = [together_of(nothing + (far if front else -far), nothing) for _, front in EXTREMES]
-    found = [apart_of(one) for one in lax.fori_loop(0, blocks, add_block, start)]
+    after = lax.fori_loop(0, blocks, add_block, start + [nothing] * 2 * task.measured)
+    found = [apart_of(one) for one in after[: len(EXTREMES)]]
+    length = jnp.stack(after[len(EXTREMES) :]).reshape(2, *pivot.shape) if task.measured else None
     (front, of_front), (back, of_back) = (
         (jnp.stack(pair).reshape(2, *pivot.shape) for pair in zip(*found[first::2], strict=True)) for first in (0, 1)
     )
     middle = lines.middle[:, 0]
     met = front < far
-    return Ends(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back)
+    return Ends(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back), length
 
 
 def shared_parts(block: Block, lines: Lines) -> tuple[Array, ...]:

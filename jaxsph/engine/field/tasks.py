@@ -86,7 +86,7 @@ class Part(NamedTuple):
     share: Float[Array, "tasks intervals rays"]
 
 
-@tree(static=("perspective", "scattered", "between"))
+@tree(static=("perspective", "scattered", "between", "measured"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -100,6 +100,7 @@ class SlabTask:
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether what is asked for are means of the intervals between samples, which then lie on borders.
         part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
+        measured: whether how much of rays supports cover is measured too, to tell what intervals miss of it.
     """
 
     entry: SlabSchedule
@@ -113,6 +114,7 @@ class SlabTask:
     scattered: bool = False
     between: bool = False
     part: Part | None = None
+    measured: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:

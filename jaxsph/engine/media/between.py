@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.cover import Cover, Ends, ends_of, over_groups
+from jaxsph.engine.field.cover import Cover, Ends, Lines, ends_of, over_groups
 from jaxsph.engine.field.fetch import particle_at
-from jaxsph.engine.field.intervals import Intervals, intervals_of, looked_up, means_by
+from jaxsph.engine.field.intervals import BESIDE, Intervals, intervals_of, looked_up, means_by
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH
@@ -47,6 +47,27 @@ class MeanCotangents(NamedTuple):
 def intervals_between(gathered: SumsBetween, task: SlabTask) -> list[Intervals]:
     """Ends of the intervals between samples, in units of the quantity; of each quantity."""
     return _intervals(by_rays(gathered.sums), gathered.cover, task.depth, task)
+
+
+def missed_length(gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks rays"]:
+    """How much more or less of each ray intervals take to be inside of supports than is, as far as lengths of chords tell.
+
+    What supports cover is no longer than all chords together, nor than from the first end of them to the last. Where chords
+    do not lie over one another it is as long as they are. Slabs that no cover was found of tell nothing.
+    """
+    cover = gathered.cover
+    assert cover.length is not None
+    lines = Lines.of(dataclasses.replace(task, part=None))
+    first, last = ((lines.middle + end)[:, 0] for end in (lines.front, lines.back))
+    taken = (intervals_between(gathered, task)[-1].share * (task.depth[:, 1:] - task.depth[:, :-1])[..., None]).sum(1)
+    hull = jnp.maximum(jnp.minimum(cover.back, last) - jnp.maximum(cover.front, first), 0)
+    covered = jnp.minimum(cover.length, hull).sum(0)
+    known = covered > 0
+    over = jnp.where(known, jnp.maximum(taken - covered, 0), 0)
+    if task.part is not None:
+        return over
+    apart = (cover.length <= (1 + BESIDE) * hull).all(0)
+    return over + jnp.where(known & apart, jnp.maximum(covered - taken, 0), 0)
 
 
 def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) -> list[Intervals]:
@@ -89,7 +110,7 @@ def pull_cover(
     def pull_some(items: Array, some: SlabTask, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         table, factor = carry
         here = jnp.minimum(items, inside.shape[0] - 1)
-        places = ends_of(ordered, rank, some, gathered.cover.pivot[here], "place")
+        places, _ = ends_of(ordered, rank, some, gathered.cover.pivot[here], "place")
         for piece in range(2):
             mine = Ends(*(value[piece] for value in places))
             cotangent = Ends(*(value[piece, here] for value in of_cover[:4]))

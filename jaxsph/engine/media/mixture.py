@@ -73,6 +73,12 @@ class Mixture(Medium):
         found = [medium.means(one, task, channels) for medium, one in zip(self.media, intervals, strict=True)]
         return [mixed_extinction(list(of_channel)) for of_channel in zip(*found, strict=True)]
 
+    def missed(self, gathered: tuple[Any, ...], task: Any) -> Float[Array, "tasks rays"]:
+        """The sum."""
+        return functools.reduce(
+            operator.add, (medium.missed(one, task) for medium, one in zip(self.media, gathered, strict=True))
+        )
+
     def every_other(self, gathered: tuple[Any, ...]) -> tuple[Any, ...]:
         """Of each."""
         return tuple(medium.every_other(one) for medium, one in zip(self.media, gathered, strict=True))

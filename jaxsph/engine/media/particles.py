@@ -28,8 +28,8 @@ from jaxsph.engine.field.methods import methods_of
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH, pull_gather
-from jaxsph.engine.lookups.means import MeanTables
-from jaxsph.engine.media.between import SumsBetween, intervals_between, pull_cover, pull_means
+from jaxsph.engine.lookups.means import MeanTables, mean_extinction
+from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_length, pull_cover, pull_means
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.fusion import fusion_barrier
@@ -142,6 +142,17 @@ class ParticleMedium(Medium):
     def means(self, intervals: Intervals | Paired, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """See `Medium.means`: of the transfer function, over the ranges of quantities in each interval."""
         return means_by(self._tables, intervals, channels)
+
+    def missed(self, gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks rays"]:
+        """See `Medium.missed`: what lengths of chords tell, of the largest extinction at the ends of what is covered."""
+        cover, reference = gathered.cover, task.entry.references[-1]
+        ends = cover.others or (cover.of_front, cover.of_back)
+        quantity = reference[:, None] + jnp.concatenate(ends)
+        there = jnp.tile(cover.front < cover.back, (2, 1, 1))
+        extinction = jnp.where(there, mean_extinction(self._tables[-1], quantity, quantity), 0).max(0)
+        length = task.border[:, -1:] - task.border[:, :1]
+        slant = task.path().sum(1) / jnp.where(length > 0, length, 1)
+        return extinction * slant * missed_length(gathered, task)
 
     @property
     def _tables(self) -> tuple[MeanTables, ...]:

@@ -118,6 +118,10 @@ class Within(Medium):
         found = self.medium.means(of_medium, self._task(task, part), channels)
         return found if self.medium.in_parts else [part.share * mean for mean in found]
 
+    def missed(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks rays"]:
+        """Of what is inside, where the medium knows of parts; else all that the medium misses."""
+        return self.medium.missed(gathered, self._task(task, self._part(task)))
+
     def every_other(self, gathered: Any) -> Any:
         """See `Medium`."""
         return self.medium.every_other(gathered)

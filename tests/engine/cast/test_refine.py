@@ -56,6 +56,24 @@ def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled) -> 
 
 
 @pytest.mark.slow
+def test_gaps_between_two_samples_that_see_particles_are_seen_by_what_supports_cover() -> None:
+    """Two particles behind one another, half of a first sample apart: both resolutions that are compared miss the gap."""
+    rng, support, step = np.random.default_rng(0), 0.2, 2.2 / 24
+    across = np.stack(np.meshgrid([-0.6, 0, 0.6], [-0.6, 0, 0.6]), -1).reshape(-1, 2)
+    near = np.column_stack([across, rng.uniform(-0.5, -0.4, 9)])
+    far = near + np.column_stack([np.zeros((9, 2)), 2 * support + rng.uniform(0.4, 0.8, 9) * step])
+    look = js.TransferFunction.from_points([0.0, 1.0], [[1, 0.2, 0], [0, 0.4, 1]], [2.7, 2.7])
+    scene = js.Scene(particles=js.Particles.from_arrays(np.concatenate([near, far]), support, 0.5), transfer=look)
+    camera = js.Camera.look_at((0, 0, 40), (0, 0, 0), fov_degrees=2.6, width=32, height=32, near=38.9, far=38.9 + 24 * step)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        image = js.render(scene, camera, dataclasses.replace(SEGMENTS, samples=48))
+    truth = js.reference.integral(scene, camera)
+    found = np.maximum(np.abs(image.color - truth.color).max(-1), np.abs(image.alpha - truth.alpha))
+    assert found.max() <= SEGMENTS.tolerance
+
+
+@pytest.mark.slow
 def test_a_smaller_tolerance_is_a_smaller_error_for_more_evaluations() -> None:
     scene, camera = frame()
     images = [js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=t)) for t in (0.1, 0.02)]

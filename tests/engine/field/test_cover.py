@@ -115,3 +115,19 @@ def test_no_chord_reaches_over_the_pivot(seed):
             behind = [k for k in outer if inside[item, :k, ray].any()]
             wanted = np.inf if not outer.size else depth[item, behind[0] if behind else outer[-1]]
             assert pivot[item, ray] == wanted
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_length_of_all_chords_in_a_slab_is_measured_where_it_is_asked_for(form):
+    with jax.enable_x64(True):
+        ordered, rank, task = drawn(np.random.default_rng(5), form)
+        found = [chords_of(ordered, rank, task, item) for item in range(TASKS)]
+        at = np.asarray(task.depth)[:, :, None, None]
+        inside = np.stack([((begin < at[item]) & (end > at[item])).any(-1) for item, (begin, end, _) in enumerate(found)])
+        assert covered(ordered, rank, task, jnp.asarray(inside), "quantity").length is None
+        cover = covered(ordered, rank, dataclasses.replace(task, measured=True), jnp.asarray(inside), "quantity")
+        first, last = (np.asarray(task.border)[:, k] for k in (0, -1))
+        for item, (begin, end, _) in enumerate(found):
+            expected = np.clip(np.minimum(end, last[item]) - np.maximum(begin, first[item]), 0, None).sum(-1)
+            looked_at = (~inside[item]).any()
+            np.testing.assert_allclose(cover.length[:, item].sum(0), expected if looked_at else 0, atol=1e-12)
