@@ -111,19 +111,25 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
             return
         again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), signal.SIGTERM))
         again.daemon = True
+        asking.append(again)
         again.start()
 
     mine = own_process and threading.current_thread() is threading.main_thread()
     if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
+    asking: list[threading.Timer] = []
     before, sys.unraisablehook = sys.unraisablehook, lost
     signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        sys.unraisablehook = before
+        try:
+            for again in asking:  # what is done is not to be asked when nobody hears it any more: that would kill the process
+                again.cancel()
+        finally:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            sys.unraisablehook = before
 
 
 def _failed(options: argparse.Namespace, reason: str, code: int) -> int:

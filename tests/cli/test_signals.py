@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -107,6 +108,27 @@ def test_asking_is_heard_while_an_object_is_thrown_away(folder, capsys, monkeypa
     started, hook = time.monotonic(), sys.unraisablehook
     assert cli.main() == 143 and time.monotonic() - started < 50
     assert capsys.readouterr().err.splitlines() == ["jaxsph info: terminated"] and sys.unraisablehook is hook
+
+
+@posix
+def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
+    class Asking:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def work(**_):
+        Asking()
+
+    late = []
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "info", "--cache"])
+    monkeypatch.setattr(cli_cache, "begin", work)
+    monkeypatch.setattr(cli, "AGAIN_SECONDS", 5)
+    assert cli.main() == 0
+    signal.signal(signal.SIGTERM, lambda *_: late.append(True))
+    until = time.monotonic() + 6
+    while time.monotonic() < until and any(type(thread) is threading.Timer for thread in threading.enumerate()):
+        time.sleep(0.05)
+    assert not late
 
 
 @posix
