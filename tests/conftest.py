@@ -33,7 +33,7 @@ QUICKLY = UNOPTIMIZED | {"xla_cpu_parallel_codegen_split_count": 1}
 
 # `dev` tries other examples each time, and what failed before first; `ci` the same ones; `nightly` (`--hypothesis-profile`) ten
 # times as many.
-DEV = hypothesis.settings(deadline=None, max_examples=EXAMPLES, print_blob=True)
+DEV = hypothesis.settings(deadline=None, max_examples=EXAMPLES, print_blob=True, derandomize=False)
 hypothesis.settings.register_profile("dev", DEV)
 hypothesis.settings.register_profile("ci", DEV, derandomize=True)
 hypothesis.settings.register_profile("nightly", DEV, max_examples=10 * EXAMPLES)

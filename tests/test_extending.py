@@ -16,7 +16,7 @@ from jaxsph.model import registry
 
 PAGE = (Path(__file__).parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = {re.match(r"# (\w+)\.py\n", block)[1]: block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)}
-ENTRIES = re.findall(r'`(INTEGRATORS|SCREENS)\["(\w+)"\] = "jaxsph\.\w+\.(\w+:\w+)"`', PAGE)
+ENTRIES = re.findall(r'`(INTEGRATORS|SCREENS)\["(\w+)"\] = "jaxsph\.(?:\w+\.)+(\w+:\w+)"`', PAGE)
 CENTRE, RADIUS, DENSITY, COLOR = (0.1, -0.05, 0.0), 0.6, 1.5, (0.2, 0.5, 0.9)
 
 

@@ -91,7 +91,7 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
     """In a process of its own, as JAX opens its cache once."""
     script = """if True:
         import sys, pathlib, jax, jax.numpy as jnp
-        from jaxsph import cli_cache
+        from jaxsph.cli import cache as cli_cache
         from jaxsph.cli.console import warnings_in_lines
         folder = pathlib.Path(sys.argv[1])
         jax.config.update("jax_compilation_cache_dir", str(folder))

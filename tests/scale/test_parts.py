@@ -8,8 +8,8 @@ import OpenEXR
 import pytest
 
 import jaxsph as js
+from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.planning.measures import Measures
-from jaxsph.scale import parts as tiles
 from jaxsph.scale.parts import cuts
 
 LAYERS = ("color", "transmittance", "depth", "error_bound", "evaluations")
@@ -160,11 +160,11 @@ def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
     scene, camera = view(count=260)
     planned = []
 
-    def stop(seen, camera, settings, plan, *more, **how):
-        planned.append(plan)
+    def stop(work, clock, progress=None):
+        planned.append(work.plan)
         raise InterruptedError
 
-    monkeypatch.setattr(tiles, "image_of", stop)
+    monkeypatch.setattr(Work, "drawn", stop)
     for limit in (None, 1000):
         with pytest.raises((InterruptedError, ValueError)) as ended:
             js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)

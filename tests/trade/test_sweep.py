@@ -115,7 +115,7 @@ def test_estimators_are_those_that_suit_full_rate():
 @pytest.fixture
 def by_reference(monkeypatch):
     """The reference renderer in place of the fast one: nothing is compiled. Gives the settings and sizes it was asked for."""
-    module, calls = importlib.import_module("jaxsph.sweep"), []
+    module, calls = importlib.import_module("jaxsph.trade.sweep"), []
 
     def render(scene, camera, settings, *, plan=None):
         calls.append((settings.tolerance, camera.width))
@@ -169,7 +169,7 @@ def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_
 
 
 def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
-    module = importlib.import_module("jaxsph.sweep")
+    module = importlib.import_module("jaxsph.trade.sweep")
     views = [js.scenes.load("letters", 20, frame, width=8, height=8) for frame in range(3)]
     made, fits = [], module.render
 

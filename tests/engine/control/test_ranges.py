@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.control.ranges import range_tables, transfer_ranges
+from jaxsph.model.transfer.function import look_up
 
-look = jax.jit(lambda transfer, q: jnp.stack(js.model.transfer.look_up(transfer.segments(), q)))
+look = jax.jit(lambda transfer, q: jnp.stack(look_up(transfer.segments(), q)))
 bound = jax.jit(lambda transfer, lo, hi: jnp.stack([jnp.stack(side) for side in transfer_ranges(range_tables(transfer), lo, hi)]))
 
 

@@ -12,7 +12,7 @@ STATM = Path("/proc/self/statm")
 IN_A_NEW_PROCESS = """
 import numpy as np
 from pathlib import Path
-from jaxsph.numerics import free_memory
+from jaxsph.engine.runtime import free_memory
 
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
