@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.camera_paths import read_camera_path, write_camera_path
 from jaxsph.io.damage import DataError
 from jaxsph.io.disk.sort import sort_snapshot
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.images.image_files import read_image, write_image
 from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.images.projections import read_projection, write_projection
+from jaxsph.io.opening.read_scene import read_scene
+from jaxsph.io.saved.camera_paths import read_camera_path, write_camera_path
+from jaxsph.io.saved.transfers import read_transfer, write_transfer
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, labels_of
 from jaxsph.io.settle.points import PointsReport, points_from_table
@@ -29,7 +31,6 @@ from jaxsph.io.settle.quantities import available_quantities
 from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.transfers import read_transfer, write_transfer
 from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.io.volumes.volume_table import VolumeTable
 from jaxsph.model.particles.particles import Particles
@@ -59,6 +60,7 @@ __all__ = [
     "read_particles",
     "read_points",
     "read_projection",
+    "read_scene",
     "read_table",
     "read_transfer",
     "read_volume",

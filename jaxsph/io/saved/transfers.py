@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import naming, regular_file
-from jaxsph.io.json_text import numbers_only, read_json, require_version, write_json
+from jaxsph.io.saved.json_text import numbers_only, read_json, require_version, write_json
 from jaxsph.model.transfer.function import TransferFunction
 
 FORMAT, VERSION = "jaxsph transfer function", 1

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxsph.io.json_text import numbers_only, read_json
+from jaxsph.io.saved.json_text import numbers_only, read_json
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import naming, regular_file
-from jaxsph.io.json_text import read_json, require_version, write_json
+from jaxsph.io.saved.json_text import read_json, require_version, write_json
 from jaxsph.model.camera.camera import Bounded, Camera
 from jaxsph.model.camera.leg import Leg
 from jaxsph.model.camera.path import CameraPath

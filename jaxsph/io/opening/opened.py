@@ -1,0 +1,198 @@
+"""The front door: a file becomes a scene and a camera, as `jaxsph render FILE` shows it.
+
+Flow: file -> [load] -> Loaded -> [staged: look, exposure, view] -> Opened: Scene, Camera, Labels, what was chosen.
+
+The look comes first, with the extinction of typical columns; then the view is framed by what that look lights up; then extinction
+is fitted to the picture itself (`jaxsph.model.preview.exposure`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.formats import find_format, read_with
+from jaxsph.io.opening.looks import by_logarithm, look_of
+from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.views import Said, camera_and_clip, place_of
+from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
+from jaxsph.io.settle.labels import Labels, can_name, labels_of
+from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.settle.selection import chosen
+from jaxsph.io.table import ParticleTable
+from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import both
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.preview.exposure import exposure
+from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.volume import Volume
+
+NEEDS_ROWS = ("face-on", "edge-on")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Loaded:
+    """What a file gives to a picture: particles or a volume.
+
+    Attributes:
+        path: the file; empty of what was made in memory.
+        shown: the particles or the volume.
+        quantity: full name of what colours are looked up by.
+        opacity_by: full name of what extinction is looked up by, where that is another.
+        table: of the particles that are shown, where there is one.
+        report: how the particles were settled.
+        said: what was chosen, for people: pairs of a word and a sentence.
+    """
+
+    path: str
+    shown: Particles | Volume
+    quantity: str
+    opacity_by: str | None = None
+    table: ParticleTable | None = None
+    report: Report | None = None
+    said: tuple[tuple[str, str], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Opened:
+    """A picture before it is rendered.
+
+    Attributes:
+        scene: with its look and its clips.
+        camera: framed.
+        labels: for a key.
+        said: what was chosen, for people: pairs of a word and a sentence.
+    """
+
+    scene: Scene
+    camera: Camera
+    labels: Labels
+    said: tuple[tuple[str, str], ...]
+
+
+def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
+    """The particles or the volume of a file (host side).
+
+    Args:
+        path: a file of particles or of a volume, see `jaxsph.io.read_table` and `read_volume`.
+        source: which of it; None chooses.
+        look: by which it will be shown: where that says all of it, opacity has no quantity of its own unless it is named.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: what cannot be read, or options that the file does not suit; the message names the file.
+        ImportError: a library that the format needs is not installed.
+    """
+    source, look, file = source or Source(), look or Look(), Path(path)
+    if is_volume(path):
+        if source.of_particles:
+            raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
+        volume, name = volume_from_table(read_volume_table(path), source.color_by)
+        return Loaded(str(path), volume, name)
+    table = read_with(find_format(file), file, source.part_type)
+    opacity_by = source.opacity_by or (None if look.transfer is not None else AUTO)
+    which: dict[str, Any] = {"box": source.box, "where": source.where, "share": source.share}
+    particles, report = particles_from_table(
+        table, source.color_by, source.support, source.kernel, **which, opacity_by=opacity_by
+    )
+    named = None if opacity_by in (None, AUTO) else report.opacity_by
+    particles, renamed = by_logarithm(particles, named)
+    said: Said = []
+    if renamed != named:
+        said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
+        report = dataclasses.replace(report, opacity_by=renamed)
+    return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said))
+
+
+def staged(
+    loaded: Loaded,
+    look: Look | None = None,
+    view: View | None = None,
+    *,
+    source: Source | None = None,
+    beside: Scene | None = None,
+    labels: Labels | None = None,
+) -> Opened:
+    """The scene and the camera of what a file gives.
+
+    Args:
+        loaded: the particles or the volume.
+        look: what was asked for; None chooses all of it.
+        view: likewise.
+        source: by which it was loaded; needed by what looks at masses and velocities of the particles that are shown.
+        beside: volumes and points with looks of their own that share the picture.
+        labels: for a key; None names the quantity by what the file states.
+
+    Raises:
+        ValueError: options that do not suit what is there.
+    """
+    look, view = look or Look(), view or View()
+    transfer, called = look_of(loaded.shown, loaded.quantity, look)
+    scene = _scene_of(loaded.shown, transfer, beside)
+    rows = _rows(loaded, source, view)
+    if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
+        place: Any = place_of(scene, view.center, rows)
+        scene = dataclasses.replace(scene, particles=loaded.shown.centered(place))
+        view = dataclasses.replace(view, center=tuple(place))
+    camera, clip, said = camera_and_clip(scene, view, rows)
+    scene = dataclasses.replace(scene, within=both(scene.within, clip))
+    scene = exposed(scene, camera, look)
+    transfer = scene.looks[0]
+    span = f"{float(transfer.values[0]):.6g} .. {float(transfer.values[-1]):.6g}"
+    said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
+    return Opened(scene, camera, labels or _labels(loaded), tuple(said))
+
+
+def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
+    """The scene with the extinction of its first look fitted to the picture, as far as the look leaves that open."""
+    own = look.transfer is not None or look.optical_depth is not None
+    factor = (1.0 if own else exposure(glimpse(scene, camera))) * 2.0**look.exposure
+    if factor == 1.0:
+        return scene
+    name = "transfer" if scene.particles is not None else "volume_transfer"
+    value = getattr(scene, name)
+    made: Any = _scaled(value, factor) if not isinstance(value, tuple) else (_scaled(value[0], factor), *value[1:])
+    return dataclasses.replace(scene, **{name: made})
+
+
+def _scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
+    return dataclasses.replace(transfer, extinction=transfer.extinction * np.asarray(factor, transfer.extinction.dtype))
+
+
+def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:
+    """What is shown, and what shares its picture."""
+    more = Scene() if beside is None else beside
+    if isinstance(shown, Particles):
+        return dataclasses.replace(more, particles=shown, transfer=transfer)
+    looks = ((shown, transfer), *more.volumes)
+    volumes, transfers = zip(*looks, strict=True)
+    return dataclasses.replace(more, volume=tuple(volumes), volume_transfer=tuple(transfers))
+
+
+def _rows(loaded: Loaded, source: Source | None, view: View) -> ParticleTable | None:
+    """The rows of the table that are shown, where masses and velocities are looked at; else the table, for its units."""
+    table = loaded.table
+    if table is None or not (view.view in NEEDS_ROWS or view.center == "mass"):
+        return table
+    source = source or Source()
+    which: dict[str, Any] = {"box": source.box, "where": source.where, "share": source.share}
+    return chosen(table, "x", source.support, source.kernel, **which)
+
+
+def _labels(loaded: Loaded) -> Labels:
+    """What a key says, in units as far as the file states them and they can be named."""
+    if loaded.table is None or not can_name():
+        return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)
+    values = np.asarray(loaded.shown.quantity, np.float64)[np.asarray(loaded.shown.valid)]  # type: ignore[union-attr]
+    largest = float(np.abs(values).max(initial=0)) or 1.0
+    if loaded.quantity.lower().startswith(LOG_PREFIX) and values.size:
+        largest = 10.0 ** float(values.max())
+    made = labels_of(loaded.table, loaded.quantity, largest)
+    return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)

@@ -1,0 +1,220 @@
+r"""Framing by what is seen: the central part of the light of a picture fills most of it, whatever lies far outside.
+
+Flow: Scene, direction -> [frame: Glimpse by Glimpse] -> Camera.
+
+A first camera shows the bulk of the particles. Of a coarse picture (`glimpse`) the box that holds the central 99 % of alpha is
+taken; the camera is moved sideways and back such that the box fills 87 % of the picture, and looks again. Where
+the light reaches the edge of the picture, it steps back first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.preview.exposure import exposure
+from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.scene import Scene
+
+CENTRAL = 0.99
+FILLED = 0.87
+EDGE = 0.04
+"""Of a side: light that comes so near to an edge goes on beyond it."""
+BULK = (2.0, 98.0)
+"""Percentiles of the particles along each direction that the first camera shows."""
+LOOKS = 6
+STEP_BACK = 1.6
+SETTLED = 0.05
+"""Change of the height by which no further look is taken."""
+NEAREST = 1e-3
+"""Smallest near over far: depths of samples are geometric between them."""
+WIDENED = 1e-3
+"""Of the depths, so that no support touches an end by rounding."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Direction:
+    """How a scene is looked at, but for from where and how near.
+
+    Attributes:
+        axes: (3, 3), rows right, up and forward.
+        fov_degrees: vertical field of view; None is parallel rays.
+        size: width and height in pixels.
+    """
+
+    axes: Float[np.ndarray, "3 3"]
+    fov_degrees: float | None
+    size: tuple[int, int]
+
+    @classmethod
+    def along(cls, forward: object, up: object, fov_degrees: float | None, size: tuple[int, int]) -> Direction:
+        """Of a line of sight and a direction that is upward in the picture.
+
+        Raises:
+            ValueError: an upward direction that is zero or parallel to the line of sight.
+        """
+        ahead, upward = (np.asarray(one, np.float64) for one in (forward, up))
+        ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(ahead, upward)
+        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(upward):
+            raise ValueError(f"`up` = {upward.tolist()} is zero or parallel to the line of sight; choose another")
+        right = right / np.linalg.norm(right)
+        return cls(np.stack([right, np.cross(right, ahead), ahead]), fov_degrees, size)
+
+    def camera(self, middle: np.ndarray, height: float, scene: Scene, reach: float = math.inf) -> Camera:
+        """The camera that shows so much of the height at `middle`; depths are snug to what is in it, within `reach`."""
+        width_pixels, height_pixels = self.size
+        distance = height if self.fov_degrees is None else height / 2 / math.tan(math.radians(self.fov_degrees) / 2)
+        eye, up = middle - self.axes[2] * distance, self.axes[1]
+        near, far = distance / 2, 2 * distance
+        if self.fov_degrees is None:
+            made = Camera.orthographic(eye, middle, up, height, width_pixels, height_pixels, near=near, far=far)
+        else:
+            made = Camera.look_at(eye, middle, up, self.fov_degrees, width_pixels, height_pixels, near=near, far=far)
+        return snug(made, scene, (distance - reach, distance + reach))
+
+
+def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None) -> Camera:
+    """The camera whose picture the central 99 % of the light of a scene fill to 87 % (host side).
+
+    Args:
+        scene: particles and volumes with their looks; where neither is, points or nothing are framed by their bounds.
+        direction: of the line of sight.
+        center: (3,) what is in the middle of the picture, length units; None leaves it to the light.
+    """
+    width_pixels, height_pixels = direction.size
+    aspect = width_pixels / height_pixels
+    middle, height, largest = _first(scene, direction, center)
+    camera = direction.camera(middle, height, scene)
+    for _ in range(LOOKS):
+        seen = glimpse(scene, camera)
+        weights = seen.weights(exposure(seen))
+        alpha = weights.sum(2)
+        if not alpha.any():
+            if height >= largest:
+                break
+            height = min(height * STEP_BACK, largest)
+            camera = direction.camera(middle, height, scene)
+            continue
+        box = np.array([_central(seen.u, alpha.sum(0)), _central(seen.v, alpha.sum(1))])
+        sides = float(camera.half_height) * np.array([aspect, 1.0])
+        beyond = (np.abs(box) > (1 - 2 * EDGE) * sides[:, None]).any()
+        if beyond and height < largest:
+            height = min(height * STEP_BACK, largest)
+            camera = direction.camera(middle, height, scene)
+            continue
+        depth = float((weights * seen.depth).sum() / weights.sum())
+        per_unit = depth if camera.is_perspective else 1.0
+        if center is None:
+            across = box.mean(1) * per_unit
+            middle = camera.exact_eye() + across @ direction.axes[:2] + depth * direction.axes[2]
+            extent = (box[:, 1] - box[:, 0]) * per_unit
+        else:
+            extent = 2 * np.abs(box).max(1) * per_unit
+        before, height = height, max(float(extent[1]), float(extent[0]) / aspect) / FILLED
+        camera = direction.camera(middle, height, scene)
+        if abs(height - before) < SETTLED * before:
+            break
+    return camera
+
+
+def num_outside(scene: Scene, camera: Camera) -> int:
+    """Particles whose middle is not in the picture (host side)."""
+    if scene.particles is None:
+        return 0
+    valid = np.asarray(scene.particles.valid)
+    view = (scene.particles.exact_position()[valid] - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    half = float(camera.half_height) * np.array([camera.width / camera.height, 1.0])
+    reach = view[:, 2:] * half if camera.is_perspective else half
+    return int((np.abs(view[:, :2]) > reach).any(1).sum())
+
+
+def snug(camera: Camera, scene: Scene, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
+    """`camera` with near and far moved to what is in its picture, between two depths; unchanged where nothing is (host side)."""
+    half = float(camera.half_height)
+    sides = np.array([half * camera.width / camera.height, half])
+    ends: list[tuple[float, float]] = []
+    for center, radius in _spheres(scene):
+        view = (center - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+        front, back = view[:, 2] - radius, view[:, 2] + radius
+        reach = np.maximum(back, 0)[:, None] * sides if camera.is_perspective else sides
+        wide = np.sqrt(1 + sides**2) if camera.is_perspective else np.ones(2)
+        shown = (np.abs(view[:, :2]) <= reach + radius[:, None] * wide).all(1) & (back > between[0]) & (front < between[1])
+        if camera.is_perspective:
+            shown &= back > 0
+        if shown.any():
+            ends.append((float(front[shown].min()), float(back[shown].max())))
+    for volume, _ in scene.volumes:
+        depth = (_corners(volume.bounds()) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
+        ends.append((float(depth.min()), float(depth.max())))
+    if not ends:
+        return camera
+    near, far = max(min(front for front, _ in ends), between[0]), min(max(back for _, back in ends), between[1])
+    if camera.is_perspective and far <= 0:
+        return camera
+    if camera.is_perspective:
+        near = max(near, NEAREST * far) * (1 - WIDENED)
+    else:
+        near -= WIDENED * (far - near)
+    far += WIDENED * (far - near)
+    if not near < far:
+        return camera
+    return dataclasses.replace(camera, near=jnp.asarray(near, camera.dtype), far=jnp.asarray(far, camera.dtype))
+
+
+def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tuple[np.ndarray, float, float]:
+    """The middle and height of a first picture, of the bulk of what there is; and the height of all of it."""
+    aspect = direction.size[0] / direction.size[1]
+    lower, upper = scene.bounds()
+    if not (upper > lower).any():
+        lower, upper = lower - 0.5, upper + 0.5
+    corners = _corners((lower, upper)) @ direction.axes.T
+    low, high = corners.min(0), corners.max(0)
+    if center is not None:
+        reach = np.abs(corners - center @ direction.axes.T).max(0)
+        largest = 2 * max(reach[1], reach[0] / aspect) + reach[2]
+    else:
+        largest = max(high[1] - low[1], (high[0] - low[0]) / aspect) * 2
+    if scene.particles is not None and scene.particles.num_particles:
+        valid = np.asarray(scene.particles.valid)
+        local = scene.particles.exact_position()[valid] @ direction.axes.T
+        margin = float(np.median(np.asarray(scene.particles.support, np.float64)[valid]))
+        inner = np.percentile(local, BULK, 0) + np.array([[-margin], [margin]])
+        low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
+    middle = (low + high) / 2 @ direction.axes if center is None else np.asarray(center, np.float64)
+    height = max(high[1] - low[1], (high[0] - low[0]) / aspect)
+    return middle, float(min(height, largest)), float(largest)
+
+
+def _central(places: np.ndarray, light: np.ndarray) -> tuple[float, float]:
+    """Between which coordinates the central part of the light is; light is even within a pixel."""
+    order = np.argsort(places)
+    step = float(abs(places[1] - places[0]))
+    edges = np.append(places[order] - step / 2, places[order[-1]] + step / 2)
+    share = np.append(0, np.cumsum(light[order])) / light.sum()
+    low, high = np.interp([(1 - CENTRAL) / 2, (1 + CENTRAL) / 2], share, edges)
+    return float(low), float(high)
+
+
+def _spheres(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centres and radii of particles and points, without padding; of a periodic set the corners of its box."""
+    found = []
+    if scene.particles is not None and scene.particles.num_particles:
+        if scene.particles.box is not None:
+            found.append((_corners(scene.particles.bounds()), np.zeros(8)))
+        valid = np.asarray(scene.particles.valid)
+        found.append((scene.particles.exact_position()[valid], np.asarray(scene.particles.support, np.float64)[valid]))
+    for points in scene.point_sets:
+        valid = np.asarray(points.valid)
+        found.append((points.exact_position()[valid], np.asarray(points.radius, np.float64)[valid]))
+    return found
+
+
+def _corners(bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    return np.array(list(itertools.product(*zip(*bounds, strict=True))))
