@@ -154,6 +154,18 @@ def pytest_configure(config: pytest.Config) -> None:
 def few_programs() -> Iterator[None]:
     """Compiled programs hold memory maps, of which a process may have only so many."""
     yield
+    _let_go_of_programs()
+
+
+@pytest.fixture(autouse=True)
+def few_programs_of_slow_tests(request: pytest.FixtureRequest) -> Iterator[None]:
+    """The same after each test that takes long: a file of them may compile more than a process can hold."""
+    yield
+    if any(request.node.get_closest_marker(mark) for mark in ("slow", "endurance")):
+        _let_go_of_programs()
+
+
+def _let_go_of_programs() -> None:
     if (memory_maps.in_use() or 0) > MAX_MAPS:
         jax.clear_caches()
 
