@@ -29,7 +29,8 @@ from jaxsph.model.scene import Scene
 
 OBLIQUE = (-0.45, -0.35, -1.0)
 UP = (0.0, 1.0, 0.0)
-FOV_DEGREES = 45.0
+FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
+"""Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75
 """Of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71."""
 NEIGHBOURS = 32
@@ -120,7 +121,7 @@ def direction_of(view: View, table: ParticleTable | None = None, center: np.ndar
         across = np.cross(spin, UP if abs(spin[1]) < 0.9 * np.linalg.norm(spin) else (1.0, 0.0, 0.0))
         forward, upward = (-spin, np.cross(across, spin)) if view.view == "face-on" else (across, spin)
         return Direction.along(forward, upward if view.up is None else view.up, None, view.size)
-    fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
+    fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
     if not 0 < fov < 180:
         raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov:g}; it is the vertical field of view")
     return Direction.along(OBLIQUE, UP if view.up is None else view.up, fov, view.size)

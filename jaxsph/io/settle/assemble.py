@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
-from jaxsph.io.settle.supports import NEIGHBOURS, kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import select
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.particles.particles import Particles
@@ -94,9 +94,9 @@ def particles_from_table(
 ) -> tuple[Particles, Report]:
     r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
-    Supports are `support` if given, else those of the table, else the distance to the 32nd neighbour. Volumes are
-    those of the table, else mass over density where a sample shows that to be the density (`jaxsph.io.settle.stored`), else
-    $1 / \sum_j W(|x_i - x_j|, H_i)$.
+    Supports are `support` if given, else those of the table, else two spacings where particles lie evenly, else the distance
+    to the 32nd neighbour. Volumes are those of the table, else mass over density where a sample shows that to be the density
+    (`jaxsph.io.settle.stored`), else $1 / \sum_j W(|x_i - x_j|, H_i)$.
 
     Args:
         table: what was read.
@@ -254,6 +254,9 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
     if table.support is not None:
         sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
         return table.support.astype(np.float64), sentence
+    spacing = even_spacing(table.position, box=table.box_size)
+    if spacing is not None:
+        return np.full(len(table), SPACINGS * spacing), f"{SPACINGS:g} spacings of {spacing:.4g}, as particles lie evenly"
     origin = f"distance to neighbour {NEIGHBOURS}"
     if len(table) == 1:
         origin = "1, as a single particle has no neighbours"

@@ -35,6 +35,9 @@ LOG_PREFIX = "log10:"
 LOG_DECADES = 2.0
 """Positive quantities that span more decades than this are shown by their logarithm when nobody chose."""
 
+LIQUID = 1.5
+"""Ratio of densities, between the 5th and 95th percentile, up to which they tell less than speeds do."""
+
 Gather = Callable[[], Float[np.ndarray, " particles"]]
 
 
@@ -44,8 +47,8 @@ def choose_quantity(
     """The quantity called `name`, or the most telling one when `name` is `None`.
 
     Without a name, the first of these that the table has and that is not the same for all particles: a concentration
-    or dye, temperature, internal energy, stored density, speed, summed density if it spans more than two decades, the
-    coordinate along the longest extent. Temperature, internal energy and density become `log10:...` when they are
+    or dye, temperature, internal energy, stored density unless it hardly varies and there are velocities, speed, summed
+    density. Temperature, internal energy and density become `log10:...` when they are
     positive and span more than two decades.
 
     Args:
@@ -116,18 +119,25 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
     dyes = [c for c in table.scalars if any(word in plain(c) for word in ("concentration", "dye"))]
     telling = [table.named(*ROLES[role]) for role in ("temperature", "internal_energy", "density")]
     scaled = [name for name in telling if name is not None and table.columns[name].ndim == 1]
-    extent = np.ptp(table.position, axis=0) if len(table) else np.zeros(3)
-    longest = "xyz"[int(np.argmax(extent))]
-    candidates = [*dyes, *scaled, *(["speed"] if velocity_name(table) else []), longest]
-    if candidates == [longest] and density is not None and _spans_decades(density()):
-        return choose_quantity(table, LOG_PREFIX + "density", density=density)
+    speed = ["speed"] if velocity_name(table) else []
+    stored = table.named(*ROLES["density"])
+    if speed and stored in scaled and _hardly_varies(table.columns[stored]):
+        scaled.remove(stored)
+    candidates = [*dyes, *scaled, *speed, *(["density"] if density is not None and stored not in scaled else [])]
+    candidates = candidates or ["z"]
     for candidate in candidates:
         values, full_name = choose_quantity(table, candidate, density=density)
         if len(values) == 0 or values.min() < values.max():
-            if candidate in scaled and _spans_decades(values):
+            if (candidate in scaled or candidate == "density") and _spans_decades(values):
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)
+
+
+def _hardly_varies(values: np.ndarray) -> bool:
+    """Whether a density is that of a liquid, which is nearly the same everywhere."""
+    low, high = np.percentile(values, (5, 95)) if len(values) else (0.0, 0.0)
+    return bool(low > 0 and high < LIQUID * low)
 
 
 def _spans_decades(values: np.ndarray) -> bool:

@@ -2,8 +2,9 @@ r"""Support radii from nearest neighbours, and kernel sums for volumes and densi
 
 Flow: ParticleTable -> [supports] -> Particles.
 
-Many files hold points and nothing more. A support radius that reaches a fixed number of neighbours, and the volume
-$V_i = 1 / \sum_j W(|x_i - x_j|, H_i)$ that goes with it, turn such a set into an SPH field.
+Many files hold points and nothing more. Where they lie about evenly, as those of liquids do, one support of two spacings is
+theirs, so that what splashes off is as small as the rest; where they cluster, a support that reaches a fixed number of
+neighbours. With the volume $V_i = 1 / \sum_j W(|x_i - x_j|, H_i)$ either turns such a set into an SPH field.
 """
 
 from __future__ import annotations
@@ -23,6 +24,16 @@ Sides = tuple[float, float, float]
 NEIGHBOURS = 32
 """Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
 
+SPACINGS = 2.0
+"""Of particles that lie evenly: support over spacing, as codes for liquids have it."""
+EVEN, FEW = 1.45, 9
+"""Ratio of the upper to the lower quartile of distances to the eighth neighbour up to which particles lie evenly, and how many
+there must be to tell; liquids have 1.0 to 1.35, gas that has begun to cluster 1.55."""
+EIGHTH = 2**0.5
+"""Distance to the eighth neighbour on a cubic lattice, over its spacing."""
+SAMPLED = 1 << 14
+"""Particles whose neighbours tell how evenly all lie."""
+
 PAIR_BUDGET = 2**22
 """Pairs looked at in one go: about 100 MB of distances, indices and weights."""
 
@@ -32,6 +43,22 @@ SAMPLED_PARTICLES = 256
 
 SHOW_PROGRESS_FROM = 100_000
 """Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
+
+
+def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | None = None) -> float | None:
+    """Spacing of particles that lie about evenly, length units; None where they cluster, or are too few to tell.
+
+    Args:
+        position: (N, 3), any length unit.
+        box: sides of a periodic box, across whose faces neighbours are found; None for none.
+    """
+    places = in_period(position, box)
+    if len(places) < FEW:
+        return None
+    some = places[:: max(1, len(places) // SAMPLED)]
+    eighth = scipy.spatial.KDTree(places, boxsize=box).query(some, k=FEW, workers=-1)[0][:, -1]
+    low, middle, high = np.percentile(eighth, (25, 50, 75))
+    return float(middle / EIGHTH) if 0 < high <= EVEN * low else None
 
 
 def nearest_neighbour_supports(

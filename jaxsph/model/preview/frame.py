@@ -3,7 +3,7 @@ r"""Framing by what is seen: the central part of the light of a picture fills mo
 Flow: Scene, direction -> [frame: Glimpse by Glimpse] -> Camera.
 
 A first camera shows the bulk of the particles. Of a coarse picture (`glimpse`) the box that holds the central 99 % of alpha is
-taken; the camera is moved sideways and back such that the box fills 87 % of the picture, and looks again. Where
+taken; the camera is moved sideways and back such that the box fills 88 % of the picture, and looks again. Where
 the light reaches the edge of the picture, it steps back first.
 """
 
@@ -23,13 +23,13 @@ from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
 
 CENTRAL = 0.99
-FILLED = 0.87
+FILLED = 0.88
 EDGE = 0.04
 """Of a side: light that comes so near to an edge goes on beyond it."""
 BULK = (2.0, 98.0)
 """Percentiles of the particles along each direction that the first camera shows."""
-LOOKS = 6
-STEP_BACK = 1.6
+STEPS_BACK, LOOKS = 5, 3
+STEP_BACK = 1.5
 SETTLED = 0.05
 """Change of the height by which no further look is taken."""
 NEAREST = 1e-3
@@ -81,7 +81,7 @@ class Direction:
 
 
 def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None) -> Camera:
-    """The camera whose picture the central 99 % of the light of a scene fill to 87 % (host side).
+    """The camera whose picture the central 99 % of the light of a scene fill to 88 % (host side).
 
     Args:
         scene: particles and volumes with their looks; where neither is, points or nothing are framed by their bounds.
@@ -92,23 +92,20 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
     aspect = width_pixels / height_pixels
     middle, height, largest = _first(scene, direction, center)
     camera = direction.camera(middle, height, scene)
-    for _ in range(LOOKS):
+    for nth in range(STEPS_BACK + LOOKS):
         seen = glimpse(scene, camera)
         weights = seen.weights(exposure(seen))
         alpha = weights.sum(2)
-        if not alpha.any():
-            if height >= largest:
-                break
-            height = min(height * STEP_BACK, largest)
-            camera = direction.camera(middle, height, scene)
-            continue
-        box = np.array([_central(seen.u, alpha.sum(0)), _central(seen.v, alpha.sum(1))])
         sides = float(camera.half_height) * np.array([aspect, 1.0])
-        beyond = (np.abs(box) > (1 - 2 * EDGE) * sides[:, None]).any()
-        if beyond and height < largest:
+        light = alpha.any()
+        box = np.array([_central(seen.u, alpha.sum(0)), _central(seen.v, alpha.sum(1))]) if light else np.zeros((2, 2))
+        beyond = not light or bool((np.abs(box) > (1 - 2 * EDGE) * sides[:, None]).any())
+        if beyond and height < largest and nth < STEPS_BACK:
             height = min(height * STEP_BACK, largest)
             camera = direction.camera(middle, height, scene)
             continue
+        if not light:
+            break
         depth = float((weights * seen.depth).sum() / weights.sum())
         per_unit = depth if camera.is_perspective else 1.0
         if center is None:

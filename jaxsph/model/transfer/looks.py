@@ -52,17 +52,27 @@ RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "s
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`."""
+    """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`.
+
+    Of a map that begins in black only what lies above the share `lift` is taken: nothing is lost on a dark background.
+    """
 
     colormap: str
     domain: str
     ramp: Ramp
     both_ways: Ramp | None = None
+    lift: float = 0.0
+
+    def colors(self) -> np.ndarray:
+        """Of the map, (K, 3)."""
+        rows = colormap(self.colormap)
+        place = np.linspace(self.lift, 1, len(rows)) * (len(rows) - 1)
+        return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
 
 
 PRESETS: dict[str, Preset] = {
-    "fluid": Preset("viridis", "linear", _rising(STEEPNESS)),
-    "density": Preset("heat", "log", _rising(3, 0)),
+    "fluid": Preset("viridis", "linear", _rising(STEEPNESS, 0.35), lift=0.25),
+    "density": Preset("heat", "log", _rising(3, 0), lift=0.25),
     "temperature": Preset("coolwarm", "log", _rising(STEEPNESS)),
     "velocity": Preset("coolwarm", "linear", _rising(STEEPNESS, 0), lambda place: np.abs(2 * place - 1) ** 1.5),
     "magnetic": Preset("ice", "log", _rising(STEEPNESS)),
@@ -202,7 +212,8 @@ def preset(
         elif (domain == "percentile" and values) or (domain == "log" and not over_decades):
             domain = "linear"
     control = control_values(domain, quantity, **given, points=points)
-    made = TransferFunction.from_colormap(colormap_name or chosen.colormap, control, ramp(np.linspace(0, 1, points)))
+    colors = colormap_name or chosen.colors()
+    made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 
 

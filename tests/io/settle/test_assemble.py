@@ -45,10 +45,19 @@ def test_a_given_support_may_differ_between_particles_but_not_in_number():
         io.particles_from_table(ParticleTable(position), "x", np.ones(3))
 
 
-def test_without_support_the_nearest_neighbours_give_it():
-    particles, report = io.particles_from_table(ParticleTable(position), "x")
-    np.testing.assert_allclose(there(particles.support), io.nearest_neighbour_supports(position), rtol=1e-6)
+def test_without_support_the_nearest_neighbours_give_it_where_particles_cluster():
+    clustered = position**4
+    particles, report = io.particles_from_table(ParticleTable(clustered), "x")
+    np.testing.assert_allclose(there(particles.support), io.nearest_neighbour_supports(clustered), rtol=1e-6)
     assert report.support == "distance to neighbour 32"
+
+
+def test_without_support_particles_that_lie_evenly_have_one_of_two_spacings():
+    lattice = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), -1).reshape(-1, 3)
+    splash = np.array([[2.0, 2.0, 40.0]])
+    particles, report = io.particles_from_table(ParticleTable(np.concatenate([lattice, splash])), "x")
+    np.testing.assert_allclose(particles.to_numpy()["support"], 2.0, rtol=1e-6)
+    assert report.support == "2 spacings of 1, as particles lie evenly"
 
 
 def test_the_volume_is_mass_over_density_where_both_are_there():

@@ -100,6 +100,8 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"density": one_to_three, "Temperature": one_to_three}, "Temperature"),
         ({"density": one_to_three, "InternalEnergy": 10.0 ** (2 * one_to_three)}, "log10:InternalEnergy"),
         ({"density": one_to_three, "velocity": velocity}, "density"),
+        ({"density": 1000 + one_to_three, "velocity": velocity}, "speed"),
+        ({"density": 1000 + one_to_three}, "density"),
         ({"density": 10.0 ** (2 * one_to_three)}, "log10:density"),
         ({"density": np.ones(3), "velocity": velocity}, "speed"),
         ({"velocity": velocity}, "speed"),
@@ -110,8 +112,8 @@ def test_without_a_name_the_most_telling_quantity_is_picked(columns, expected):
     assert choose_quantity(table(**columns))[1] == expected
 
 
-def test_bare_points_are_shown_by_density_only_where_they_cluster():
-    assert choose_quantity(table(), density=lambda: one_to_three)[1] == "z"
+def test_bare_points_are_shown_by_density_and_its_logarithm_where_they_cluster():
+    assert choose_quantity(table(), density=lambda: one_to_three)[1] == "density"
     assert choose_quantity(table(), density=lambda: 10.0 ** (2 * one_to_three))[1] == "log10:density"
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.io.settle import supports
-from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.supports import even_spacing, kernel_sum, nearest_neighbour_supports
 from jaxsph.model.particles import kernels
 
 
@@ -143,3 +143,19 @@ def test_supports_that_reach_more_pairs_than_can_be_summed_are_refused(monkeypat
     with pytest.raises(ValueError, match=r"supports reach about 200 particles each, 40000 pairs.* give smaller supports"):
         kernel_sum(position, np.full(200, 2.0))
     assert (kernel_sum(position, np.full(200, 0.05)) > 0).all()
+
+
+@given(st.floats(0, 0.2), st.floats(-6, 6), st.booleans())
+def test_a_jittered_lattice_lies_evenly_whatever_its_spacing(jitter, decades, periodic):
+    spacing, rng = 10.0**decades, np.random.default_rng(0)
+    lattice = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)
+    position = spacing * (lattice + jitter * rng.uniform(-1, 1, lattice.shape))
+    found = even_spacing(position, box=(8 * spacing,) * 3 if periodic else None)
+    assert found == pytest.approx(spacing, rel=0.3)
+
+
+def test_clusters_and_a_few_particles_do_not_lie_evenly():
+    rng = np.random.default_rng(0)
+    halo = rng.normal(size=(2000, 3)) * rng.lognormal(0, 1.5, (2000, 1))
+    assert even_spacing(halo) is None and even_spacing(halo[:8]) is None
+    assert even_spacing(np.zeros((50, 3))) is None and even_spacing(np.zeros((0, 3))) is None

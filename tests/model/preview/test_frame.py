@@ -1,0 +1,90 @@
+"""Framing: what is lit fills most of the picture, and stray particles do not rule it."""
+
+import numpy as np
+import pytest
+from examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxsph as js
+from jaxsph.model.preview.exposure import exposure
+from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug
+from jaxsph.model.preview.glimpse import glimpse
+
+OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
+LIT = 24 / 255
+
+
+def scene_of(position, support):
+    particles = js.Particles.from_arrays(position, support, np.zeros(len(position)), 1.0)
+    return js.Scene(particles=particles, transfer=js.TransferFunction.from_points([-1, 1], np.ones((2, 3)), [1.0, 1.0]))
+
+
+def block(size=1.0, sides=(1.0, 1.0, 1.0), count=2000):
+    return size * np.random.default_rng(0).random((count, 3)) * sides
+
+
+def filled(scene, camera):
+    """Longest side of what is lit, over that of the picture."""
+    seen = glimpse(scene, camera, 60)
+    rows, columns = np.nonzero(seen.picture(exposure(seen)).max(-1) > LIT)
+    return max((np.ptp(rows) + 1) / len(seen.v), (np.ptp(columns) + 1) / len(seen.u))
+
+
+@examples(12)
+@given(
+    st.floats(-3, 4),
+    st.tuples(*[st.sampled_from([0.2, 1.0])] * 3),
+    st.sampled_from([None, 30.0, 90.0]),
+    st.sampled_from([(64, 64), (96, 48), (48, 96)]),
+)
+def test_a_block_fills_the_picture_whatever_its_size_and_shape(decades, sides, fov, size):
+    scene = scene_of(block(10.0**decades, sides), 0.12 * 10.0**decades)
+    camera = fitted(scene, Direction.along(OBLIQUE, UP, fov, size))
+    assert 0.75 <= filled(scene, camera) <= 1.0
+
+
+@pytest.mark.parametrize("far", [10, 1000])
+def test_stray_particles_do_not_rule_the_frame_and_are_counted(far):
+    position = np.concatenate([block(), far * np.eye(3)])
+    scene = scene_of(position, 0.12)
+    camera = fitted(scene, Direction.along(OBLIQUE, UP, 30.0, (64, 64)))
+    assert filled(scene, camera) >= 0.75 and num_outside(scene, camera) >= 2
+
+
+def test_one_large_support_does_not_rule_the_frame():
+    position, support = block(), np.full(2000, 0.12)
+    support[0] = 50.0
+    particles = js.Particles.from_arrays(position, support, np.zeros(2000), np.append(1e-9, np.ones(1999)))
+    look = js.TransferFunction.from_points([-1, 1], np.ones((2, 3)), [1.0, 1.0])
+    camera = fitted(js.Scene(particles=particles, transfer=look), Direction.along(OBLIQUE, UP, 30.0, (64, 64)))
+    assert np.isfinite(np.asarray(camera.eye)).all() and float(camera.near) < float(camera.far)
+
+
+def test_the_middle_that_is_asked_for_stays_in_the_middle():
+    scene = scene_of(block(), 0.12)
+    center = np.array([0.2, 0.5, 0.8])
+    camera = fitted(scene, Direction.along(OBLIQUE, UP, 30.0, (64, 64)), center)
+    view = np.asarray(camera.axes, np.float64) @ (center - camera.exact_eye())
+    assert np.abs(view[:2]).max() < 1e-5 * view[2] and num_outside(scene, camera) < 20
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_particles_and_none_have_a_camera(count):
+    scene = scene_of(np.random.default_rng(1).random((count, 3)), np.full(count, 0.3))
+    camera = fitted(scene, Direction.along(OBLIQUE, UP, 30.0, (64, 64)))
+    assert 0 < float(camera.near) < float(camera.far) and np.isfinite(np.asarray(camera.eye)).all()
+
+
+def test_depths_are_those_of_what_is_in_the_picture():
+    position = np.array([[0.0, 0, 0], [0, 0, 4], [90, 0, 30]])
+    camera = js.Camera.look_at((0, 0, -2), (0, 0, 0), fov_degrees=30, near=1e-3, far=1.0, width=8, height=8)
+    made = snug(camera, scene_of(position, 0.5))
+    assert float(made.near) == pytest.approx(1.5, rel=3e-3) and float(made.far) == pytest.approx(6.5, rel=3e-3)
+    near, far = (float(end) for end in (snug(camera, scene_of(position, 0.5), (1.8, 3.0)).near, made.far))
+    assert near >= 1.79 and far <= 6.6
+
+
+def test_an_upward_direction_along_the_line_of_sight_is_refused():
+    with pytest.raises(ValueError, match="parallel to the line of sight"):
+        Direction.along((0, 0, 1), (0, 0, 1), None, (8, 8))

@@ -1,0 +1,74 @@
+"""A coarse picture is an unbiased likeness of the reference: same light, same place, whatever the projection."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model.preview.glimpse import glimpse
+
+RAYS = 16
+
+
+def ball(count=4000, second=False):
+    rng = np.random.default_rng(0)
+    position = rng.normal(size=(count, 3))
+    position *= (rng.random((count, 1)) ** (1 / 3)) / np.linalg.norm(position, axis=1, keepdims=True)
+    quantity = position[:, 0]
+    return js.Particles.from_arrays(position, 0.25, (quantity, position[:, 1]) if second else quantity, 4.19 / count)
+
+
+COLORS = [[1, 0.2, 0], [0.1, 0.4, 1]]
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("second", [False, True])
+@pytest.mark.parametrize("clipped", [False, True])
+def test_its_mean_colour_is_that_of_the_reference(projection, second, clipped):
+    particles = ball(second=second)
+    own = {"extinction_values": [-1.0, 1.0]} if second else {}
+    look = js.TransferFunction.from_points([-1, 1], COLORS, [0.5, 2.0], **own)
+    scene = js.Scene(particles=particles, transfer=look, within=js.Sphere((0.2, 0, 0), 0.7) if clipped else None)
+    if projection == "perspective":
+        camera = js.Camera.look_at((0.5, 0.4, 3), (0, 0, 0), width=RAYS, height=RAYS, near=1.5, far=4.6)
+    else:
+        camera = js.Camera.orthographic((0.5, 0.4, 3), (0, 0, 0), view_height=2.6, width=RAYS, height=RAYS, near=1.5, far=4.6)
+    seen = glimpse(scene, camera, rays=RAYS, steps=64)
+    truth = js.reference.render(scene, camera, js.Settings(samples=64))
+    assert np.abs(seen.picture() - np.asarray(truth.color)).mean() < 0.02
+    assert np.abs(seen.picture() - np.asarray(truth.color)).max() < 0.35
+    assert abs(seen.weights().sum(2).mean() - np.asarray(truth.alpha).mean()) < 0.01
+
+
+def test_its_volumes_are_those_of_the_reference():
+    values = np.random.default_rng(0).random((6, 5, 4)).astype(np.float32)
+    volume = js.Volume.from_array(values, (-1, -1, -1), 0.5)
+    scene = js.Scene(volume=volume, volume_transfer=js.TransferFunction.from_points([0, 1], COLORS, [0.2, 1.5]))
+    camera = js.Camera.framing(volume, width=RAYS, height=RAYS)
+    seen = glimpse(scene, camera, rays=RAYS, steps=64)
+    truth = js.reference.render(scene, camera, js.Settings(samples=64))
+    assert np.abs(seen.picture() - np.asarray(truth.color)).mean() < 0.02
+
+
+def test_scaling_extinction_is_scaling_the_transfer_function():
+    particles = ball(500)
+    looks = [js.TransferFunction.from_points([-1, 1], COLORS, [0.5 * f, 2.0 * f]) for f in (1, 3)]
+    camera = js.Camera.framing(particles, width=RAYS, height=RAYS)
+    one, three = (glimpse(js.Scene(particles=particles, transfer=look), camera, RAYS) for look in looks)
+    np.testing.assert_allclose(one.picture(3), three.picture(), atol=1e-9)
+    assert (one.optical_depth * 3 == pytest.approx(three.optical_depth, rel=1e-6)) and one.weights(3).sum(2).max() <= 1
+
+
+def test_a_camera_inside_of_the_particles_and_one_that_sees_nothing_are_fine():
+    particles = ball(500)
+    scene = js.Scene(particles=particles, transfer=js.TransferFunction.from_points([-1, 1], COLORS, [0.5, 2.0]))
+    inside = js.Camera.look_at((0, 0, 0), (1, 0, 0), width=24, height=12, near=0.01, far=2)
+    away = js.Camera.look_at((9, 0, 0), (99, 0, 0), width=24, height=12, near=0.01, far=2)
+    seen = glimpse(scene, inside, RAYS)
+    assert seen.optical_depth.shape == (8, 16) and (seen.optical_depth > 0).all() and np.isfinite(seen.picture()).all()
+    assert not glimpse(scene, away, RAYS).optical_depth.any()
+
+
+def test_nothing_is_dark():
+    empty = js.Particles.from_arrays(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    scene = js.Scene(particles=empty, transfer=js.TransferFunction.from_points([-1, 1], COLORS, [0.5, 2.0]))
+    assert not glimpse(scene, js.Camera.framing(empty, width=8, height=8), RAYS).picture().any()
