@@ -1,0 +1,209 @@
+"""The front door: what a file becomes with no options, and with those of a figure."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.io.opening.opened import load, staged
+from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.views import length_of
+from jaxsph.io.units import LENGTH, CodeUnit
+
+h5py = pytest.importorskip("h5py")
+
+KPC = 3.0857e21
+SIZE = (48, 32)
+
+
+def disc(count=3000):
+    """A turning disc in the x-z plane about (3, 2, 1), and one particle far away."""
+    rng = np.random.default_rng(0)
+    radius, angle = rng.exponential(1.0, count), rng.uniform(0, 2 * np.pi, count)
+    flat = np.stack([radius * np.cos(angle), 0.05 * rng.normal(size=count), radius * np.sin(angle)], 1)
+    turning = np.stack([-np.sin(angle), 0 * angle, np.cos(angle)], 1)
+    density = 1e3 * np.exp(-3 * radius)
+    position = flat + (3.0, 2.0, 1.0)
+    position[-1] = (3.0, 2.0, 500.0)
+    return {
+        "Coordinates": position,
+        "Velocities": turning,
+        "Masses": np.ones(count),
+        "Density": density,
+        "SmoothingLength": 0.1 + 0.3 * radius,
+        "InternalEnergy": 1 + radius,
+    }
+
+
+def snapshot(path, columns, **header):
+    """A Gadget-like file, with lengths in kpc."""
+    with h5py.File(path, "w") as file:
+        file.create_group("Header").attrs.update({"Time": 0.5, "MassTable": np.zeros(6), **header})
+        for name, values in columns.items():
+            file[f"PartType0/{name}"] = values
+        scalings = {"length_scaling": 1.0, "mass_scaling": 0.0, "velocity_scaling": 0.0, "a_scaling": 0.0, "h_scaling": 0.0}
+        file["PartType0/Coordinates"].attrs.update(scalings | {"to_cgs": KPC})
+    return path
+
+
+@pytest.fixture(scope="module")
+def galaxy(tmp_path_factory):
+    return snapshot(tmp_path_factory.mktemp("galaxy") / "disc.hdf5", disc())
+
+
+def middle(camera, scene):
+    """The place in the middle of the picture, at the depth of the disc."""
+    forward = np.asarray(camera.axes, np.float64)[2]
+    return camera.exact_eye() + forward * ((np.array([3.0, 2.0, 1.0]) - camera.exact_eye()) @ forward)
+
+
+def test_with_no_options_the_disc_fills_the_picture(galaxy):
+    scene, camera = js.io.read_scene(galaxy, size=SIZE)
+    image = js.render(scene, camera)
+    brightest = np.asarray(image.color).max(-1)
+    rows, columns = np.nonzero(brightest > 24 / 255)
+    assert max(np.ptp(rows) / SIZE[1], np.ptp(columns) / SIZE[0]) > 0.6
+    assert np.percentile(brightest, 99) > 0.5
+    assert np.abs(middle(camera, scene) - (3, 2, 1)).max() < 1.0
+    assert scene.particles.extinction_quantity is not None
+
+
+def test_what_was_chosen_is_said(galaxy):
+    said = dict(staged(load(galaxy), view=View(size=SIZE)).said)
+    assert "temperature" in said["colours"] and "InternalEnergy" in said["colours"]
+    assert "of 3,000 particles lie outside of the picture" in said["frame"]
+
+
+@pytest.mark.parametrize("view", ["x", "y", "z", "iso", "face-on", "edge-on"])
+def test_a_width_is_that_of_the_picture_in_every_view(galaxy, view):
+    scene, camera = js.io.read_scene(galaxy, center=(3, 2, 1), width="2 kpc", view=view, size=SIZE)
+    away = np.linalg.norm(np.array([3, 2, 1]) - camera.exact_eye()) if camera.is_perspective else 1.0
+    across = 2 * float(camera.half_height) * away * SIZE[0] / SIZE[1]
+    assert across == pytest.approx(2.0, rel=1e-5)
+    np.testing.assert_allclose(middle(camera, scene), (3, 2, 1), atol=1e-4)
+    assert scene.within is not None
+
+
+def test_face_on_looks_along_the_axis_and_edge_on_across_it(galaxy):
+    _, face = js.io.read_scene(galaxy, view="face-on", center="mass", size=SIZE)
+    _, edge = js.io.read_scene(galaxy, view="edge-on", center="densest", size=SIZE)
+    assert abs(float(face.axes[2, 1])) > 0.999
+    assert abs(float(edge.axes[2, 1])) < 0.05 and abs(float(edge.axes[1, 1])) > 0.999
+
+
+def test_the_densest_place_is_the_middle_of_the_disc(galaxy):
+    scene, camera = js.io.read_scene(galaxy, center="densest", width=1.0, view="y", size=SIZE)
+    assert np.abs(middle(camera, scene) - (3, 2, 1)).max() < 0.3
+
+
+def test_clips_that_are_given_stand_instead_of_that_of_the_width(galaxy):
+    everything, _ = js.io.read_scene(galaxy, center=(3, 2, 1), width=2, clips=(), size=SIZE)
+    half, _ = js.io.read_scene(galaxy, clips=(js.Plane((3, 2, 1), (1, 0, 0)),), size=SIZE)
+    assert everything.within is None and half.within is not None
+
+
+def test_everything_is_in_the_frame_where_that_is_asked_for(galaxy):
+    _, camera = js.io.read_scene(galaxy, frame_all=True, size=SIZE)
+    view = (np.array([[3.0, 2.0, 500.0]]) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    assert (np.abs(view[0, :2]) < view[0, 2] * float(camera.half_height) * np.array([1.5, 1])).all()
+
+
+def test_named_opacity_over_decades_is_by_its_logarithm(galaxy):
+    loaded = load(galaxy, Source(color_by="InternalEnergy", opacity_by="Density"))
+    assert loaded.opacity_by == "log10:Density"
+    np.testing.assert_allclose(
+        np.asarray(loaded.shown.extinction_quantity)[:3000], np.log10(disc()["Density"]).clip(-30), rtol=1e-4, atol=1e-3
+    )
+    assert "logarithm of Density" in dict(loaded.said)["opacity"]
+    assert load(galaxy, Source(opacity_by="InternalEnergy")).opacity_by in (None, "InternalEnergy")
+
+
+def test_stops_of_exposure_double_extinction(galaxy):
+    plain, _ = js.io.read_scene(galaxy, size=SIZE)
+    brighter, _ = js.io.read_scene(galaxy, exposure=2, size=SIZE)
+    np.testing.assert_allclose(brighter.transfer.extinction, 4 * np.asarray(plain.transfer.extinction), rtol=1e-6)
+
+
+def test_a_transfer_function_that_is_given_stays_as_it_is(galaxy, tmp_path):
+    look = js.TransferFunction.from_points([1, 4], [[1, 0, 0], [0, 0, 1]], [0.1, 2.0])
+    look.save(tmp_path / "look.json")
+    for given in (look, tmp_path / "look.json"):
+        scene, _ = js.io.read_scene(galaxy, transfer=given, size=SIZE)
+        np.testing.assert_allclose(scene.transfer.extinction, [0.1, 2.0], rtol=1e-6)
+        assert scene.particles.extinction_quantity is None
+
+
+def test_conditions_and_shares_choose_particles(galaxy):
+    scene, _ = js.io.read_scene(galaxy, where="InternalEnergy < 2", size=SIZE)
+    assert 0 < scene.particles.num_particles < 3000
+
+
+def test_a_periodic_box_is_centred_where_it_is_asked_for(tmp_path):
+    rng = np.random.default_rng(0)
+    position = np.mod(0.05 * rng.normal(size=(800, 3)), 1.0)
+    columns = {"Coordinates": position, "SmoothingLength": np.full(800, 0.05), "Density": np.ones(800), "Masses": np.ones(800)}
+    path = snapshot(tmp_path / "box.hdf5", columns, BoxSize=1.0)
+    for center in ((0.0, 0.0, 0.0), "mass", "densest"):
+        scene, camera = js.io.read_scene(path, center=center, width=0.5, view="z", size=SIZE)
+        assert np.abs((middle_of(scene) + 0.5) % 1 - 0.5).max() < 0.1
+        assert np.asarray(js.render(scene, camera).alpha)[16, 24] > 0.5
+
+
+def middle_of(scene):
+    lower, upper = scene.particles.bounds()
+    return (lower + upper) / 2
+
+
+def test_a_volume_is_framed_and_exposed(tmp_path):
+    values = np.zeros((24, 24, 24), np.float32)
+    values[6:12, 6:12, 6:12] = np.random.default_rng(0).random((6, 6, 6)) + 0.5
+    np.save(tmp_path / "scan.npy", values)
+    scene, camera = js.io.read_scene(tmp_path / "scan.npy", size=SIZE)
+    alpha = np.asarray(js.render(scene, camera).alpha)
+    assert np.percentile(alpha, 99) > 0.8 and (alpha > 0.1).mean() > 0.2
+
+
+BAD = [
+    ({"width": 0}, "`width` must be > 0"),
+    ({"width": "3 furlongs"}, "furlongs"),
+    ({"width": "3 K"}, "does not agree"),
+    ({"width": "wide"}, "`width` must be a length"),
+    ({"center": (0, 0, 1e9)}, "outside of everything"),
+    ({"center": "middle"}, "`center` must be x, y and z"),
+    ({"view": "top"}, "`view` must be one of"),
+    ({"target": (0, 0, 0)}, "`target` needs `eye`"),
+    ({"eye": (9, 9, 9), "width": 3}, "exclude each other"),
+    ({"view": "x", "fov_degrees": 30}, "parallel"),
+    ({"frame_all": True, "width": 3}, "exclude each other"),
+    ({"norm": "logarithmic"}, "`norm` must be one of"),
+    ({"range": (3, 1)}, "ascend"),
+    ({"exposure": 99}, "stops"),
+    ({"optical_depth": -1}, "`optical_depth` must be > 0"),
+    ({"support": -1}, "`support` must be > 0"),
+    ({"where": "InternalEnergy > 1e9"}, "no particle"),
+    ({"color_by": "Temperatur"}, "there is no quantity"),
+]
+
+
+@pytest.mark.parametrize(("options", "told"), BAD)
+def test_what_makes_no_sense_is_refused_by_name(galaxy, options, told):
+    with pytest.raises(ValueError, match=told):
+        js.io.read_scene(galaxy, **options)
+
+
+def test_an_option_that_there_is_not_is_named(galaxy):
+    with pytest.raises(TypeError, match="'colour'; there are color_by"):
+        js.io.read_scene(galaxy, colour="viridis")
+
+
+def test_a_transfer_function_and_a_colour_map_exclude_each_other():
+    with pytest.raises(ValueError, match="leave out `colormap`"):
+        Look(transfer="look.json", colormap="viridis")
+
+
+def test_lengths_with_units_are_converted_by_what_the_file_states():
+    unit = CodeUnit(KPC, LENGTH)
+    assert length_of("3 Mpc", "width", unit)[0] == pytest.approx(3000, rel=1e-3)
+    assert length_of("30kpc", "width", unit)[0] == pytest.approx(30, rel=1e-3)
+    assert length_of("2.5e1", "width", None) == (25.0, None)
+    with pytest.raises(ValueError, match="does not state"):
+        length_of("3 Mpc", "width", None)
