@@ -22,8 +22,8 @@ ASKED = (
     ("--center densest: the box wraps", DENSE, ["render", "--center", "densest"]),
     ("column density: jaxsph project", DENSE, ["project", "--norm", "log"]),
     ("mean of energy by mass", DENSE, ["project", "--of", "InternalEnergy", "--weight", "mass", "--norm", "log"]),
-    ("--clip-plane", FLUID, ["render", "--clip-plane", "0", "0", "0", "0.4", "0", "-1"]),
-    ("--slice", FLUID, ["render", "--slice", "0", "0", "0", "0", "0", "-1"]),
+    ("--clip plane:...", FLUID, ["render", "--clip", "plane:0,0,0,0.4,0,-1"]),
+    ("jaxsph slice", FLUID, ["slice", "--plane", "0,0,0,0,0,-1"]),
     ("--where 'hypot(x, z) > 0.5'", FLUID, ["render", "--where", "hypot(x, z) > 0.5"]),
     ("--annotate: bar, scale, axes, time", DENSE, ["render", "--annotate"]),
 )

@@ -1,6 +1,6 @@
 """Compiled programs that the command line keeps for the next command, in the user's cache folder.
 
-Flow: cli -> [cli_cache] -> JAX's persistent compilation cache.
+Flow: cli -> [cache] -> JAX's persistent compilation cache.
 
 Where `JAX_COMPILATION_CACHE_DIR` names a folder, that is taken as it is, with all that JAX's own variables say of it.
 """
@@ -16,6 +16,7 @@ from pathlib import Path
 import jax
 import jax.monitoring
 
+from jaxsph.cli.voice import notice
 from jaxsph.engine.runtime.programs import PROGRAMS
 
 CHOSEN_BY_USER = "JAX_COMPILATION_CACHE_DIR"
@@ -40,8 +41,8 @@ def begin(*, keep: bool) -> None:
         jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    notice = _Notice("once, as it is kept for the next command")
-    jax.monitoring.register_event_listener(lambda event, **_: notice() if event == MISS else None)
+    told = _Notice("once, as it is kept for the next command")
+    jax.monitoring.register_event_listener(lambda event, **_: told() if event == MISS else None)
 
 
 def folder() -> Path:
@@ -88,4 +89,4 @@ class _Notice:
     def __call__(self) -> None:
         text, self._text = self._text, None
         if text is not None:
-            print(text, file=sys.stderr, flush=True)
+            notice(text)

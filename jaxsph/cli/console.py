@@ -1,14 +1,12 @@
-"""What the command line tells a person: lines of text, a progress bar, and what it refuses.
+"""What the command line tells a person of what it made: lines of text, a progress bar, and what it refuses.
 
-Flow: particles, camera, image -> [console] -> cli.
+Flow: particles, camera, image -> [console] -> voice.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,37 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.cli.voice import OPTIONS, UsageError, report, result, say, tell
 from jaxsph.io import ParticleTable, Report
 from jaxsph.model import Camera, Image, Settings, registry
 from jaxsph.numerics.checks import Progress
 
 IMAGES = (".exr", ".png")
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
-OPTIONS = {
-    "values": "--range",
-    "low": "the low end of --range",
-    "optical_depth": "--opacity",
-    "fov_degrees": "--fov",
-    "name": "scene:NAME",
-    "num_particles": "--particles",
-}
-"""Options whose names in the library differ."""
-SAME = (
-    *("samples", "tolerance", "relax", "estimator", "integrator", "support", "share", "domain"),
-    *("eye", "target", "up", "frame", "particles"),
-)
-
-
-class UsageError(Exception):
-    """The command line asks for something that makes no sense."""
-
-
-def by_option(message: str) -> str:
-    """A message of the library whose first word is an argument, with the name of its option in place of that."""
-    found = re.match(r"`(\w+)`", message)
-    if found is None or found[1] not in (*OPTIONS, *SAME):
-        return message
-    return OPTIONS.get(found[1], f"--{found[1]}") + message[found.end() :]
 
 
 @contextlib.contextmanager
@@ -59,12 +33,13 @@ def wrong_usage(before: str = "", of: type[Exception] = ValueError) -> Iterator[
         raise UsageError(f"{before}{error}") from error
 
 
-def refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
+def refuse(options: Any, names: Sequence[str], why: str) -> None:
     """Raise `UsageError` where an option is given that is for something else."""
     for name in names:
         given = getattr(options, name, None)
-        if given is not None and given is not False:
-            raise UsageError(f"--{name.replace('_', '-')} {why}")
+        if given is not None and given is not False and given != ():
+            option = OPTIONS.get(name, f"--{name.replace('_', '-')}")
+            raise UsageError(f"{option} {why}")
 
 
 def require_writable(path: Path, must_be: str, suffixes: Sequence[str]) -> None:
@@ -94,19 +69,14 @@ def warnings_in_lines(command: str, hushed: Callable[[str], bool]) -> Iterator[N
         yield
 
 
-def tell(command: str, text: str) -> None:
-    """Print a line on stderr that a command's user should see."""
-    print(f"jaxsph {command}: {' '.join(text.split())}", file=sys.stderr)
-
-
 def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
     """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try."""
     shown = [np.asarray(color, np.float64).reshape(-1, 3) for color in colors]
     dark = [float((color.max(-1) < DARK).mean()) for color in shown if len(color)]
     bright = [float((color.min(-1) > BRIGHT).mean()) for color in shown if len(color)]
     for shares, what, remedy in (
-        (dark, f"darker than {DARK:.0%}", "a larger --opacity, --opacity-by log10:NAME, or another camera"),
-        (bright, f"brighter than {BRIGHT:.0%}", "a smaller --opacity, or another --range or --colormap"),
+        (dark, f"darker than {DARK:.0%}", "a larger --exposure, --opacity-by log10:NAME, or another camera"),
+        (bright, f"brighter than {BRIGHT:.0%}", "a smaller --exposure, or another --range or --colormap"),
     ):
         if shares and min(shares) >= NEARLY_ALL:
             share = f"{min(shares):.4g}"
@@ -136,11 +106,6 @@ def progress(what: str, unit: str = " bands") -> Iterator[Progress | None]:
             bar.update(done - bar.n)
 
         yield show
-
-
-def say(what: str, text: str) -> None:
-    """Print a line with its subject in front."""
-    print(f"{what:<10}{text}")
 
 
 def say_report(report: Report, support: Any = None) -> None:
@@ -174,27 +139,30 @@ def ranges(column: np.ndarray) -> str:
 
 
 def attributes(table: ParticleTable) -> None:
-    """Print the columns of a table: name, shape, type and range."""
+    """Say the columns of a table: name, shape, type and range."""
     for sentence in table.conventions:
-        print(f"  {sentence}")
-    print()
+        result(f"  {sentence}")
+    result("")
     rows = [("attribute", "shape", "type", "range")]
     for name, column in (("position", table.position), *table.columns.items()):
         rows.append((name, " x ".join(map(str, column.shape)), str(column.dtype), ranges(column)))
+    report(attributes=[dict(zip(rows[0], row, strict=True)) for row in rows[1:]], particles=len(table))
     widths = [max(len(row[i]) for row in rows) for i in range(3)]
     for row in rows:
-        print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
+        result("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
 
 
-def camera_line(camera: Camera, options: argparse.Namespace | None = None) -> str:
-    """The options that give this camera again, as they were given, and its depths."""
+def camera_line(camera: Camera, options: Any = None) -> str:
+    """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
+    if not camera.is_perspective:
+        return camera.describe()
     eye, axes = camera.exact_eye(), np.asarray(camera.axes, np.float64)
     fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
     near, far = float(camera.near), float(camera.far)
     given = [getattr(options, name, None) for name in ("eye", "target")]
     computed = eye, eye + axes[2] * (near + far) / 2
     texts = [
-        " ".join(f"{v:.5g}" for v in at) if said is None else " ".join(f"{v:.12g}" for v in said)
+        ",".join(f"{v:.5g}" for v in at) if said is None else ",".join(f"{v:.12g}" for v in said)
         for at, said in zip(computed, given, strict=True)
     ]
     place = " --target ".join(texts)

@@ -1,64 +1,39 @@
 """Command line: a picture from files of particles, volumes and points in one command.
 
-Flow: file or scene -> [cli] -> render -> EXR or PNG.
+Flow: words -> former spellings, files of options -> cyclopts -> [main] -> a command -> files, results on stdout, prose on stderr.
 
 Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted (SIGINT), 143 asked to end (SIGTERM); one line on stderr
-says why.
+says why. A command's module is imported when that command is asked for, so that help comes at once.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
+import functools
 import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-import numpy as np
+from cyclopts import ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
 
-import jaxsph
-from jaxsph import scenes
-from jaxsph.cli import cache as cli_cache
-from jaxsph.cli import disk as cli_disk
-from jaxsph.cli import look as cli_look
-from jaxsph.cli import merge as cli_merge
-from jaxsph.cli import movie as cli_movie
-from jaxsph.cli import options as cli_options
-from jaxsph.cli import parts as cli_parts
-from jaxsph.cli import project as cli_project
-from jaxsph.cli import render as cli_render
-from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import sweep as cli_sweep
-from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import (
-    IMAGES,
-    UsageError,
-    by_option,
-    camera_line,
-    largest,
-    progress,
-    refuse,
-    require_writable,
-    say,
-    time_line,
-    warnings_in_lines,
-)
-from jaxsph.model import Camera, Settings
-from jaxsph.model.camera.camera import BoundingBox
-from jaxsph.trade.contenders import layers_of
+from jaxsph.cli import voice
+from jaxsph.cli.options.former import Rewritten, rewritten
+from jaxsph.cli.options.table import COMMANDS, app
+from jaxsph.cli.options.words import Declared, Entry, completed, joined, saved
+from jaxsph.cli.voice import UsageError, by_option
+from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.version import __version__
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 AGAIN_SECONDS = 0.02
-DEMO_TOLERANCE = 0.004
-DEMO_CHECK = 64
-"""Rows and columns of pixels, about, that `demo` compares with the float64 reference."""
+HELP, SHORT_HELP, VERSION = "--help", "-h", "--version"
+ALOUD = ("info", "demo", "doctor", "cache")
+"""Commands whose result is what they say."""
+FIRST_STEPS = "Examples:\n  jaxsph render snap_042.hdf5\n  jaxsph info snap_042.hdf5\n"
 
 
 class _Terminated(KeyboardInterrupt):
@@ -72,30 +47,154 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: those of the process if not given. Only then are compiled programs kept for other processes, and SIGTERM
             heard, as a caller may have set up JAX and signals otherwise.
     """
+    words = [str(word) for word in (sys.argv[1:] if arguments is None else arguments)]
+    command = next(iter(words), "")
+    verbose = any(word in ("--verbose", "-v", "--debug") for word in words)
     try:
-        options, unknown = _parser().parse_known_args(arguments)
-    except SystemExit as stop:  # --help, --version and what argparse refuses
-        return int(stop.code or DONE)
-    try:
-        if unknown:
-            raise UsageError(f"unrecognized arguments: {' '.join(unknown)}")
+        if _helped(command, words):
+            return DONE
+        new = _rewritten(command, words[1:])
+        command = new.command
+        run, entries = _asked(new)
         with _ending_in_order(arguments is None):
-            if arguments is None:
-                cli_cache.begin(keep=not options.no_cache)
-            with warnings_in_lines(options.command, cli_cache.mended):
-                options.run(options)
+            _work(run, entries, own_process=arguments is None)
     except _Terminated:
-        return _failed(options, "terminated", TERMINATED)
+        return _failed(command, "terminated", TERMINATED, verbose)
     except KeyboardInterrupt:
-        return _failed(options, "interrupted", INTERRUPTED)
+        return _failed(command, "interrupted", INTERRUPTED, verbose)
     except BrokenPipeError:  # the reader of our output went away, as in `jaxsph info FILE | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except UsageError as error:
-        return _failed(options, f"{by_option(str(error))} (see `jaxsph {options.command} --help`)", WRONG_USAGE)
+        which = f"{command} " if command in COMMANDS else ""
+        return _failed(command, f"{by_option(str(error))} (see `jaxsph {which}--help`)", WRONG_USAGE, verbose)
     except Exception as error:
-        return _failed(options, _reason(error), FAILED)
+        return _failed(command, _reason(error), FAILED, verbose)
     return DONE
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """A command, its files, and its options."""
+
+    function: Callable[..., None]
+    files: tuple[str, ...]
+    options: Any
+
+
+def _work(run: _Run, entries: Sequence[Entry], *, own_process: bool) -> None:
+    """Do what is asked for."""
+    from jaxsph.cli import cache
+    from jaxsph.cli.console import warnings_in_lines
+
+    options = run.options
+    if own_process:
+        cache.begin(keep=not options.no_cache)
+    with warnings_in_lines(options.command, cache.mended):
+        run.function(*run.files, asked=options)
+        if options.save_config is not None:
+            options.save_config.write_text(saved(entries), encoding="utf-8")
+            voice.say("saved", f"{options.save_config}: the options, for --config")
+        voice.end(options.command)
+
+
+def _rewritten(command: str, words: list[str]) -> Rewritten:
+    """The words as they are written now.
+
+    Raises:
+        UsageError: no command.
+    """
+    if command not in COMMANDS:
+        known = ", ".join(COMMANDS)
+        raise UsageError(f"there is no command {command!r}; there are {known}{did_you_mean(command, COMMANDS)}")
+    return rewritten(command, words, lambda of, name: name in declared(of).names)
+
+
+def _asked(new: Rewritten) -> tuple[_Run, list[Entry]]:
+    """The command that is asked for, with its options.
+
+    Raises:
+        UsageError: what cannot be understood.
+    """
+    entries = completed(new.command, new.words, declared(new.command))
+    said = joined(entries)
+    voice.begin(quiet="--quiet" in said, verbose="--verbose" in said, as_json="--json" in said, aloud=new.command in ALOUD)
+    for text in new.told:
+        voice.warn(new.command, text)
+    try:
+        function, bound, _ = app()[new.command].parse_args(said, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        raise UsageError(_one_line(error)) from error
+    except ValueError as error:  # of a group whose options do not go together
+        raise UsageError(str(error)) from error
+    bound.apply_defaults()
+    options = dataclasses.replace(bound.arguments["asked"], command=new.command, words=tuple(said))
+    return _Run(function, bound.args, options), entries
+
+
+def _one_line(error: CycloptsError) -> str:
+    """What cyclopts refuses, with the option first."""
+    if isinstance(error, CoercionError) and error.msg and error.argument is not None:
+        name, text = error.argument.name, str(error.msg)
+        return f"{name} {text}" if text.startswith("must ") else f"{name}: {text}"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        return f"{error.argument.name.removeprefix('*')} needs a value"
+    return " ".join(str(error).split())
+
+
+def arguments_of(command: str) -> ArgumentCollection:
+    """What a command offers, as cyclopts has it."""
+    return app()[command].assemble_argument_collection()
+
+
+@functools.cache
+def declared(command: str) -> Declared:
+    """Names of the options of a command."""
+    flags, valued, several, full = {HELP}, set(), set(), {SHORT_HELP: HELP}
+    for one in arguments_of(command):
+        names = [name for name in one.names if name.startswith("--")]
+        if not names or not one.parse:
+            continue
+        full.update(dict.fromkeys(one.names, names[0]))
+        if one.hint is bool:
+            flags.add(names[0])
+        else:
+            valued.add(names[0])
+            if one.parameter.allow_repeating:
+                several.add(names[0])
+    return Declared(frozenset(flags), frozenset(valued), frozenset(several), full)
+
+
+def _helped(command: str, words: list[str]) -> bool:
+    """Whether help or the version was asked for; and print it."""
+    if command == VERSION:
+        print(f"jaxsph {__version__}")
+    elif not words:
+        print(f"{FIRST_STEPS}\n`jaxsph --help` lists all commands, `jaxsph COMMAND -h` has more examples.")
+    elif command in (HELP, SHORT_HELP):
+        print(FIRST_STEPS)
+        app().help_print([])
+    elif command in COMMANDS and HELP in words:
+        app().help_print([command])
+    elif command in COMMANDS and SHORT_HELP in words:
+        _print_short(command)
+    else:
+        return False
+    return True
+
+
+def _print_short(command: str) -> None:
+    """Examples and names of options."""
+    groups: dict[str, list[str]] = {}
+    for one in arguments_of(command):
+        if one.show and one.name.startswith("-"):
+            kinds: Any = one.parameter.group
+            groups.setdefault(kinds[0].name, []).append(one.name)
+    print(f"{COMMANDS[command].text[0].upper()}{COMMANDS[command].text[1:]}.\n\nExamples:")
+    print("\n".join(f"  {example}" for example in COMMANDS[command].examples) + "\n\nOptions:")
+    for name, options in groups.items():
+        print(f"  {name}: {' '.join(options)}")
+    print(f"\n`jaxsph {command} --help` explains them.")
 
 
 @contextlib.contextmanager
@@ -132,12 +231,12 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
             sys.unraisablehook = before
 
 
-def _failed(options: argparse.Namespace, reason: str, code: int) -> int:
-    if options.debug:
+def _failed(command: str, reason: str, code: int, verbose: bool) -> int:
+    if verbose:
         import traceback
 
         traceback.print_exc()
-    print(f"jaxsph {options.command}: {' '.join(reason.split())}", file=sys.stderr)
+    print(f"jaxsph{f' {command}' if command in COMMANDS else ''}: {' '.join(reason.split())}", file=sys.stderr)
     return code
 
 
@@ -148,138 +247,4 @@ def _reason(error: Exception) -> str:
         return f"out of memory ({error}); try a smaller --size, fewer --samples or a lower --memory"
     if isinstance(error, ValueError | OSError | ImportError | RuntimeError):
         return by_option(str(error)) or type(error).__name__
-    return f"unexpected {type(error).__name__}: {error}; --debug shows where"
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse, with its errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(WRONG_USAGE, f"{self.prog}: {message} (see `{self.prog} --help`)\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="jaxsph", description="Render SPH particles as a volume.")
-    parser.add_argument("--version", action="version", version=f"jaxsph {jaxsph.__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    common = _Parser(add_help=False)
-    common.add_argument("--debug", action="store_true", help="show where an error comes from")
-    common.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next command")
-
-    def command(name: str, run: Callable[[argparse.Namespace], None], text: str, more: str) -> argparse.ArgumentParser:
-        made = commands.add_parser(name, parents=[common], help=text, description=f"{text[0].upper()}{text[1:]}. {more}")
-        made.set_defaults(run=run)
-        return made
-
-    render = command("render", cli_render.run, "make an image", "What you do not say is chosen, and said.")
-    render.epilog = f"Built-in scenes: {', '.join(cli_options.SCENE + name for name in scenes.names())}."
-    cli_options.add_source(render, optional=True, several=True)
-    _add_parts(render)
-    cli_where.add_places(render)
-    cli_disk.add_options(render)
-    where = ".exr or .png; of several files a folder, or a name with {} in it"
-    render.add_argument("-o", "--output", type=Path, metavar="OUT", help=where)
-    cli_options.add_picture(render)
-    cli_options.add_control(render)
-    cli_look.add_looks(render)
-    cli_look.add_key(render)
-    cli_options.add_devices(render)
-    cli_merge.add_tile(render)
-    cli_merge.add_options(command("merge", cli_merge.run, "make one image of its parts", cli_merge.MORE))
-    transfer = command("transfer", _transfer, "draw a transfer function over what rays meet", "FILE may be one that was saved.")
-    cli_options.add_source(transfer)
-    cli_options.add_picture(transfer, means=False)
-    cli_look.add_looks(transfer)
-    cli_look.add_command(transfer)
-    info = command("info", _info, "say what a file holds", "And what `render` would show of it.")
-    cli_options.add_source(info, optional=True, surface=False)
-    _add_parts(info, mixed=False)
-    info.add_argument("--cache", action="store_true", help="say where compiled programs are kept, and how large they are")
-    cli_disk.add_sort(command("sort", cli_disk.sort, "order a snapshot in space", "So that parts of it can be read alone."))
-    cli_project.add_options(
-        command("project", cli_project.run, "integrate along rays: column densities, means", cli_project.MORE)
-    )
-    more = "Appends to DIR/sweep.jsonl what it does not hold yet, and writes sweep.csv and figures."
-    sweep = command("sweep", cli_sweep.run, "measure error against tolerance against time", more)
-    cli_options.add_source(sweep)
-    cli_options.add_picture(sweep)
-    cli_sweep.add_options(sweep)
-    sweep.set_defaults(integrator="samples")  # whose full rate bounds and the pilot keep a tolerance against
-    movie = command("movie", cli_movie.run, "make a movie", cli_movie.MORE)
-    cli_options.add_source(movie, several=True)
-    _add_parts(movie)
-    cli_look.add_looks(movie)
-    cli_options.add_picture(movie)
-    cli_options.add_control(movie)
-    cli_where.add_places(movie, slices=False)
-    cli_movie.add_options(movie)
-    demo = command("demo", _demo, "render a built-in scene and measure its error", "Writes an EXR and a PNG.")
-    add = demo.add_argument
-    add("-o", "--output", type=Path, default=Path("demo"), metavar="STEM", help="path without suffix (default: demo)")
-    add("--size", type=cli_options.size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
-    return parser
-
-
-def _add_parts(parser: argparse.ArgumentParser, *, mixed: bool = True) -> None:
-    cli_where.add_selection(parser)
-    cli_parts.add_options(parser, mixed=mixed)
-
-
-def _transfer(options: argparse.Namespace) -> None:
-    output = cli_look.check_figure(options)
-    if Path(options.source).suffix.lower() == ".json":
-        refuse(options, ("quantity", "save", *cli_look.LOOKS), "is for FILE or scene:NAME, and this is a saved function")
-        cli_look.draw_file(options, output)
-        return
-    source = cli_scene.source_of(options)
-    camera = source.camera or cli_scene.camera_of(source.shown, options)
-    cli_look.draw(source.scene, camera, source.labels, options, output)
-
-
-def _info(options: argparse.Namespace) -> None:
-    options = cli_where.settled(options)
-    if options.cache:
-        for what, text in cli_cache.described():
-            say(what, text)
-        if options.source is None:
-            return
-    cli_scene.require_something(options, ", or --cache")
-    parts, camera = [], None
-    if options.source is not None:
-        shown, camera = cli_scene.described(options)
-        parts.append((options.source, shown))
-    parts += [(path, cli_parts.described_volume(path, options.volume_quantity)) for path in options.volume or ()]
-    parts += cli_parts.points_of(options, described=True)
-    if camera is None or len(parts) > 1:
-        camera = Camera.framing(BoundingBox.around(part for _, part in parts))
-    say("camera", camera_line(camera))
-    cli_parts.warn_apart(parts, options.command)
-
-
-def _demo(options: argparse.Namespace) -> None:
-    width, height = options.size
-    outputs = [Path(f"{options.output}{suffix}") for suffix in IMAGES]
-    for output in outputs:
-        require_writable(output, "an image must be", IMAGES)
-    scene, camera = scenes.load("mixer", width=width, height=height)
-    settings = Settings(tolerance=DEMO_TOLERANCE, integrator="samples")
-    exact = dataclasses.replace(settings, tolerance=None)
-    every = max(min(width, height) // DEMO_CHECK, 1)
-    with ThreadPoolExecutor(1) as beside, progress("render") as show:  # NumPy has time while XLA compiles
-        truth_of = beside.submit(jaxsph.reference.render, scene, camera, exact, every=every)
-        started = time.perf_counter()
-        image = jaxsph.render(scene, camera, settings, progress=show)
-        elapsed = time.perf_counter() - started
-    for output in outputs:
-        image.save(output)
-    full = jaxsph.render(scene, camera, exact)
-    error = largest(np.abs(layers_of(image) - layers_of(full)))
-    truth, some = truth_of.result(), slice(every // 2, None, every)
-    rounding = largest(np.abs(layers_of(full)[some, some] - layers_of(truth)))
-    say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
-    for output in outputs:
-        say("image", str(output.resolve()))
-    say("tolerance", f"{DEMO_TOLERANCE:g}, certified: no pixel can be off by more than {largest(image.error_bound):.2g}")
-    say("error", f"{error:.2g}, the largest against full sampling")
-    say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
-    say("time", time_line(image, elapsed))
+    return f"unexpected {type(error).__name__}: {error}; --verbose shows where"

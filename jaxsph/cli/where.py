@@ -1,161 +1,144 @@
-"""Where and which on the command line: conditions, shares, periodic boxes, and clips.
+"""From where, where and which on the command line: cameras of what is no scene, middles of boxes, and clips.
 
-Flow: options -> [cli_where] -> particles, Scene.within, what there is to frame -> cli.
+Flow: options -> [where] -> Camera, Scene.within, what there is to frame -> commands.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import operator
 from typing import Any
 
 import numpy as np
 
-from jaxsph.cli.console import UsageError, say, wrong_usage
-from jaxsph.cli.options import replaced
-from jaxsph.model import Particles
+from jaxsph.cli.console import UsageError, wrong_usage
+from jaxsph.cli.voice import say
+from jaxsph.io.opening.views import FOV_DEGREES, UP, length_of
+from jaxsph.io.units import CodeUnit
+from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.model.camera.framing import VIEWS, along_axis
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.scenes.view import snug, snug_box
 from jaxsph.sequence.snapshots import center_of
 from jaxsph.sequence.survey import Survey
 
-OF_FILES = ("where", "share", "box", "not_periodic", "center")
-OF_PARTICLES = (*OF_FILES, "slice")
-DENSEST = "densest"
-CLIPS = ("clip_plane", "clip_box", "cut_box", "clip_sphere", "cut_sphere")
+PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")
+"""Options that place a camera."""
 
 
-def add_selection(parser: argparse.ArgumentParser) -> None:
-    """Options of which particles of a file are shown."""
-    add = parser.add_argument_group("which particles of a file").add_argument
-    add("--where", metavar="CONDITION", help='such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` lists them')
-    add("--share", type=float, metavar="S", help="a share of them, as 0.1, for a quick look: their field is another one")
-    add("--box", nargs=3, type=float, metavar=("LX", "LY", "LZ"), help="sides of a periodic box (default: the file's)")
-    add("--not-periodic", action="store_true", default=None, help="leave the file's box aside: nothing reaches across its faces")
+def is_placed(options: Any) -> bool:
+    """Whether any option says where the camera is."""
+    return any(getattr(options, name, None) not in (None, False) for name in PLACED)
 
 
-def add_places(parser: argparse.ArgumentParser, *, slices: bool = True) -> None:
-    """Options of where things are shown."""
-    add = parser.add_argument_group("where", "Clips may be repeated: what is in all of them is shown.").add_argument
-    more = f"middle of a periodic box: X Y Z, or {DENSEST} for the densest point"
-    add("--center", nargs="+", metavar=("X", "Y Z"), help=more)
-    vector = ("X", "Y", "Z")
-    clips: dict[str, Any] = {"type": float, "action": "append"}
-    more = "what is on the side that (NX, NY, NZ) points to"
-    add("--clip-plane", nargs=6, metavar=(*vector, "NX", "NY", "NZ"), **clips, help=more)
-    corners = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")
-    add("--clip-box", nargs=6, metavar=corners, **clips, help="what is inside of a box")
-    add("--cut-box", nargs=6, metavar=corners, **clips, help="what is outside of it")
-    add("--clip-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is inside of a sphere")
-    add("--cut-sphere", nargs=4, metavar=(*vector, "R"), **clips, help="what is outside of it")
-    if slices:
-        more = "the quantity on a plane through (X, Y, Z), seen from where (NX, NY, NZ) points to; OUT may be .npy, too"
-        add("--slice", nargs=6, type=float, metavar=(*vector, "NX", "NY", "NZ"), help=more)
-
-
-def settled(options: argparse.Namespace) -> argparse.Namespace:
-    """The options with what `--center` has taken from FILE where it belongs; what needs no file is checked.
+def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None = None, unit: CodeUnit | None = None) -> Camera:
+    """The camera asked for, of what there is to frame; where only a part is said, the rest frames it. Between `depths`, or snug.
 
     Raises:
-        UsageError: options that are no numbers, or do not go together.
+        UsageError: options that do not go together, or that the place does not suit.
     """
+    shown = framed(shown, options)
+    lower, upper = shown.bounds()
+    width, height = options.size
+    with wrong_usage():
+        if getattr(options, "eye", None) is not None:
+            return _from_eye(shown, options, depths)
+        middle = _middle(options, lower, upper)
+        across = getattr(options, "width", None)
+        if options.view in VIEWS:
+            return _along(shown, options, middle, depths, unit)
+        if options.view in ("face-on", "edge-on"):
+            raise ValueError(f"--view {options.view} is for a single file that is rendered; choose x, y, z or iso")
+        if across is not None or middle is not None:
+            at = (lower + upper) / 2 if middle is None else middle
+            reach = (upper - lower) / 2 if across is None else np.full(3, length_of(across, "width", unit)[0] / 2)
+            shown = BoundingBox(at - reach, at + reach)
+        return Camera.framing(shown, up=_up(options), fov_degrees=_fov(options), width=width, height=height)
+
+
+def _along(shown: Bounded, options: Any, middle: Any, depths: tuple[float, float] | None, unit: CodeUnit | None) -> Camera:
+    """With parallel rays along an axis; `depths` are coordinates along it."""
+    width, height = options.size
+    whole = along_axis(shown, options.view, width, height, slab=depths)
+    across = getattr(options, "width", None)
+    if across is None and middle is None:
+        return whole
+    tall = 2 * float(whole.half_height) if across is None else length_of(across, "width", unit)[0] * height / width
+    forward, up = np.asarray(VIEWS[options.view], np.float64)
+    eye = whole.exact_eye()
+    at = eye if middle is None else middle
+    moved = eye + (at - eye) - ((at - eye) @ forward) * forward
+    return Camera.orthographic(moved, moved + forward, up, tall, width, height, near=float(whole.near), far=float(whole.far))
+
+
+def _middle(options: Any, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+    """The place in the middle that was asked for."""
     given = getattr(options, "center", None)
-    if given is not None:
-        wanted = 1 if given[0] == DENSEST else 3
-        if len(given) == wanted + 1 and options.source is None:
-            *given, source = given
-            options = replaced(options, source=source)
-        options = replaced(options, center=DENSEST if given == [DENSEST] else _numbers(given))
-    if options.box is not None and options.not_periodic:
-        raise UsageError("--box and --not-periodic exclude each other")
-    if options.box is not None and not all(np.isfinite(side) and side > 0 for side in options.box):
-        raise UsageError(f"--box must be three lengths > 0, got {' '.join(f'{side:g}' for side in options.box)}")
-    clip_of(options)
-    return options
+    if given is None:
+        return None
+    if isinstance(given, str):
+        raise ValueError(f"--center {given} is for a single file that is rendered; give X,Y,Z")
+    place = np.asarray(given, np.float64)
+    if (place < lower).any() or (place > upper).any():
+        said = ",".join(f"{value:g}" for value in place)
+        raise ValueError(f"--center {said} is outside of everything: that lies {ends_of(lower, upper)}")
+    return place
 
 
-def _numbers(given: list[str]) -> list[float]:
-    try:
-        numbers = [float(value) for value in given]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or not np.isfinite(numbers).all():
-        raise UsageError(f"--center must be X Y Z or {DENSEST}, got {' '.join(given)}")
-    return numbers
+def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) -> Camera:
+    lower, upper = shown.bounds()
+    width, height = options.size
+    target = (lower + upper) / 2 if options.target is None else options.target
+    near, far = depths or (1e-3, 1.0)
+    made = Camera.look_at(options.eye, target, _up(options), _fov(options), width, height, near=near, far=far)
+    if depths is not None:
+        return made
+    return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)
 
 
-def selected(options: argparse.Namespace) -> dict[str, Any]:
-    """Which particles of a file are asked for, as `io.particles_from_table` is to be given them."""
-    box = None if getattr(options, "not_periodic", None) else getattr(options, "box", None) or "file"
-    return {"box": box, "where": getattr(options, "where", None), "share": getattr(options, "share", None)}
+def _up(options: Any) -> Any:
+    return UP if options.up is None else options.up
 
 
-def centered(particles: Particles, options: argparse.Namespace) -> Particles:
-    """With the middle of a periodic box where it is asked for."""
-    at = getattr(options, "center", None)
-    if at is None:
-        return particles
-    if particles.box is None:
-        raise UsageError("--center is for periodic boxes, and this is none; give its sides by --box, or look at it by --target")
-    moved = particles.centered(at)
-    _say_center(np.mean(moved.bounds(), 0))
-    return moved
+def _fov(options: Any) -> float:
+    return FOV_DEGREES if options.fov_degrees is None else float(options.fov_degrees)
 
 
-def middle_of(survey: Survey, options: argparse.Namespace) -> tuple[float, float, float] | None:
-    """The same of a sequence."""
-    if options.center is not None and survey.box is None:
-        raise UsageError("--center is for periodic boxes, and these files do not have one; give its sides by --box")
-    center = center_of(survey, options.center)
+def middle_of(survey: Survey, options: Any) -> tuple[float, float, float] | None:
+    """What is to be in the middle of the periodic box of a sequence."""
+    given = getattr(options, "center", None)
+    if given is None or survey.box is None:
+        if given is not None:
+            raise UsageError("--center is for periodic boxes, and these files do not have one; give its sides by --box-size")
+        return None
+    if given == "mass":
+        raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
+    center = center_of(survey, list(given) if not isinstance(given, str) else given)
     if center is not None:
-        _say_center(center)
+        say("center", " ".join(f"{value:.6g}" for value in center))
     return center
 
 
-def _say_center(center: Any) -> None:
-    say("center", " ".join(f"{value:.6g}" for value in center))
-
-
-def clip_of(options: argparse.Namespace) -> Clip | None:
+def clip_of(options: Any) -> Clip | None:
     """What is in all clips that are asked for; None where there are none."""
-    clips: list[Clip] = []
-    makers = (plane, _box, lambda numbers: ~_box(numbers), _sphere, lambda numbers: ~_sphere(numbers))
-    for name, make in zip(CLIPS, makers, strict=True):
-        with wrong_usage(f"--{name.replace('_', '-')}: "):
-            clips += [make(numbers) for numbers in getattr(options, name, None) or ()]
+    clips = [one.clip for one in getattr(options, "clip", ()) if one.clip is not None]
     return functools.reduce(operator.and_, clips) if clips else None
 
 
-def plane(numbers: list[float]) -> Plane:
-    """Of a place on it, and where it points to."""
-    return Plane(numbers[:3], numbers[3:])
-
-
-def _box(numbers: list[float]) -> Box:
-    return Box(numbers[:3], numbers[3:])
-
-
-def _sphere(numbers: list[float]) -> Sphere:
-    return Sphere(numbers[:3], numbers[3])
-
-
-def framed(parts: Bounded, options: argparse.Namespace) -> Bounded:
+def framed(parts: Bounded, options: Any) -> Bounded:
     """What there is to frame: all of it, or what is in the boxes and spheres that it is clipped by.
 
     Raises:
         UsageError: nothing is.
     """
-    inner = [(numbers[:3], numbers[3:]) for numbers in getattr(options, "clip_box", None) or ()]
-    for x, y, z, radius in getattr(options, "clip_sphere", None) or ():
-        inner.append(([value - radius for value in (x, y, z)], [value + radius for value in (x, y, z)]))
+    inner = [one.ends for one in getattr(options, "clip", ()) if one.ends is not None]
     if not inner:
         return parts
     lower, upper = parts.bounds()
     low, high = np.max([lower, *(one for one, _ in inner)], 0), np.min([upper, *(other for _, other in inner)], 0)
     if not (low < high).all():
-        raise UsageError(f"nothing is inside of --clip-box and --clip-sphere; there is something {ends_of(lower, upper)}")
+        raise UsageError(f"nothing is inside of --clip; there is something {ends_of(lower, upper)}")
     return BoundingBox(low, high)
 
 
@@ -165,7 +148,8 @@ def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
     return "from " + " to ".join(ends)
 
 
-def left_out(options: argparse.Namespace) -> list[tuple[str, Any]]:
+def left_out(options: Any) -> list[tuple[str, Any]]:
     """What is not shown, as metadata of a picture."""
-    given = {name: getattr(options, name, None) for name in ("where", "share", *CLIPS)}
-    return [(f"jaxsph.{name}", value if isinstance(value, str | float) else str(value)) for name, value in given.items() if value]
+    clips = " ".join(one.text for one in getattr(options, "clip", ()))
+    given = {"where": getattr(options, "where", None), "share": getattr(options, "share", None), "clip": clips}
+    return [(f"jaxsph.{name}", value) for name, value in given.items() if value]

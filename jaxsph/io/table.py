@@ -161,7 +161,7 @@ def box_of(edges: np.ndarray) -> tuple[tuple[float, float, float] | None, list[s
     """Sides of a periodic box from one stored length or three; where they are none, a note that says so."""
     if len(edges) not in (1, 3) or not (np.isfinite(edges) & (edges > 0)).all():
         stored = ", ".join(f"{edge:g}" for edge in edges[:4].tolist())
-        return None, [f"not periodic: a box of {stored} (in the header) has no volume; `box=` or --box sets one"]
+        return None, [f"not periodic: a box of {stored} (in the header) has no volume; `box=` or --box-size sets one"]
     x, y, z = np.broadcast_to(edges, 3).tolist()
     return (x, y, z), []
 

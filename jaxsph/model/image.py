@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.model.colors import rgb
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.trees import tree
@@ -52,7 +53,7 @@ class Image:
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
 
-    writer: ClassVar[Callable[[str | os.PathLike[str], Image], None]]
+    writer: ClassVar[Callable[..., None]]
     """How images become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
     drawer: ClassVar[Callable[..., Any]]
     """How images become figures: given by `jaxsph.plot.methods`, from `jaxsph.plot.image_figure`."""
@@ -93,9 +94,28 @@ class Image:
         """(height, width)."""
         return int(self.color.shape[0]), int(self.color.shape[1])
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to `path`: `.exr` (all layers) or `.png` (colour over black). See `jaxsph.io.write_image`."""
-        type(self).writer(path, self)
+    def over(self, background: Any) -> Float[np.ndarray, "height width 3"]:
+        """The picture in front of a background of one colour: C + T B, with premultiplied C and transmittance T (host side).
+
+        Args:
+            background: a name such as `"white"`, `"#rrggbb"`, or R, G and B in [0, 1], display-referred as `color` is.
+
+        Returns:
+            (height, width, 3) in [0, 1], float64, display-referred: what `matplotlib.pyplot.imshow` shows.
+
+        Raises:
+            ValueError: no colour; an image without transmittance, as one read from a PNG is.
+        """
+        color, behind = np.asarray(self.color, np.float64), np.asarray(rgb(background))
+        transmittance = np.asarray(self.transmittance, np.float64)[..., None]
+        if np.isnan(transmittance).any():
+            raise ValueError("`over` needs the transmittance of the image, and a PNG does not hold it: write EXR to keep it")
+        made: np.ndarray = np.clip(np.nan_to_num(color, nan=0.0) + transmittance * behind, 0, 1)
+        return made
+
+    def save(self, path: str | os.PathLike[str], background: Any = None) -> None:
+        """Write to `path`: `.exr` (all layers) or `.png` (colour over black, or `background`). See `jaxsph.io.write_image`."""
+        type(self).writer(path, self, background)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's with colour bar, scale bar, axes, outline and time. See `jaxsph.plot.image_figure`."""

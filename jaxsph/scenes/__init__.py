@@ -28,6 +28,7 @@ from jaxsph.model.transfer.looks import (
     opacity_by_second,
     preset,
 )
+from jaxsph.numerics.nearest import did_you_mean
 from jaxsph.scenes import cosmos, fields
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.flubber import flubber
@@ -94,7 +95,7 @@ def load(
         ValueError: an unknown name, fewer than one particle, a frame that the scene does not have.
     """
     if name not in SCENES:
-        raise ValueError(f"`name` must be one of {', '.join(names())}, got {name!r}")
+        raise ValueError(f"`name` must be one of {', '.join(names())}, got {name!r}{did_you_mean(name, names())}")
     if particles is not None and (isinstance(particles, bool) or int(particles) != particles or particles < 1):
         raise ValueError(f"`particles` must be an integer of at least 1, got {particles!r}")
     return SCENES[name](particles=particles, frame=frame, width=width, height=height, seed=seed)

@@ -28,6 +28,6 @@ def test_what_cannot_be_had_is_wrong_usage(tmp_path, capsys, given, why):
 @pytest.mark.slow
 def test_a_picture_is_made_by_all_devices(tmp_path):
     output = tmp_path / "out.png"
-    small = ["--particles", "300", "--size", "24x24", "--samples", "16"]
-    assert cli.main(["render", "scene:mixer", *small, "-o", str(output), "--devices", "all"]) == 0
+    small = ["--size", "24x24", "--samples", "16"]
+    assert cli.main(["render", "scene:mixer:particles=300", *small, "-o", str(output), "--devices", "all"]) == 0
     assert output.stat().st_size > 0

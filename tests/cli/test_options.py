@@ -1,36 +1,47 @@
-"""Options: whatever a command offers, it reads, be it to refuse it."""
+"""Options: whatever a command offers, it reads, and it offers no more than a person can take in."""
 
-import argparse
+import ast
+import dataclasses
+import importlib
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from commanded import run
 
 import jaxsph as js
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import main as cli
-from jaxsph.cli import movie as cli_movie
-from jaxsph.cli import project as cli_project
-from jaxsph.cli import sweep as cli_sweep
+from jaxsph.cli.commands import movie, project, render, sweep, transfer
+from jaxsph.cli.commands import slice as slices
+from jaxsph.cli.options import groups
+from jaxsph.cli.options.table import COMMANDS
+from jaxsph.io.opening import options as opening
 
 SMALL = ["--size", "8x8"]
+SCENE = "scene:radial:particles=50"
 RUNS = {
-    "render": (["render", "FILE", *SMALL], ["render", "VOLUME", *SMALL], ["render", "scene:radial", "--particles", "50", *SMALL],
+    "render": (["render", "FILE", *SMALL], ["render", "VOLUME", *SMALL], ["render", SCENE, *SMALL],
                ["render", "FILE", "--points", "FILE", "--volume", "VOLUME", *SMALL], ["render", "FILE", "--annotate", *SMALL],
-               ["render", "FILE", "--from-disk", "1"]),
+               ["render", "VOLUME", "--iso", "0.5", *SMALL], ["render", "FILE", "--from-disk", "1"]),
     "movie": (["movie", "FILE", "--orbit", "9", *SMALL], ["movie", "VOLUME", "--orbit", "9", *SMALL],
               ["movie", "FILE", "FILE", *SMALL], ["movie", "FILE", "--points", "FILE", "--volume", "VOLUME", "--orbit", "9"],
-              ["movie", "scene:radial", "--particles", "50", "--orbit", "9"]),
-    "transfer": (["transfer", "FILE", *SMALL], ["transfer", "VOLUME", *SMALL], ["transfer", "scene:radial", "--particles", "50"]),
-    "info": (["info", "FILE"], ["info", "VOLUME"], ["info", "scene:radial", "--particles", "50"],
-             ["info", "--points", "FILE", "--volume", "VOLUME"]),
-    "project": (["project", "FILE", *SMALL], ["project", "FILE", "--of", "volume", *SMALL]),
-    "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"],
-              ["sweep", "scene:radial", "--particles", "50", "-o", "out"]),
+              ["movie", SCENE, "--orbit", "9"], ["movie", "VOLUME", "--iso", "0.5", "--orbit", "9", *SMALL]),
+    "transfer": (["transfer", "FILE", *SMALL], ["transfer", "VOLUME", *SMALL], ["transfer", SCENE]),
+    "info": (["info", "FILE"], ["info", "VOLUME"], ["info", SCENE], ["info", "--points", "FILE", "--volume", "VOLUME"]),
+    "project": (["project", "FILE", *SMALL], ["project", "FILE", "--of", "volume", *SMALL],
+                ["project", "FILE", "--eye", "0,0,9", *SMALL], ["project", "FILE", "--center", "mass", *SMALL]),
+    "slice": (["slice", "FILE", *SMALL], ["slice", SCENE, *SMALL]),
+    "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"], ["sweep", SCENE, "-o", "out"]),
     "merge": (["merge", "FILE.exr", "-o", "a.png"],),
     "sort": (["sort", "FILE", "-o", "a.hdf5"],),
     "demo": (["demo", *SMALL],),
+    "doctor": (["doctor"],),
+    "cache": (["cache"],),
+    "completion": (["completion", "bash"],),
 }  # fmt: skip
-OF_ALL = {"help", "debug", "no_cache"}
+OF_ALL = {"quiet", "verbose", "json", "config", "save_config", "no_cache", "like"}
+"""What is read before a command is, see `test_words.py` and `test_voice.py`."""
 
 
 class EnoughError(ValueError):
@@ -46,40 +57,116 @@ def asked(tmp_path, monkeypatch):
     np.save("VOLUME.npy", np.random.default_rng(0).random((4, 4, 4), np.float32))
     names = set()
 
-    class Recording(argparse.Namespace):
-        def __getattribute__(self, name):
+    def recording(self, name):
+        code = sys._getframe(1).f_code  # who copies or checks the options does not use them
+        if not (code.co_filename.endswith("dataclasses.py") or code.co_name == "__post_init__"):
             names.add(name)
-            return super().__getattribute__(name)
+        return object.__getattribute__(self, name)
 
     def enough(*_, **__):
         raise EnoughError("enough")
 
-    monkeypatch.setattr(argparse, "Namespace", Recording)
-    begun = cli.warnings_in_lines
-    monkeypatch.setattr(cli, "warnings_in_lines", lambda *given: names.clear() or begun(*given))  # the parser asks for all
-    for module, name in ((js, "render"), (js, "project"), (cli_movie, "render_frames"), (cli_sweep, "sweep")):
+    monkeypatch.setattr(groups.Options, "__getattribute__", recording)
+    for module, name in (
+        (js, "render"),
+        (project, "projected"),
+        (movie, "render_frames"),
+        (sweep, "measured"),
+        (transfer, "transfer_figure"),
+        (slices, "slice_of"),
+    ):
         monkeypatch.setattr(module, name, enough)
-    monkeypatch.setattr(cli_look, "transfer_figure", enough)
-    if hasattr(cli_project, "project"):
-        monkeypatch.setattr(cli_project, "project", enough)
     return names
 
 
-def offered():
-    """Of each command, the names under which its options are kept."""
-    (commands,) = [action for action in cli._parser()._actions if isinstance(action, argparse._SubParsersAction)]
-    return {name: {action.dest for action in parser._actions} - OF_ALL for name, parser in commands.choices.items()}
+def offered(command):
+    """Names under which the options of a command are kept."""
+    return {one.field_info.name for one in cli.arguments_of(command) if one.name.startswith("--") and one.parse} - OF_ALL
 
 
 def test_every_command_is_tried():
-    assert set(offered()) == set(RUNS)
+    assert set(COMMANDS) == set(RUNS)
 
 
 @pytest.mark.parametrize("command", RUNS)
-def test_every_option_of_a_command_is_read_or_refused_by_it(command, asked):
-    read = set()
+def test_every_option_of_a_command_is_read_by_it(command, asked, capsys):
     for arguments in RUNS[command]:
         code = cli.main([{"FILE": "FILE.npz", "VOLUME": "VOLUME.npy"}.get(argument, argument) for argument in arguments])
         assert code in (cli.DONE, cli.FAILED, cli.WRONG_USAGE)
-        read |= asked
-    assert not offered()[command] - read, "offered, and never looked at"
+    assert not offered(command) - asked, "offered, and never looked at"
+
+
+def test_render_shows_no_more_options_than_a_person_can_take_in(capsys):
+    shown = [one.name for one in cli.arguments_of("render") if one.show and one.name.startswith("--")]
+    assert len(shown) <= 46
+    code, out, _ = run(capsys, "render", "--help")
+    assert code == 0 and all(f"  {name}" in out for name in shown)
+    assert {word for word in out.split() if word.startswith("--") and word[2:].strip(":,").isidentifier()} <= {
+        *(name for name in shown),
+        *(f"{name}:" for name in shown),
+        *(f"{name}," for name in shown),
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_begins_with_examples_and_names_exit_codes_and_json(command, capsys):
+    code, out, err = run(capsys, command, "--help")
+    assert (code, err) == (0, []) and out.startswith("Examples:\n  ") and "jaxsph" in out.splitlines()[1]
+    assert "Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted, 143" in " ".join(out.split())
+    assert "--json" in out and max(map(len, out.splitlines())) <= 130
+    code, short, err = run(capsys, command, "-h")
+    assert (code, err) == (0, []) and "Examples:\n  " in short and len(short) < len(out) and "--help" in short
+
+
+def test_the_groups_of_the_command_line_are_those_of_python():
+    for own, shared in ((groups.Source, opening.Source), (groups.View, opening.View), (groups.Look, opening.Look)):
+        assert issubclass(render.Render, own) and issubclass(own, shared)
+        mine = {field.name: field for field in dataclasses.fields(own)}
+        for field in dataclasses.fields(shared):
+            assert mine[field.name].default == field.default, field.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["rendr", "FILE"], "render"),
+        (["render", "FILE", "--colr-by", "heat"], "--color-by"),
+        (["render", "scene:mixre"], "mixer"),
+        (["render", "none.npz", "--colormap", "viridsi"], "viridis"),  # before the file is looked for
+        (["render", "none.npz", "--norm", "logg"], "log"),
+        (["render", "none.npz", "--integrator", "segment"], "segments"),
+        (["render", "FILE", "--color-by", "haet"], "heat"),
+        (["project", "FILE", "--of", "haet"], "heat"),
+        (["render", "scene:mixer:particels=3"], "particles"),
+        (["render", "none.npz", "--background", "whiet"], "white"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_typing_errors_are_answered_with_what_was_meant(arguments, meant, asked, capsys):
+    code, _, err = run(capsys, *("FILE.npz" if word == "FILE" else word for word in arguments))
+    assert code in (1, 2) and len(err) == 1 and f"did you mean {meant}?" in err[0].replace("Did", "did")
+
+
+def test_options_are_not_abbreviated(asked, capsys):
+    code, _, err = run(capsys, "render", "FILE.npz", "--tol", "0.1")
+    assert code == 2 and len(err) == 1 and "--tol" in err[0]
+
+
+def test_help_imports_nothing_that_takes_time():
+    """What `jaxsph.cli.main` imports at its top, and what that imports, is of this package's lightest modules."""
+    light, ahead = set(), ["jaxsph.cli.main"]
+    root = Path(js.__file__).parent.parent
+    while ahead:
+        name = ahead.pop()
+        light.add(name)
+        for node in ast.parse((root / (name.replace(".", "/") + ".py")).read_text(encoding="utf-8")).body:
+            names = [node.module] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            for found in names:
+                assert found.split(".")[0] not in ("jax", "numpy", "scipy"), (name, found)
+                if found.startswith("jaxsph."):
+                    inside = [f"{found}.{alias.name}" for alias in node.names]
+                    files = [one for one in (*inside, found) if (root / (one.replace(".", "/") + ".py")).exists()]
+                    ahead += [one for one in files if one not in light]
+    assert len(light) < 10
+    assert all(importlib.util.find_spec(f"jaxsph.cli.commands.{command.module}") for command in COMMANDS.values())

@@ -42,16 +42,28 @@ def pictured(monkeypatch, capsys, *arguments):
         raise RuntimeError("enough")
 
     monkeypatch.setattr(js, "render", render)
-    code, out, err = run(capsys, "render", *arguments, *TINY)
+    code, out, err = run(capsys, "render", *arguments, *TINY, "--verbose")
+    err = [line for line in err if line.startswith("jaxsph ")]  # the others are where the error comes from
     assert (code, err[-1:]) == (1, ["jaxsph render: enough"]), err
     return given["scene"], given["camera"], out, err[:-1]
 
 
-def framed(camera, *boxes):
-    """Whether all corners of boxes are in view and between near and far."""
-    for lower, upper in boxes:
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
-        view = (corners - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+def ends_of(part, axes):
+    """The outermost places of a part: corners of a volume, of balls what is farthest along each axis of the camera."""
+    if isinstance(part, js.Volume):
+        lower, upper = part.bounds()
+        return np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
+    valid = np.asarray(part.valid)
+    radius = np.asarray(part.support if isinstance(part, js.Particles) else part.radius, np.float64)[valid]
+    center = np.asarray(part.position, np.float64)[valid]
+    return np.concatenate([center + sign * radius[:, None] * axis for axis in axes for sign in (-1, 1)])
+
+
+def framed(camera, *parts):
+    """Whether all of each part is in view, and between near and far."""
+    axes = np.asarray(camera.axes, np.float64)
+    for part in parts:
+        view = (ends_of(part, axes) - camera.exact_eye()) @ axes.T
         aside = np.abs(view[:, :2]) / view[:, 2:] / float(camera.half_height) / (camera.width / camera.height, 1)
         if not ((aside <= 1).all() and (view[:, 2] >= camera.near).all() and (view[:, 2] <= camera.far).all()):
             return False
@@ -84,7 +96,7 @@ def test_all_parts_are_in_one_scene_and_in_view(files, monkeypatch, capsys):
     scene, camera, _, err = pictured(monkeypatch, capsys, *arguments, "--mix", "opacity")
     assert scene.particles.num_particles == 60 and len(scene.volumes) == len(scene.point_sets) == 2 and scene.mix == "opacity"
     scene.check()
-    assert not err and framed(camera, scene.particles.bounds(), scene.volumes[0][0].bounds(), scene.point_sets[0].bounds())
+    assert not err and framed(camera, scene.particles, scene.volumes[0][0], scene.point_sets[0])
 
 
 @pytest.mark.parametrize("source", ["scene:mixer", "gas.vti", None])
@@ -97,7 +109,7 @@ def test_any_source_takes_points_and_none_too(files, monkeypatch, capsys, source
     ]
     scene, camera, *_ = pictured(monkeypatch, capsys, *arguments)
     scene.check()
-    assert scene.point_sets[0].num_points == 2 and framed(camera, scene.point_sets[0].bounds())
+    assert scene.point_sets[0].num_points == 2 and framed(camera, scene.point_sets[0])
 
 
 def test_an_iso_surface_takes_points_and_a_camera_that_is_said_is_used(files, monkeypatch, capsys):
@@ -110,17 +122,17 @@ def test_an_iso_surface_takes_points_and_a_camera_that_is_said_is_used(files, mo
 
 def test_without_more_parts_scenes_are_as_before(files, monkeypatch, capsys):
     scene, camera, *_ = pictured(monkeypatch, capsys, "gas.vti")
-    assert isinstance(scene.volume, js.Volume) and scene.points is None and scene.mix == "extinction"
-    assert float(camera.near) == float(js.Camera.framing(scene.volume, width=24, height=16).near)
+    assert len(scene.volumes) == 1 and scene.points is None and scene.mix == "extinction"
+    assert camera.describe() == io.read_scene("gas.vti", size=(24, 16))[1].describe()
 
 
 @pytest.mark.parametrize(
     ("options", "radius", "color", "said"),
     [
-        (["--point-radius", "0.25"], [0.25, 0.25], [(1, 1, 1), (1, 1, 1)], "given by the caller"),
-        (["--point-radius", "mass", "--point-color", "1,0.5,0"], [1, 5], [(1, 0.5, 0), (1, 0.5, 0)], "column `mass`"),
+        (":radius=0.25", [0.25, 0.25], [(1, 1, 1), (1, 1, 1)], "given by the caller"),
+        (":radius=mass,color=1,0.5,0", [1, 5], [(1, 0.5, 0), (1, 0.5, 0)], "column `mass`"),
         (
-            ["--point-radius", "1", "--point-color", "mass", "--point-colormap", "gray"],
+            ":radius=1,color=mass,colormap=gray",
             [1, 1],
             [(32 / 255,) * 3, (1, 1, 1)],
             "gray over mass",
@@ -128,7 +140,7 @@ def test_without_more_parts_scenes_are_as_before(files, monkeypatch, capsys):
     ],
 )
 def test_radius_colour_and_opacity_are_numbers_or_columns(files, monkeypatch, capsys, options, radius, color, said):
-    scene, _, out, _ = pictured(monkeypatch, capsys, "--points", "bare.csv", *options, "--point-opacity", "0.5")
+    scene, _, out, _ = pictured(monkeypatch, capsys, "--points", f"bare.csv{options},opacity=0.5")
     points = scene.points[0]
     np.testing.assert_array_equal(points.radius[:2], radius)
     np.testing.assert_allclose(points.color[:2], color, atol=1e-3)
@@ -137,14 +149,14 @@ def test_radius_colour_and_opacity_are_numbers_or_columns(files, monkeypatch, ca
 
 
 def test_parts_that_lie_far_apart_are_warned_of_and_pictured(files, monkeypatch, capsys):
-    scene, camera, _, err = pictured(monkeypatch, capsys, "gas.vti", "--points", "far.csv", "--point-opacity", "0.5")
-    assert len(err) == 1 and framed(camera, scene.volumes[0][0].bounds(), scene.points[0].bounds())
+    scene, camera, _, err = pictured(monkeypatch, capsys, "gas.vti", "--points", "far.csv:opacity=0.5")
+    assert len(err) == 1 and framed(camera, scene.volumes[0][0], scene.points[0])
     assert err[0].startswith("jaxsph render: warning: gas.vti in [-1, 1] x [-1, 1] x [-1, 1] and far.csv in [999.9, 1001] x")
     assert "lie 998.9 apart: are they in the same units?" in err[0]
 
 
 def test_info_says_what_would_be_taken(files, capsys):
-    code, out, err = run(capsys, "info", "--points", "bare.csv", "--point-radius", "0.5", "--volume", "gas.vti")
+    code, out, err = run(capsys, "info", "--points", "bare.csv:radius=0.5", "--volume", "gas.vti")
     assert (code, err) == (0, [])
     for said in (
         "2 points",
@@ -164,18 +176,22 @@ def test_info_says_what_would_be_taken(files, capsys):
 
 WRONG_USAGE = [
     (["render"], "a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE"),
-    (["info"], "or --cache"),
+    (["info"], "or --points FILE, or --volume FILE"),
     (["render", "gas.vti", "--point-radius", "1"], "--point-radius is for --points FILE, and there is none"),
     (["render", "gas.vti", "--volume-colormap", "ice"], "--volume-colormap is for --volume FILE, and there is none"),
-    (["render", "--points", "stars.csv", "--point-radius", "0"], "--point-radius must be > 0, got 0"),
-    (["render", "--points", "stars.csv", "--point-radius", "nan"], "--point-radius must be > 0, got nan"),
-    (["render", "--points", "stars.csv", "--point-opacity", "1"], "--point-opacity must be in [0, 1), got 1"),
+    (["render", "--points", "stars.csv", "--point-radius", "0"], "--points stars.csv: radius must be > 0, got 0"),
+    (["render", "--points", "stars.csv:radius=nan"], "--points stars.csv: radius must be > 0, got nan"),
+    (["render", "--points", "stars.csv:opacity=1"], "--points stars.csv: opacity must be in [0, 1), got 1"),
+    (
+        ["render", "--points", "stars.csv:radus=1"],
+        "no option 'radus'; there are type, radius, opacity, color, colormap; did you mean radius?",
+    ),
     (["render", "--points", "stars.csv", "--point-color", "1,2"], "R,G,B from 0 to 1, as in 1,0.5,0; got '1,2'"),
     (["render", "--points", "stars.csv", "--point-color", "255,0,0"], "got '255,0,0'"),
     (["render", "--points", "stars.csv", "--point-color", "a,b,c"], "got 'a,b,c'"),
-    (["render", "--points", "stars.csv", "--quantity", "mass"], "--quantity is for FILE or scene:NAME, and there is none"),
-    (["render", "--points", "stars.csv", "--mix", "sum"], "invalid choice"),
-    (["render", "--points"], "expected one argument"),
+    (["render", "--points", "stars.csv", "--quantity", "mass"], "--color-by is for FILE or scene:NAME, and there is none"),
+    (["render", "--points", "stars.csv", "--mix", "sum"], "--mix must be one of extinction, opacity, got 'sum'"),
+    (["render", "--points"], "--points needs a value"),
 ]
 
 
@@ -186,7 +202,10 @@ def test_wrong_usage_is_exit_code_2_and_one_line(files, capsys, arguments, messa
 
 
 FAILURES = [
-    (["--points", "bare.csv"], "bare.csv: has no radius of its points: there are mass; give `radius=NUMBER` (--point-radius)"),
+    (
+        ["--points", "bare.csv"],
+        "bare.csv: has no radius of its points: there are mass; give `radius=NUMBER` (:radius=R)",
+    ),
     (
         ["--points", "stars.csv", "--point-color", "age"],
         "`color`: there is no column 'age': there are radius, r, g, b,",

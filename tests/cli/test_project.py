@@ -68,9 +68,9 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
         (["--of", "temperature", "--weight", "mass"], given["temperature"], given["mass"], {}),
         (["--emission", 2], given["density"] * given["mass"], None, {}),
         (["--emission", 1.5, "--of", "temperature"], given["temperature"] * given["density"] ** 0.5 * given["mass"], None, {}),
-        (["--depth-range", 0.4, 0.6], given["mass"], None, {"slab": (0.4, 0.6)}),
+        (["--depth-range", "0.4,0.6"], given["mass"], None, {"slab": (0.4, 0.6)}),
     ):
-        found, _ = values(capsys, file, "--axis", "x", "--pixel", "ray", *arguments)
+        found, _ = values(capsys, file, "--view", "x", "--pixel", "ray", *arguments)
         view = js.along_axis(particles, "x", 18, 12, **more) if more else camera
         truth = js.reference.project(particles, view, of, weight, **ray).values
         there = np.isfinite(truth) & np.isfinite(found)
@@ -87,7 +87,7 @@ def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file
     sums = [image.sum() * 4 * float(frame.half_height) ** 2 for image, frame in zip((some, others), frames, strict=True)]
     frame = js.along_axis(io.read_particles("bare.npz", "x"), "z", 18, 12)
     np.testing.assert_allclose(sum(sums), whole.sum() * 4 * float(frame.half_height) ** 2, rtol=1e-3)
-    image, out = values(capsys, "bare.npz", "--box", 1, 1, 1, "--size", "12x12")
+    image, out = values(capsys, "bare.npz", "--box-size", "1,1,1", "--size", "12x12")
     assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area
 
 
@@ -101,7 +101,7 @@ def test_from_an_eye_it_is_in_perspective(file, capsys):
 
 
 def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys):
-    code, out, err = run(capsys, "bare.npz", *TINY, "-o", "out.png", "--colormap", "heat", "--norm", "log", "--range", 1, 100)
+    code, out, err = run(capsys, "bare.npz", *TINY, "-o", "out.png", "--colormap", "heat", "--norm", "log", "--range", "1,100")
     assert (code, err) == (0, []) and "particles a unit of area" in out
     assert np.asarray(io.read_image("out.png").color).max() > 0.3
 
@@ -111,11 +111,11 @@ def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys
     [
         (["-o", "a.jpg"], "a projection must be .exr, .npy, .png"),
         (["--support", 0], "--support must be > 0"),
-        (["--axis", "w"], "invalid choice"),
-        (["--axis", "x", "--eye", 0, 0, 9], "--axis and --eye exclude each other"),
+        (["--axis", "w"], "--view must be one of x, y, z, got 'w'"),
+        (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--target", 0, 0, 0], "--target needs --eye"),
         (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
-        (["--depth-range", 2, 1], "--depth-range must ascend"),
+        (["--depth-range", "2,1"], "--depth-range must ascend"),
         (["--norm", "log"], "are for a picture"),
         (["--eye", 0, 0, 9, "--target", 0, 0, 9], "must differ"),
         (["--size", "0x4"], "at least 1 pixel"),

@@ -1,17 +1,16 @@
 """Several files at once on the command line."""
 
-import argparse
 from pathlib import Path
 
 import pytest
 
-from jaxsph.cli.console import UsageError
-from jaxsph.cli.options import stem_of
-from jaxsph.cli.render import outputs_of, render_each
+from jaxsph.cli.commands.render import Render, outputs_of, render_each
+from jaxsph.cli.options.settings import stem_of
+from jaxsph.cli.voice import UsageError
 
 
 def options(*sources, output=None):
-    return argparse.Namespace(source=list(sources), output=output)
+    return Render(source=list(sources), output=output)
 
 
 def test_pictures_are_named_after_their_files():

@@ -70,13 +70,13 @@ def ball_of(place, center=(0.5, 0.5, 0.9), radius=0.4):
 
 
 CLIPPED = {
-    "plane": (["--clip-plane", 0.5, 0.5, 0.5, 1, 0, -1], lambda place: (place - 0.5) @ (1, 0, -1) >= 0),
-    "inside of a box": (["--clip-box", 0, 0, 0, 0.6, 0.7, 0.5], box_of),
-    "outside of a box": (["--cut-box", 0, 0, 0, 0.6, 0.7, 0.5], lambda place: ~box_of(place)),
-    "inside of a sphere": (["--clip-sphere", 0.5, 0.5, 0.9, 0.4], ball_of),
-    "outside of a sphere": (["--cut-sphere", 0.5, 0.5, 0.9, 0.4], lambda place: ~ball_of(place)),
+    "plane": (["--clip", "plane:0.5,0.5,0.5,1,0,-1"], lambda place: (place - 0.5) @ (1, 0, -1) >= 0),
+    "inside of a box": (["--clip", "box:0,0,0,0.6,0.7,0.5"], box_of),
+    "outside of a box": (["--clip", "~box:0,0,0,0.6,0.7,0.5"], lambda place: ~box_of(place)),
+    "inside of a sphere": (["--clip", "sphere:0.5,0.5,0.9,0.4"], ball_of),
+    "outside of a sphere": (["--clip", "~sphere:0.5,0.5,0.9,0.4"], lambda place: ~ball_of(place)),
     "several": (
-        ["--cut-sphere", 0.2, 0.2, 0.9, 0.3, "--cut-sphere", 0.8, 0.8, 0.9, 0.3, "--clip-plane", 0, 0, 0.1, 0, 0, 1],
+        ["--clip", "~sphere:0.2,0.2,0.9,0.3", "--clip", "~sphere:0.8,0.8,0.9,0.3", "--clip", "plane:0,0,0.1,0,0,1"],
         lambda place: (place[:, 2] >= 0.1) & ~ball_of(place, (0.2, 0.2, 0.9), 0.3) & ~ball_of(place, (0.8, 0.8, 0.9), 0.3),
     ),
 }
@@ -89,33 +89,33 @@ def test_each_clip_shows_its_part_of_space(file, seen, capsys, name):
     found = np.asarray(seen.scene.within.contains(tuple(jnp.asarray(PLACES.T, jnp.float32))))
     np.testing.assert_array_equal(found, truth(PLACES))
     assert 0.02 < found.mean() < 0.98
-    assert f"jaxsph.{arguments[0][2:].replace('-', '_')}" in kept
+    assert kept["jaxsph.clip"] == " ".join(arguments[1::2])
 
 
 def test_the_camera_frames_what_boxes_and_spheres_leave(file, seen, capsys):
     made(capsys, file)
     whole = seen.camera
-    made(capsys, file, "--clip-box", 0.4, 0.4, 0.4, 0.6, 0.6, 0.6)
+    made(capsys, file, "--clip", "box:0.4,0.4,0.4,0.6,0.6,0.6")
     near, far = (np.linalg.norm(camera.exact_eye() - 0.5) for camera in (seen.camera, whole))
-    assert near < 0.3 * far and abs(np.asarray(seen.camera.axes)[2] @ (0.5 - seen.camera.exact_eye()) / near - 1) < 1e-3
-    made(capsys, file, "--clip-plane", 0.5, 0.5, 0.5, 1, 0, 0)
-    assert seen.camera.describe() == whole.describe()
+    assert near < 0.3 * far and abs(np.asarray(seen.camera.axes)[2] @ (0.5 - seen.camera.exact_eye()) / near - 1) < 1e-2
+    made(capsys, file, "--clip", "plane:0.5,0.5,0.5,1,0,0")
+    assert np.linalg.norm(seen.camera.exact_eye() - (0.75, 0.5, 0.5)) < far  # what is lit is half of it, around x = 0.75
 
 
 def test_a_box_and_its_middle_are_those_asked_for(file, seen, capsys):
-    out, _ = made(capsys, file, "--box", 1, 1, 1)
+    out, _ = made(capsys, file, "--box-size", "1,1,1")
     assert "periodic box of 1 x 1 x 1" in out
     np.testing.assert_allclose(seen.scene.particles.box.corners(), [(0, 0, 0), (1, 1, 1)])
     assert made(capsys, file)[0].count("periodic") == 0 and seen.scene.particles.box is None
-    out, _ = made(capsys, file, "--box", 1, 1, 1, "--center", 0.9, 0.25, -0.5)
+    out, _ = made(capsys, file, "--box-size", "1,1,1", "--center", "0.9,0.25,-0.5")
     assert "0.9 0.25 -0.5" in out
     lower, upper = seen.scene.particles.bounds()
     np.testing.assert_allclose((lower + upper) / 2, (0.9, 0.25, -0.5), atol=1e-6)
     place = seen.scene.particles.to_numpy()["position"]
     assert (place >= lower - 1e-6).all() and (place <= upper + 1e-6).all()
     for middle in ([0.9, 0.25, -0.5], ["densest"]):  # FILE may come after it
-        assert run(capsys, "render", "-o", "out.exr", *TINY, "--box", 1, 1, 1, "--center", *middle, file)[0] == 0
-    densest = js.io.read_particles(file, box=(1, 1, 1)).centered("densest").bounds()
+        assert run(capsys, "render", "-o", "out.exr", *TINY, "--box-size", "1,1,1", "--center", *middle, file)[0] == 0
+    densest = io.read_scene(file, box=(1, 1, 1), center="densest")[0].particles.bounds()
     np.testing.assert_allclose(seen.scene.particles.bounds(), densest)
 
 
@@ -129,14 +129,14 @@ def test_the_box_of_a_file_can_be_left_aside(tmp_path, monkeypatch, seen, capsys
         part["SmoothingLength"], part["Density"] = np.full(30, 0.3), np.linspace(1, 2, 30)
     made(capsys, "a.hdf5")
     assert seen.scene.particles.box is not None
-    made(capsys, "a.hdf5", "--not-periodic")
+    made(capsys, "a.hdf5", "--box-size", "none")
     assert seen.scene.particles.box is None
 
 
 def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
-    plane = ["--slice", 0.5, 0.5, 0.5, 0, 0, 1, "--quantity", "pressure", "--size", "24x16"]
+    plane = ["--plane", "0.5,0.5,0.5,0,0,1", "--color-by", "pressure", "--size", "24x16"]
     for name in ("a.npy", "a.exr", "a.png"):
-        code, out, err = run(capsys, "render", file, "-o", name, *plane)
+        code, out, err = run(capsys, "slice", file, "-o", name, *plane)
         assert (code, err) == (0, []) and "of the pixels inside of supports" in out
     particles = io.read_particles(file, "pressure")
     expected = js.slice_of(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
@@ -145,53 +145,70 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
 
 
 def test_info_says_what_would_be_left(file, capsys):
-    code, out, err = run(capsys, "info", file, "--where", "pressure < 0.5", "--box", 1, 1, 1)
+    code, out, err = run(capsys, "info", file, "--where", "pressure < 0.5", "--box-size", "1,1,1")
     assert (code, err) == (0, []) and "left out by pressure < 0.5" in out and "periodic box of 1 x 1 x 1" in out
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--clip-plane", 0, 0, 0, 0, 0, 0], "--clip-plane: `normal` must not be (0, 0, 0)"),
-        (["--slice", 0, 0, 0, 0, 0, 0], "--slice: `normal` must not be (0, 0, 0)"),
-        (["--clip-box", 0, 0, 0, 1, -1, 1], "--clip-box: `lower` must be below `upper`"),
-        (["--cut-sphere", 0, 0, 0, -1], "--cut-sphere: `radius` must be > 0"),
-        (["--clip-sphere", 0, 0, "nan", 1], "--clip-sphere: `center` must be finite"),
-        (["--clip-box", 5, 5, 5, 6, 6, 6], "nothing is inside of --clip-box and --clip-sphere; there is something from"),
+        (["--clip", "plane:0,0,0,0,0,0"], "--clip: plane:0,0,0,0,0,0: normal must not be (0, 0, 0)"),
+        (["--clip", "box:0,0,0,1,-1,1"], "--clip: box:0,0,0,1,-1,1: lower must be below upper"),
+        (["--clip", "~sphere:0,0,0,-1"], "--clip: ~sphere:0,0,0,-1: radius must be > 0"),
+        (["--clip", "sphere:0,0,nan,1"], "center must be finite"),
+        (["--clip", "spere:0,0,0,1"], "did you mean sphere?"),
+        (["--clip", "box:5,5,5,6,6,6"], "nothing is inside of --clip; there is something from"),
+        (["--clip", "none", "--clip", "box:0,0,0,1,1,1"], "--clip none stands alone"),
         (["--where", "entropy > 1"], "no quantity 'entropy'; there are temperature, pressure"),
         (["--where", "temperature >"], "the condition 'temperature >' is not understood at its end"),
         (["--where", "temperature > 1 and (pressure"], "at character 21, '(pressure'"),
-        (["--share", 0], "`share` must be above 0 and at most 1, got 0"),
-        (["--share", 2], "`share` must be above 0 and at most 1, got 2"),
+        (["--share", 0], "--share must be above 0 and at most 1, got 0"),
+        (["--share", 2], "--share must be above 0 and at most 1, got 2"),
         (["--box", 1, 1, 1, "--not-periodic"], "--box and --not-periodic exclude each other"),
-        (["--box", 1, 0, 1], "--box must be three lengths > 0, got 1 0 1"),
-        (["--center", 0, 0, 0], "--center is for periodic boxes, and this is none"),
-        (["--center", "middle"], "--center must be X Y Z or densest, got middle"),
-        (["--center", 0, 0], "--center must be X Y Z or densest, got 0 0"),
-        (["--box", 1, 1, 1, "--center", "inf", 0, 0], "--center must be"),
+        (["--box-size", "1,0,1"], "--box-size must be three lengths > 0 as LX,LY,LZ, or none; got '1,0,1'"),
+        (["--center", "9,9,9"], "--center = 9 9 9 is outside of everything: that lies from"),
+        (["--center", "middle"], "--center must be X,Y,Z, densest or mass, got 'middle'"),
+        (["--center", "densets"], "did you mean densest?"),
+        (["--center", "0,0"], "--center must be X,Y,Z, densest or mass, got '0,0'"),
+        (["--box-size", "1,1,1", "--center", "inf,0,0"], "--center must be"),
+        (["--width", "0"], "--width must be > 0 and finite, got '0'"),
+        (["--width", "3 kpc"], "--width = '3 kpc' has a unit, but the file does not state that of its lengths"),
         (["-o", "a.npy"], "an image must be .exr or .png"),
-        (["--slice", 0, 0, 0, 0, 0, 1, "-o", "a.jpg"], "an image must be .npy or .exr or .png"),
     ],
 )
 def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
-    code, _, err = run(capsys, "render", file, *(TINY[:2] if "--slice" in arguments else TINY), *arguments)
+    code, _, err = run(capsys, "render", file, *TINY, *arguments)
     assert code == 2 and len(err) == 1 and said in err[0], err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--plane", "0,0,0,0,0,0"], 2, "--plane: 0,0,0,0,0,0: normal must not be (0, 0, 0)"),
+        (["--plane", "0,0,0,0,0,1", "-o", "a.jpg"], 2, "an image must be .npy or .exr or .png"),
+        (["--plane", "0,0,9,0,0,1"], 1, "no particle reaches the plane; there are particles from"),
+        (["--plane", "0,0,0,0,0,1", "--view", "x"], 2, "--plane and --view exclude each other"),
+        (["--tolerance", "1"], 2, "Unknown option: --tolerance"),
+    ],
+)
+def test_slices_that_cannot_be_are_told_in_one_line(file, capsys, arguments, code, said):
+    found, _, err = run(capsys, "slice", file, *TINY[:2], *arguments)
+    assert found == code and len(err) == 1 and said in err[0], err
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--where", "temperature > 10 and pressure > 2"], "80 left out by pressure > 2"),
-        (["--slice", 0, 0, 9, 0, 0, 1], "no particle reaches the plane of --slice; there are particles from"),
-        (["--box", 0.2, 1, 1], "no side shorter than the largest support, but 0.2 < 0.25"),
+        (["--box-size", "0.2,1,1"], "no side shorter than the largest support, but 0.2 < 0.25"),
     ],
 )
 def test_work_that_cannot_be_done_is_told_in_one_line(file, capsys, arguments, said):
-    code, _, err = run(capsys, "render", file, *(TINY[:2] if "--slice" in arguments else TINY), *arguments)
+    code, _, err = run(capsys, "render", file, *TINY, *arguments)
     assert code == 1 and len(err) == 1 and said in err[0], err
 
 
-@pytest.mark.parametrize("option", [["--where", "x > 0"], ["--share", 0.5], ["--box", 1, 1, 1], ["--center", 0, 0, 0]])
+@pytest.mark.parametrize("option", [["--where", "x > 0"], ["--share", 0.5], ["--box-size", "1,1,1"]])
 def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monkeypatch, capsys, option):
     monkeypatch.chdir(tmp_path)
     np.save("a.npy", np.zeros((4, 4, 4), np.float32))
@@ -200,15 +217,12 @@ def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monk
         assert code == 2 and len(err) == 1 and option[0] in err[0]
 
 
-@pytest.mark.parametrize(
-    "beside",
-    [
-        ["--annotate"], ["--eye", 1, 2, 3], ["--target", 1, 2, 3], ["--fov", 30], ["--tolerance", 0.1], ["--progressive"],
-        ["--opacity", 2], ["--opacity-by", "pressure"], ["--relax", 0], ["--screen", "quadtree"], ["--memory", 1],
-        ["--integrator", "samples"], ["--estimator", "pilot"], ["--samples", 64],
-    ],
-    ids=lambda beside: beside[0],
-)  # fmt: skip
-def test_what_does_nothing_to_a_slice_is_refused_beside_it(file, capsys, beside):
-    code, _, err = run(capsys, "render", file, "--slice", 0.5, 0.5, 0.5, 0, 0, 1, *beside, "-o", "s.png")
-    assert code == 2 and len(err) == 1 and f"{beside[0]} and --slice exclude each other" in err[0]
+def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, capsys):
+    code, _, err = run(
+        capsys, "slice", file, "--center", "0.5,0.5,0.4", "--view", "x", "--width", "0.6", *TINY[:2], "-o", "a.npy"
+    )
+    assert (code, err) == (0, [])
+    particles = io.read_particles(file)
+    plane = js.Plane((0.5, 0.5, 0.4), (1, 0, 0))
+    expected = js.slice_of(particles, plane, center=(0.5, 0.5, 0.4), view_height=0.4, width=24, height=16)
+    np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)

@@ -21,8 +21,8 @@ PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
 CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2",)}
 ONCE = {"repeats": 1, "converged": 1, "integral": 0}
 SETTINGS, POINTS_8, POINTS_4 = (js.Settings(samples=samples, integrator="samples") for samples in (SAMPLES, 8, 4))
-SOURCE = ["scene:radial", "--particles", PARTICLES, "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
-LEAST_WORK = ["--estimators", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]
+SOURCE = [f"scene:radial:particles={PARTICLES}", "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
+LEAST_WORK = ["--estimators=", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +352,7 @@ def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(ro
 
 def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, capsys):
     pytest.importorskip("matplotlib")
-    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--frames", 0, 2, *LEAST_WORK)
+    code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--moments", "0,2", *LEAST_WORK)
     assert (code, err) == (0, [])
     names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "integral.png", "frames.png")
     assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == sorted(names)
@@ -384,15 +384,15 @@ def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
     ("arguments", "message"),
     [
         ([], "-o"),
-        (["-o", "out", "--tolerances", "-1"], "number >= 0"),
+        (["-o", "out", "--tolerances", "-1"], "--tolerances must be numbers >= 0, got '-1'"),
         (["-o", "out", "--tolerances", "none"], "'none'"),
-        (["-o", "out", "--estimators", "exact"], "invalid choice"),
+        (["-o", "out", "--estimators", "exact"], "--estimators must be one of"),
         (["-o", "out", "--baselines", "half"], "samples/2"),
         (["-o", "out", "--repeats", "0"], "at least 1"),
         (["-o", "out", "--integral", "-1"], "at least 0"),
-        (["-o", "out", "--integrator", "walks"], "invalid choice"),
+        (["-o", "out", "--integrator", "walks"], "--integrator must be one of"),
         (["-o", "out", "--samples", "0"], "--samples must be"),
-        (["-o", "out", "--frames", "1", "1"], "different"),
+        (["-o", "out", "--moments", "1,1"], "different"),
         (["-o", "out", "--frames", "1", "--frame", "1"], "exclude"),
     ],
 )

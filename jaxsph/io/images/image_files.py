@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from jaxsph.io.damage import regular_file
 from jaxsph.io.images import exr, png
@@ -16,16 +17,30 @@ from jaxsph.model.image import Image
 FORMATS = {".exr": exr, ".png": png}
 
 
-def write_image(path: str | os.PathLike[str], image: Image) -> None:
+def write_image(path: str | os.PathLike[str], image: Image, background: Any = None) -> None:
     """Write `image` to `path`, whole or not at all: `.exr` (every layer) or `.png` (8 bit colours over black).
 
     Both show the same: a PNG holds `image.color` as displayed, an EXR the linear light of it (`jaxsph.io.images.scene_linear`).
 
+    Args:
+        path: where to.
+        image: what.
+        background: of a PNG, what is behind the picture: a colour as `Image.over` takes it, `"transparent"`, or None for black.
+            An EXR holds alpha, over which any background can be put.
+
     Raises:
-        ValueError: another suffix, or a place that cannot be written to.
+        ValueError: another suffix, a place that cannot be written to, no colour, or a colour behind an EXR.
     """
     file = Path(path)
-    _format(file).write(file, image)
+    form = _format(file)
+    if form is exr and background not in (None, "transparent"):
+        raise ValueError(
+            f"`background` = {background!r} is for .png: {path} holds alpha, over which any can be put; leave it out"
+        )
+    if form is exr or background is None:
+        form.write(file, image)
+    else:
+        png.write(file, image, background)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:

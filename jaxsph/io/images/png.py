@@ -1,4 +1,4 @@
-"""PNG images: 8 bit RGB of the colours over black, for looking at.
+"""PNG images: 8 bit RGB of the colours over black, or another background, or RGBA in front of none, for looking at.
 
 Colours come from a transfer function, which is made by eye on a display, so they are display-referred (sRGB): they are written
 as they are, clipped to [0, 1] and rounded to the nearest of 256 steps, with no further encoding. Layers other than
@@ -22,13 +22,38 @@ from jaxsph.model.image import Image
 SOURCE = "PNG"
 
 
-def write(path: Path, image: Image) -> None:
-    """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to."""
-    write_pixels(path, image.to_uint8(), dict(image.metadata))
+def write(path: Path, image: Image, background: Any = None) -> None:
+    """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to.
+
+    Args:
+        path: where to.
+        image: what.
+        background: None is black; `"transparent"` keeps alpha; else a colour.
+    """
+    if background is None:
+        pixels = image.to_uint8()
+    elif background == "transparent":
+        pixels = with_alpha(image)
+    else:
+        pixels = (image.over(background) * 255 + 0.5).astype(np.uint8)
+    write_pixels(path, pixels, dict(image.metadata))
+
+
+def with_alpha(image: Image) -> np.ndarray:
+    """(H, W, 4) uint8: colours divided by alpha, as PNG has them, and alpha.
+
+    Colours are display-referred, premultiplied, and divided as they are: in front of black, programs that mix displayed values
+    show `image.color`. Where alpha is 0 in 8 bits, nothing is seen, and colours are 0; elsewhere they are divided by the alpha
+    that is written, and at most 1, as they are at most alpha where colours of the transfer function are at most 1.
+    """
+    color = np.clip(np.nan_to_num(np.asarray(image.color, np.float64), nan=0.0), 0, 1)
+    alpha = np.floor(np.clip(np.nan_to_num(np.asarray(image.alpha, np.float64), nan=1.0), 0, 1) * 255 + 0.5)
+    straight = np.divide(color * 255, alpha[..., None], out=np.zeros_like(color), where=alpha[..., None] > 0)
+    return np.concatenate([np.clip(straight, 0, 1) * 255 + 0.5, alpha[..., None]], -1).astype(np.uint8)
 
 
 def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) -> None:
-    """Write (H, W, 3) uint8, whole or not at all, with metadata in text chunks."""
+    """Write (H, W, 3) or (H, W, 4) uint8, whole or not at all, with metadata in text chunks."""
     pillow = require("PIL.Image", "writing PNG images")
     chunks = require("PIL.PngImagePlugin", "writing PNG images").PngInfo()
     for name, value in metadata.items():

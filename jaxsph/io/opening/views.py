@@ -158,6 +158,8 @@ def place_of(scene: Scene, center: Any, table: ParticleTable | None) -> np.ndarr
     lower, upper = scene.bounds()
     if not isinstance(center, str):
         place = np.asarray(center, np.float64)
+        if scene.particles is not None and scene.particles.box is not None:  # of which every place is inside, by its period
+            return place
         if (place < lower).any() or (place > upper).any():
             ends = " to ".join(" ".join(f"{value:.6g}" for value in end) for end in (lower, upper))
             raise ValueError(f"`center` = {' '.join(f'{v:g}' for v in place)} is outside of everything: that lies from {ends}")

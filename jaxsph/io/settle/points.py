@@ -24,6 +24,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import given
+from jaxsph.numerics.nearest import did_you_mean
 
 RADIUS_NAMES = ("radius", "radii", "rad", "r", "size")
 COLOR_TRIPLES = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g", "color_b"))
@@ -136,7 +137,7 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
         given = table.named(*SMOOTHING_NAMES)
     if given is None:
         raise DataError(
-            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (--point-radius), or the name of a column"
+            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (:radius=R), or the name of a column"
         )
     values, name = _values(table, "radius", given)
     return _positive(values, name), f"column `{name}`"
@@ -215,7 +216,11 @@ def _values(table: ParticleTable, role: str, name: str) -> tuple[np.ndarray, str
         return choose_quantity(table, name)
     except DataError as error:
         unknown = "there is no quantity" in str(error)
-        said = f"there is no column {name!r}: {_there_is(table)}; choose one of them" if unknown else str(error)
+        said = (
+            f"there is no column {name!r}: {_there_is(table)}; choose one of them{did_you_mean(name, table.columns)}"
+            if unknown
+            else str(error)
+        )
         raise DataError(f"`{role}`: {said}") from error
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.table import ParticleTable, plain, refuse_rows
+from jaxsph.numerics.nearest import did_you_mean
 
 ROLES: dict[str, tuple[str, ...]] = {
     "density": ("density", "densities", "rho", "gas_density", "den"),
@@ -110,9 +111,9 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return _scalar(table, stored), stored
     if role == "density" and density is not None:
         return density(), "density"
-    raise DataError(
-        f"there is no quantity {name!r}; there are {', '.join(available_quantities(table))}, and `log10:` before any of them"
-    )
+    known = available_quantities(table)
+    meant = did_you_mean(name, known)
+    raise DataError(f"there is no quantity {name!r}; there are {', '.join(known)}, and `log10:` before any of them{meant}")
 
 
 def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:

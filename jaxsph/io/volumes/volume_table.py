@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 
 from jaxsph.io.damage import DataError
+from jaxsph.numerics.nearest import did_you_mean
 
 COMPONENTS = "xyz"
 SKEW = 1e-6  # of a step along an axis that may lie across it: directions are written with some seven digits
@@ -58,7 +59,7 @@ class VolumeTable:
             index = COMPONENTS.find(part) if part and part in COMPONENTS else int(part) if part.isdigit() else -1
             if 0 <= index < values.shape[3]:
                 return name, values[..., index]
-        raise DataError(f"has no quantity {name!r}; it has {', '.join(self.names())}")
+        raise DataError(f"has no quantity {name!r}; it has {', '.join(self.names())}{did_you_mean(name, self.names())}")
 
     def names(self) -> list[str]:
         """All that `quantity` knows."""

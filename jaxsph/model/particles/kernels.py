@@ -17,6 +17,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsph.numerics.nearest import did_you_mean
+
 MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
 NOTHING = 1e-37  # the same for particles of no size, which pad blocks: the least that float32 holds in full
 
@@ -172,7 +174,7 @@ KERNELS = {
 def by_name(name: str) -> Kernel:
     """The kernel called `name`; raises `ValueError` listing the known ones."""
     if name not in KERNELS:
-        raise ValueError(f"`kernel` must be one of {', '.join(KERNELS)}, got {name!r}")
+        raise ValueError(f"`kernel` must be one of {', '.join(KERNELS)}, got {name!r}{did_you_mean(name, KERNELS)}")
     return KERNELS[name]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.nearest import did_you_mean
 
 COLORMAPS: dict[str, tuple[str, ...]] = {
     "viridis": ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"),
@@ -34,6 +35,7 @@ def colormap(name: str) -> Float[np.ndarray, "points 3"]:
     Raises:
         ValueError: an unknown name.
     """
+    known: list[str] = list(COLORMAPS)
     base, reverse = (name[:-2], -1) if name.endswith("_r") else (name, 1)
     if base in COLORMAPS:
         rows = np.array([[int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)] for code in COLORMAPS[base]])
@@ -46,8 +48,8 @@ def colormap(name: str) -> Float[np.ndarray, "points 3"]:
     else:
         if base in colormaps:
             return np.asarray(colormaps[base](np.linspace(0, 1, POINTS)))[::reverse, :3]
-        more = " or a name of matplotlib's"
-    raise ValueError(f"`colormap` must be one of {', '.join(COLORMAPS)}{more}; got {name!r}")
+        more, known = " or a name of matplotlib's", [*COLORMAPS, *colormaps]
+    raise ValueError(f"`colormap` must be one of {', '.join(COLORMAPS)}{more}; got {name!r}{did_you_mean(name, known)}")
 
 
 def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float]:

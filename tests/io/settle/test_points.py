@@ -135,7 +135,7 @@ def test_a_function_reads_the_scalar_columns_as_attributes():
 
 
 REFUSED = [
-    ({}, {}, "has no radius of its points: there are positions alone; give `radius=NUMBER` .--point-radius., or the name"),
+    ({}, {}, "has no radius of its points: there are positions alone; give `radius=NUMBER` .:radius=R., or the name"),
     ({"mass": [1.0, 2.0]}, {}, "has no radius of its points: there are mass; give"),
     ({"radius": [1.0, np.nan]}, {}, "column `radius` must be finite, but 1 of 2 values are not, the first in row 2: nan"),
     ({"radius": [0.0, 1.0]}, {}, "`radius` is a radius and must be > 0, but 1 of 2 are not, the first in row 1: 0"),

@@ -5,32 +5,36 @@ Flow: file, options -> [cli_project] -> project -> EXR, NPY or PNG.
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import functools
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from cyclopts import Parameter
 
 from jaxsph import io
 from jaxsph.analysis.projection.plan import PIXELS, plan_projection
-from jaxsph.analysis.projection.project import project
-from jaxsph.cli import options as cli_options
-from jaxsph.cli import scene as cli_scene
+from jaxsph.analysis.projection.project import project as projected
+from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, progress, refuse, say, say_notes, span, wrong_usage
-from jaxsph.cli.options import PLACE
+from jaxsph.cli.console import UsageError, progress, refuse, say_notes, span, wrong_usage
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import CAMERA, LOOK, OWN, option, output
+from jaxsph.cli.options.settings import SCENE
+from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
+from jaxsph.io.opening.views import place_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
-from jaxsph.model import Camera, Particles
-from jaxsph.model.camera.framing import VIEWS, along_axis
+from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission
-from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.projection import NORMS, Projection
+from jaxsph.model.transfer.looks import default_transfer
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -40,55 +44,69 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 
-MORE = (
-    "NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a "
-    "column density, number to a column number density, and the integral of any other quantity is taken along rays; nothing is "
-    "normalised. What you do not say is chosen, and said."
-)
 
-
-def add_options(parser: argparse.ArgumentParser) -> None:
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Project(groups.Options, groups.Selection, groups.View):
     """Options of the command."""
-    parser.add_argument("source", metavar="FILE", help="file of particles")
-    suffixes = ", ".join(SUFFIXES)
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help=f"{suffixes} (default: FILE's name with .exr, here)")
-    add = parser.add_argument_group("what is projected").add_argument
-    add("--of", metavar="NAME", help="mass, number, volume or a quantity (default: mass where there are masses, else number)")
-    add("--weight", metavar="NAME", help="a mean of --of along rays, by mass, number, volume, or a quantity times volume")
-    add("--emission", type=float, metavar="N", help="emission: the integral of density^N, times --of where that is given")
-    add(
-        "--pixel",
-        choices=PIXELS,
-        default=PIXELS[0],
-        help="means of pixels, which keep all mass, or values of rays (default mean)",
-    )
-    add("--support", type=float, metavar="H", help="support radius (default: the file's, or from neighbours)")
-    add("--kernel", choices=tuple(KERNELS), help="(default: that of the file or its code, else poly6)")
-    add("--part-type", type=int, metavar="N", help="of a Gadget-like file (default: gas, else the first)")
-    cli_where.add_selection(parser)
-    add = parser.add_argument_group("camera", "default: parallel rays along z, all of the particles").add_argument
-    add("--axis", choices=tuple(VIEWS), help="parallel rays along an axis")
-    add("--eye", **PLACE, help="perspective from here")
-    add("--target", **PLACE, help="what the eye looks at (default: the middle of the particles)")
-    add("--up", **PLACE, help="upward direction (default 0 1 0)")
-    add("--fov", type=float, metavar="DEG", help="vertical field of view (default 45)")
-    depths = "what lies between: coordinates along the --axis, or depths from the --eye"
-    add("--depth-range", nargs=2, type=float, metavar=("A", "B"), help=depths)
-    add("--size", type=cli_options.size, default=(512, 512), metavar="WxH", help="pixels (default 512x512)")
-    add = parser.add_argument_group("colours of a .png").add_argument
-    add("--colormap", metavar="NAME", help="(default viridis)")
-    add("--norm", choices=NORMS, help="(default: log where values span more than a decade)")
-    add("--range", nargs=2, type=float, metavar=("LOW", "HIGH"), help="values that the colours span (default: nearly all)")
+
+    view: Annotated[
+        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)")
+    ] = None
+    clip: Annotated[Any, groups.NOT_HERE] = ()
+    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")] = None
+    of: Annotated[
+        str | None,
+        option("--of", "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)"),
+    ] = None
+    weight: Annotated[
+        str | None,
+        option("--weight", "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"),
+    ] = None
+    emission: Annotated[
+        float | None,
+        option("--emission", "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"),
+    ] = None
+    pixel: Annotated[
+        str,
+        option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"),
+    ] = PIXELS[0]
+    depth_range: Annotated[
+        Any,
+        option(
+            "--depth-range",
+            "A,B",
+            values.numbers("A,B"),
+            CAMERA,
+            "what lies between: coordinates along the --view, or depths from the --eye",
+        ),
+    ] = None
+    colormap: Annotated[str | None, groups.colormap_option("of a .png: a colour map (default viridis)")] = None
+    norm: Annotated[
+        str | None,
+        option("--norm", "NAME", values.one_of(NORMS), LOOK, f"of a .png: {', '.join(NORMS)} (default: log over a decade)"),
+    ] = None
+    range: Annotated[
+        Any, option("--range", "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
+    ] = None
 
 
-def run(options: argparse.Namespace) -> None:
-    """Project, write, and say."""
-    options = _checked(options)
+PROJECT = Project()
+
+
+def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = PROJECT) -> None:
+    """Project, write, and say.
+
+    NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a column
+    density, number to a column number density, and the integral of any other quantity is taken along rays.
+    """
+    options = _checked(dataclasses.replace(asked, source=file))
     output = options.output or Path(Path(options.source).stem + ".exr")
     table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
+    which: dict[str, Any] = {"box": options.box, "where": options.where, "share": options.share}
     with wrong_usage(of=io.ConditionError):
-        table = chosen(table, "density", options.support, options.kernel, **cli_where.selected(options))
+        table = chosen(table, "density", options.support, options.kernel, **which)
     particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
     say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
     say("kernel", report.kernel)
@@ -96,15 +114,20 @@ def run(options: argparse.Namespace) -> None:
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    camera = _camera(particles, options)
+    camera = _camera(particles, table, options)
     say("camera", camera.describe())
     image, seconds = _projected(particles, camera, (of, weight), options.pixel, name)
-    values = np.asarray(image.values)
+    found = np.asarray(image.values)
     image.save(output, **_look(options))
-    say("image", f"{output}, {name} {span(values[np.isfinite(values)])}")
+    said = found[np.isfinite(found)]
+    say("image", f"{output}, {name} {span(said)}")
     if weight is None and not camera.is_perspective:
-        say("total", f"{float(image.total()):.7g} in the image, of {float(np.sum(of)):.7g}")
+        total = float(image.total())
+        say("total", f"{total:.7g} in the image, of {float(np.sum(of)):.7g}")
+        voice.report(total=total, of_all=float(np.sum(of)))
     say("time", f"{sum(seconds.values()):.2f} s: " + ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items()))
+    lowest, highest = (float(said.min()), float(said.max())) if said.size else (None, None)
+    voice.written(output, name=name, lowest=lowest, highest=highest, camera=camera.describe(), seconds=seconds)
 
 
 def _projected(particles: Particles, camera: Camera, held: Any, pixel: str, name: str) -> tuple[Projection, dict[str, float]]:
@@ -117,21 +140,21 @@ def _projected(particles: Particles, camera: Camera, held: Any, pixel: str, name
         planned = time.perf_counter() - started
         tell(1, 2)
         clock = Clock()
-        image = project(particles, camera, *held, pixel=pixel, plan=plan, name=name, clock=clock)
+        image = projected(particles, camera, *held, pixel=pixel, plan=plan, name=name, clock=clock)
         tell(2, 2)
     return image, {"plan": planned, "compile": clock.seconds["compile"], "cast": clock.seconds["cast"]}
 
 
-def _checked(options: argparse.Namespace) -> argparse.Namespace:
+def _checked(options: Any) -> Any:
     """The options; `UsageError` where they exclude each other, or are out of range."""
-    options = cli_where.settled(options)
+    if options.source.startswith(SCENE):
+        raise UsageError(f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
     if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{options.output}: a projection must be {', '.join(SUFFIXES)}")
-    cli_options.require_support(options)
-    if options.axis is not None and options.eye is not None:
-        raise UsageError("--axis and --eye exclude each other: rays are parallel or spread from the eye")
+    if options.view is not None and options.eye is not None:
+        raise UsageError("--view and --eye exclude each other: rays are parallel or spread from the eye")
     if options.eye is None:
-        refuse(options, ("target", "up", "fov"), "needs --eye: from where should it be looked at?")
+        refuse(options, ("up", "fov_degrees"), "needs --eye: from where should it be looked at?")
     if options.emission is not None and options.weight is not None:
         raise UsageError("--emission is an integral, not a mean: leave out --weight")
     if options.depth_range is not None and not options.depth_range[0] < options.depth_range[1]:
@@ -188,7 +211,7 @@ class _Columns:
         return io.kernel_sum(self.table.position, support, mass, kernel=self._particles.kernel, box=self.table.box_size)
 
 
-def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray | None, str, str]:
+def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | None, str, str]:
     """Amounts or values, weights, the name of the result, and a sentence about it."""
     default = MASS if columns.mass_name is not None else NUMBER
     if options.emission is not None:
@@ -205,14 +228,19 @@ def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, 
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
 
 
-def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
+def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Camera:
     depths = None if options.depth_range is None else tuple(options.depth_range)
-    if options.eye is not None:
-        return cli_scene.camera_of(particles, options, depths)
-    with wrong_usage():
-        return along_axis(particles, options.axis or "z", *options.size, slab=depths)
+    if options.eye is None and options.view is None:
+        options = dataclasses.replace(options, view="z")
+    if isinstance(options.center, str):
+        with wrong_usage():
+            place = place_of(Scene(particles=particles, transfer=default_transfer(particles)), options.center, table)
+        assert place is not None
+        say("center", " ".join(f"{value:.6g}" for value in place))
+        options = dataclasses.replace(options, center=tuple(place))
+    return cli_where.camera_of(particles, options, depths, table.units.length)
 
 
-def _look(options: argparse.Namespace) -> dict[str, Any]:
+def _look(options: Any) -> dict[str, Any]:
     given = {"colormap": options.colormap, "norm": options.norm, "value_span": options.range}
     return {name: value for name, value in given.items() if value is not None}

@@ -5,21 +5,22 @@ Flow: files, options -> Snapshots, CameraPath, client -> render_frames -> [cli_m
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from cyclopts import Parameter
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import (
     UsageError,
@@ -27,15 +28,18 @@ from jaxsph.cli.console import (
     progress,
     refuse,
     require_writable,
-    say,
     say_notes,
     say_report,
     span,
     tell_if_unseen,
     wrong_usage,
 )
-from jaxsph.cli.options import SCENE, replaced, require_support, settings_of
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
+from jaxsph.cli.options.settings import SCENE, settings_of, stem_of
+from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.settle.assemble import AUTO
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
@@ -44,7 +48,6 @@ from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Reading, Survey, surveyed
 from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
 
-MORE = "Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped."
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
 MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
@@ -57,32 +60,65 @@ EVERY = 5.0
 """Seconds between two lines on what is done, where no bar is shown."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of the command besides those of its source and picture, which are there already."""
-    parser.set_defaults(size=None)  # so that the size in a file of key frames is taken unless another is asked for
-    more = "(default: named after the first source, here); frames are in OUT_frames"
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT.mp4", help=more)
-    group = parser.add_argument_group("movie")
-    add = group.add_mutually_exclusive_group().add_argument
-    add("--camera", type=Path, metavar="KEYS.json", help="key frames of the camera; times are seconds of the movie")
-    add("--orbit", type=float, metavar="DEGREES", help="go around, counterclockwise as seen from above; 360 can be looped")
-    add = group.add_argument
-    add("--fps", type=float, default=24.0, metavar="F", help="frames a second (default 24)")
-    add("--frames", type=int, metavar="N", help="(default: as long as KEYS; else 10 s, or one a snapshot if those are more)")
-    add("--frame-format", choices=("png", "exr"), default="png", help="of the frames (default png)")
-    add("--gaps", action="store_true", help="go on where numbers are missing in the names of a sequence")
-    add("--strict", action="store_true", help="end where a file cannot be read (default: render the others)")
-    add = parser.add_argument_group("several processes").add_mutually_exclusive_group().add_argument
-    add("--workers", type=int, metavar="N", help="render frames by N processes of this machine, each with its share of the cores")
-    add("--client", metavar="ADDRESS", help="render frames by the workers of a Dask scheduler, such as tcp://HOST:8786")
+FORMATS = ("png", "exr")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Say what is shown, render the frames that are not there, and write the movie."""
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Movie(groups.Options, groups.Control, groups.Look, groups.View, groups.Mixed, groups.Source):
+    """Options of the command."""
+
+    size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")] = None
+    output: Annotated[
+        Path | None, output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
+    ] = None
+    camera: Annotated[
+        Any, option("--camera", "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
+    ] = None
+    orbit: Annotated[
+        float | None, option("--orbit", "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
+    ] = None
+    fps: Annotated[float, option("--fps", "F", values.number, OWN, "frames a second (default 24)")] = 24.0
+    frames: Annotated[
+        int | None, option("--frames", "N", values.whole, OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
+    ] = None
+    frame_format: Annotated[
+        str, option("--frame-format", "NAME", values.one_of(FORMATS), OUTPUT, "of the frames: png or exr (default png)")
+    ] = "png"
+    gaps: Annotated[bool, flag("--gaps", OWN, "go on where numbers are missing in the names of a sequence")] = False
+    strict: Annotated[bool, flag("--strict", OWN, "end where a file cannot be read (default: render the others)")] = False
+    workers: Annotated[
+        int | None, option("--workers", "N", values.whole, MEANS, "render frames by N processes of this machine")
+    ] = None
+    client: Annotated[
+        str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Check what each group checks, with a size."""
+        if self.size is not None:
+            super().__post_init__()
+            return
+        object.__setattr__(self, "size", (512, 512))
+        super().__post_init__()
+        object.__setattr__(self, "size", None)
+
+
+MOVIE = Movie()
+
+
+def movie(
+    *files: Annotated[str, Parameter(help="a file, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")],
+    asked: Movie = MOVIE,
+) -> None:
+    """Say what is shown, render the frames that are not there, and write the movie.
+
+    Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped.
+    """
+    options = dataclasses.replace(asked, source=list(files))
     settings, output = settings_of(options), _checked(options)
-    options = cli_where.settled(options)
     io.images.movie.encoder()
-    sized, options = options.size is not None, replaced(options, size=options.size or (512, 512))
+    sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
         sources, camera, shown = _sequence(options) if len(options.source) > 1 else _still(options)
         path = _path(options, camera, shown, sized)
@@ -92,13 +128,14 @@ def run(options: argparse.Namespace) -> None:
             path = _orbit(options, camera, shown, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
+        voice.release()
         folder = output.with_name(f"{output.stem}_frames")
         pattern = folder / f"{{:05d}}.{options.frame_format}"
         at_once = 1 if client is None else max(len(client.nthreads()), 1)
         rendered = render_frames(_moments(sources, frames), cameras, settings, client, output=pattern)
-        files, failed = _written(rendered, frames, folder, at_once)
-        if files:
-            _write(files, frames, options, cameras[0], output)
+        files_made, failed = _written(rendered, frames, folder, at_once)
+        if files_made:
+            _write(files_made, frames, options, cameras[0], output)
     if failed is not None:
         raise failed
     unread = () if isinstance(sources, Still) else sources.survey.unread
@@ -106,9 +143,11 @@ def run(options: argparse.Namespace) -> None:
         raise ValueError(f"{len(unread)} of the snapshots cannot be read: {'; '.join(file.why for file in unread)}")
 
 
-def _checked(options: argparse.Namespace) -> Path:
+def _checked(options: Any) -> Path:
     """The output, once options make sense."""
-    output: Path = options.output or Path(Path(options.source[0].removeprefix(SCENE)).stem + ".mp4")
+    if not options.source:
+        raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
+    output: Path = options.output or Path(f"{_stem(options.source[0])}.mp4")
     if output.suffix.lower() != ".mp4":
         raise UsageError(f"{output}: a movie must be .mp4; its frames may be EXR by --frame-format exr")
     require_writable(output, "a movie must be", (".mp4",))
@@ -121,19 +160,25 @@ def _checked(options: argparse.Namespace) -> Path:
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
     if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
         raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
-    if options.progressive:
-        raise UsageError("--progressive is for one image; frames of a movie are rendered to their end")
+    if options.orbit is not None and options.camera is not None:
+        raise UsageError("--orbit and --camera exclude each other: one goes around, the other follows KEYS.json")
+    if options.workers is not None and options.client is not None:
+        raise UsageError("--workers and --client exclude each other: processes of this machine, or those of a scheduler")
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
     if options.camera is not None:
-        refuse(options, ("eye", "target", "fov"), "and --camera exclude each other; KEYS.json places the camera")
+        refuse(options, cli_where.PLACED, "and --camera exclude each other; KEYS.json places the camera")
     if options.workers is not None and options.workers < 1:
         raise UsageError(f"--workers must be at least 1, got {options.workers}")
     return output
 
 
+def _stem(source: str) -> str:
+    return stem_of(source) if source.startswith(SCENE) else Path(source).stem
+
+
 @contextlib.contextmanager
-def _client_of(options: argparse.Namespace) -> Iterator[Any]:
+def _client_of(options: Any) -> Iterator[Any]:
     """The client that is asked for, until the block ends; None where frames are rendered by this process.
 
     Raises:
@@ -167,11 +212,11 @@ def _client_of(options: argparse.Namespace) -> Iterator[Any]:
         yield client
 
 
-def _still(options: argparse.Namespace) -> tuple[Still, Camera, Bounded]:
+def _still(options: Any) -> tuple[Still, Camera, Bounded]:
     """One source, its camera, and what there is to see from all sides."""
-    options = replaced(options, source=options.source[0])
+    options = dataclasses.replace(options, source=options.source[0])
+    cli_scene.require_something(options)
     scene, camera, _ = cli_scene.scene_of(options)
-    scene = dataclasses.replace(scene, within=cli_where.clip_of(options))
     if scene.parts and not scene.media:
         return Still(scene), camera, cli_where.framed(scene, options)
     near, far = float(camera.near), float(camera.far)  # media do not say how large they are: what the camera sees of depth
@@ -180,16 +225,15 @@ def _still(options: argparse.Namespace) -> tuple[Still, Camera, Bounded]:
     return Still(scene), camera, cli_where.framed(BoundingBox(center - reach, center + reach), options)
 
 
-def _sequence(options: argparse.Namespace) -> tuple[Snapshots, Camera, Bounded]:
+def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded]:
     """The snapshots and their look, as said on the way; a camera, and what there ever is."""
     for path in options.source:
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
-    of_one = "particles", "frame", "iso", "volume", "points", "mix"
-    refuse(options, of_one, "is not for a sequence of particle files")
-    require_support(options)
-    more = {**cli_where.selected(options), "opacity_by": cli_scene.opacity_by(options)}
-    reading = Reading(options.quantity, options.support, options.kernel, options.part_type, **more)
+    refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
+    more = {"box": options.box, "where": options.where, "share": options.share}
+    more["opacity_by"] = options.opacity_by or (None if options.transfer is not None else AUTO)
+    reading = Reading(options.color_by, options.support, options.kernel, options.part_type, **more)
     with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
         try:
             survey = surveyed(options.source, reading, gaps=options.gaps, strict=options.strict, progress=show)
@@ -198,13 +242,14 @@ def _sequence(options: argparse.Namespace) -> tuple[Snapshots, Camera, Bounded]:
                 raise ValueError(f"{error}; --gaps goes on without") from error
             raise
     _say_survey(survey)
-    looks = options if options.transfer is not None else replaced(options, range=options.range or survey.span)
-    transfer = cli_look.look(survey.middle, looks, survey.quantity, cli_scene.ramp_of(survey.report))
+    looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
+    transfer = cli_look.look(survey.middle, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     center = cli_where.middle_of(survey, options)
     snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options))
-    return snapshots, cli_scene.camera_of(snapshots, options), cli_where.framed(snapshots, options)
+    placed = dataclasses.replace(options, center=None) if center is not None else options
+    return snapshots, cli_where.camera_of(snapshots, placed), cli_where.framed(snapshots, options)
 
 
 def _say_survey(survey: Survey) -> None:
@@ -227,7 +272,7 @@ def _moments(sources: Still | Snapshots, frames: int) -> Still | Sequence[Source
     return sources.moments(np.linspace(sources.times[0], sources.times[-1], frames).tolist())
 
 
-def _path(options: argparse.Namespace, camera: Camera, shown: Bounded, sized: bool) -> CameraPath | None:
+def _path(options: Any, camera: Camera, shown: Bounded, sized: bool) -> CameraPath | None:
     """Key frames, if there is a file of them, of its own size unless another is asked for."""
     if options.camera is None:
         return None
@@ -235,7 +280,7 @@ def _path(options: argparse.Namespace, camera: Camera, shown: Bounded, sized: bo
     return io.read_camera_path(options.camera, shown=shown, **size)
 
 
-def _number_of_frames(options: argparse.Namespace, path: CameraPath | None, snapshots: int) -> int:
+def _number_of_frames(options: Any, path: CameraPath | None, snapshots: int) -> int:
     if options.frames is not None:
         return int(options.frames)
     if path is not None and path.end > path.start:
@@ -263,7 +308,7 @@ class _OnPath(Sequence[Camera]):
         return self._path.at(self._path.start + self._frames[frame] / self._fps)
 
 
-def _orbit(options: argparse.Namespace, camera: Camera, shown: Bounded, seconds: float) -> CameraPath:
+def _orbit(options: Any, camera: Camera, shown: Bounded, seconds: float) -> CameraPath:
     """Around the middle of all there is, or the target, from where all is in view from every side unless the eye is given.
 
     It ends where its next frame would begin anew.
@@ -329,7 +374,7 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
-def _write(files: Sequence[Path], frames: int, options: argparse.Namespace, camera: Camera, output: Path) -> None:
+def _write(files: Sequence[Path], frames: int, options: Any, camera: Camera, output: Path) -> None:
     """Write the movie, and say what it shows."""
     io.write_movie(output, files, options.fps)
     padded = " and a row or column to make both even" if camera.width % 2 or camera.height % 2 else ""
@@ -337,4 +382,5 @@ def _write(files: Sequence[Path], frames: int, options: argparse.Namespace, came
     duration = f"{len(files) / options.fps:.4g} s at {options.fps:g} a second"
     say("movie", f"{output}, {count}, {duration}, {camera.width} x {camera.height}{padded}")
     some = {files[0], files[len(files) // 2], files[-1]}
+    voice.written(output, frames=len(files), of=frames, fps=options.fps, size=[camera.width, camera.height])
     tell_if_unseen(options.command, output, [io.read_image(path).color for path in some])

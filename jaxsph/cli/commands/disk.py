@@ -5,22 +5,28 @@ Flow: options -> [cli_disk] -> OnDisk, Image -> cli.
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import math
 import time
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from cyclopts import Parameter
 
 from jaxsph.cli import look as cli_look
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, camera_line, progress, refuse, say, span, time_line
-from jaxsph.cli.options import SCENE
+from jaxsph.cli.console import UsageError, camera_line, progress, refuse, span, time_line
+from jaxsph.cli.options import groups
+from jaxsph.cli.options.groups import DATA, option, output
+from jaxsph.cli.options.settings import SCENE
+from jaxsph.cli.options.values import whole
+from jaxsph.cli.voice import say
 from jaxsph.io.disk.index import index_path
 from jaxsph.io.disk.rows import Snapshot
 from jaxsph.io.disk.sort import sort_snapshot
-from jaxsph.model import Image, Settings
+from jaxsph.model import Camera, Image, Settings
 from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
 from jaxsph.scale.on_disk import OnDisk
 
@@ -28,33 +34,27 @@ GIB = 2**30
 DIGITS = 4
 FRACTIONS = 10**DIGITS
 """Of a GiB, to which memory is named."""
-OTHERS = ("volume", "points", "iso", "support", "particles", "frame", *cli_where.CLIPS)
+OTHERS = ("volume", "points", "iso", "support", "where", "share", "center", "width", "clip")
 """Options of what cannot be rendered part by part."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The option of `render`."""
-    more = "leave the particles of a Gadget-like HDF5 snapshot on disk, and keep at most GIB of them and of what is made of them"
-    parser.add_argument("--from-disk", type=float, metavar="GIB", help=more)
-
-
-def render(options: argparse.Namespace, settings: Settings) -> Image:
-    """The picture of a snapshot that stays on disk.
+def render_options(options: Any, settings: Settings) -> tuple[Image, Camera]:
+    """The picture of a snapshot that stays on disk, and its camera.
 
     Raises:
         UsageError: options that need all particles at once.
     """
-    if not 0 < options.from_disk < 2**20:
-        raise UsageError(f"--from-disk must be a positive number of GiB, got {options.from_disk:g}")
     if options.source is None or options.source.startswith(SCENE):
         raise UsageError("--from-disk is for a snapshot file")
-    refuse(options, (*OTHERS, *cli_where.OF_PARTICLES), "needs all particles at once; leave out --from-disk")
-    if options.progressive or options.screen == "quadtree" or options.annotate:
+    refuse(options, OTHERS, "needs all particles at once; leave out --from-disk")
+    if options.box != "file":
+        raise UsageError("--box-size needs all particles at once; leave out --from-disk")
+    if options.progressive or options.screen == "quadtree" or cli_look.has_key(options):
         raise UsageError("--from-disk renders the image pane by pane; leave out --progressive, --screen and --annotate")
     with progress("index", " reads") as show:
         on_disk = OnDisk.open(
             options.source,
-            options.quantity,
+            options.color_by,
             kernel=options.kernel,
             part_type=options.part_type,
             opacity_by=options.opacity_by or "auto",
@@ -68,8 +68,8 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
     say("quantity", f"{name}, {span(values)} of a sample of {len(values):,}")
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_look.look(on_disk.sample, options, name, on_disk.ramp)
-    camera = cli_scene.camera_of(on_disk, options)
+    transfer = cli_look.look(on_disk.sample, options, name)
+    camera = cli_where.camera_of(on_disk, options)
     say("camera", camera_line(camera))
     started = time.perf_counter()
     try:
@@ -79,26 +79,40 @@ def render(options: argparse.Namespace, settings: Settings) -> Image:
         raise ValueError(_too_little(options, error)) from error
     say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
     say("time", time_line(image, time.perf_counter() - started))
-    return image
+    return image, camera
 
 
-def _too_little(options: argparse.Namespace, error: TooLittleMemoryError) -> str:
+def _too_little(options: Any, error: TooLittleMemoryError) -> str:
     """In words of the command line: the least memory that works, rounded up to what is written of it."""
     option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
     least = math.ceil(error.least / GIB * FRACTIONS) / FRACTIONS
     return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
 
 
-def add_sort(parser: argparse.ArgumentParser) -> None:
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sort(groups.Options):
     """Options of the command `sort`."""
-    parser.add_argument("source", metavar="FILE", help="Gadget-like HDF5; any file of a snapshot in several")
-    where = "one file, ordered in space; one that is there is replaced only if it was sorted from a FILE of this name"
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.hdf5", help=where)
-    parser.add_argument("--part-type", type=int, metavar="N", help="kind of particles (default: gas, else the first)")
+
+    output: Annotated[
+        Path | None, output("one file; one that is there is replaced only if it was sorted from a FILE of this name", "OUT.hdf5")
+    ] = None
+    part_type: Annotated[
+        int | None, option("--part-type", "N", whole, DATA, "kind of particles (default: gas, else the first)")
+    ] = None
 
 
-def sort(options: argparse.Namespace) -> None:
+SORT = Sort()
+
+
+def sort(
+    file: Annotated[str, Parameter(help="Gadget-like HDF5; any file of a snapshot in several")], /, *, asked: Sort = SORT
+) -> None:
     """Order a snapshot in space."""
+    if asked.output is None:
+        raise UsageError("-o OUT.hdf5 is needed: where should the sorted particles go?")
     with progress("sort", " reads") as show:
-        sort_snapshot(options.source, options.output, part_type=options.part_type, progress=show)
-    say("sorted", f"{options.output}, {len(Snapshot(options.output, options.part_type)):,} particles")
+        sort_snapshot(file, asked.output, part_type=asked.part_type, progress=show)
+    particles = len(Snapshot(asked.output, asked.part_type))
+    say("sorted", f"{asked.output}, {particles:,} particles")
+    voice.written(asked.output, particles=particles)

@@ -1,0 +1,61 @@
+"""The command `doctor`: versions, devices and the cache, as a report of a fault should have them.
+
+Flow: installed packages, JAX -> [doctor] -> lines on stdout.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import sys
+
+from jaxsph.cli import cache as kept
+from jaxsph.cli import voice
+from jaxsph.cli.options import groups
+from jaxsph.cli.voice import say
+from jaxsph.numerics.version import __version__
+
+NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
+WANTED = {
+    "h5py": "HDF5 snapshots",
+    "matplotlib": "figures, more colour maps",
+    "unyt": "names of units",
+    "tqdm": "progress bars",
+    "imageio-ffmpeg": "movies",
+    "nibabel": "NIfTI volumes",
+    "pynrrd": "NRRD volumes",
+    "distributed": "movies by several processes",
+    "xarray": "labelled arrays",
+}
+OPTIONS = groups.Options()
+
+
+def doctor(*, asked: groups.Options = OPTIONS) -> None:
+    """Say versions, devices and the cache."""
+    import jax
+
+    system = f"{platform.system()} {platform.release()}, {platform.machine()}"
+    found = {name: _version(name) for name in (*NEEDED, *WANTED)}
+    devices = [f"{device.platform}:{device.id} {device.device_kind}" for device in jax.devices()]
+    say("jaxsph", __version__)
+    say("python", f"{platform.python_version()}, {sys.executable}")
+    say("system", system)
+    say("versions", ", ".join(f"{name} {found[name] or 'MISSING'}" for name in NEEDED))
+    there = [f"{name} {found[name]}" for name in WANTED if found[name]]
+    say("optional", ", ".join(there) or "none")
+    for name, what in WANTED.items():
+        if not found[name]:
+            say("absent", f"{name}: {what}")
+    say("devices", ", ".join(devices))
+    say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
+    for what, text in kept.described():
+        say(what, text)
+    voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
+    voice.report(cache=str(kept.folder()))
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None

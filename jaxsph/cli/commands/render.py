@@ -1,0 +1,231 @@
+"""The command `render`: a picture of each file, whole or a part of it, in one go or in stages.
+
+Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on stdout, prose on stderr.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+import jaxsph
+from jaxsph.cli import look as cli_look
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
+from jaxsph.cli import where as cli_where
+from jaxsph.cli.commands import disk, merge
+from jaxsph.cli.console import (
+    IMAGES,
+    UsageError,
+    camera_line,
+    error_line,
+    largest,
+    progress,
+    require_writable,
+    tell_if_unseen,
+    time_line,
+)
+from jaxsph.cli.options import groups, values, words
+from jaxsph.cli.options.groups import DATA, MEANS, OUTPUT, QUALITY, flag, option, output
+from jaxsph.cli.options.settings import devices_of, settings_of, stem_of
+from jaxsph.cli.voice import say
+from jaxsph.engine.frame.progressive import progressive
+from jaxsph.io.images.image_files import write_image
+from jaxsph.model import Image, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.scale import parts as tiles
+
+NAME = "{}"
+"""What stands in OUT for the name of a file."""
+WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: named after FILE, here)"
+
+
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render(groups.Options, groups.Control, groups.Key, groups.Look, groups.View, groups.Mixed, groups.Source):
+    """Options of the command."""
+
+    output: Annotated[Path | None, output(WHERE)] = None
+    background: Annotated[
+        str | None,
+        option("--background", "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"),
+    ] = None
+    annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")] = False
+    progressive: Annotated[bool, flag("--progressive", QUALITY, "by a quadtree, in stages: OUT is rewritten at each")] = False
+    devices: Annotated[
+        Any, option("--devices", "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
+    ] = None
+    tile: Annotated[
+        Any,
+        option("--tile", "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together"),
+    ] = None
+    from_disk: Annotated[
+        float | None,
+        option("--from-disk", "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"),
+    ] = None
+    like: Annotated[
+        Any, option("--like", "PICTURE", Path, DATA, "take the options by which a picture was made; those beside it win")
+    ] = None
+
+
+RENDER = Render()
+
+
+def render(
+    *files: Annotated[str, Parameter(help="files of particles or of volumes, or scene:NAME[:particles=N,frame=K]")],
+    asked: Render = RENDER,
+) -> None:
+    """Make a picture of each source that is given, or of the parts that stand for it."""
+    render_each(dataclasses.replace(asked, source=list(files)), _render)
+
+
+def render_each(options: Any, render: Callable[[Any], None]) -> None:
+    """Render each of `options.source`; one that fails keeps none of the others from being done.
+
+    Raises:
+        UsageError: OUT is not for several files, or two files have the same name.
+        RuntimeError: some failed; the message says which, and why.
+    """
+    sources = options.source
+    if len(sources) < 2:
+        render(dataclasses.replace(options, source=sources[0] if sources else None))
+        return
+    outputs, failed = outputs_of(sources, options.output), []
+    voice.release()
+    for nth, (source, place) in enumerate(zip(sources, outputs, strict=True), 1):
+        say("", f"{nth} of {len(sources)}: {source}")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            render(dataclasses.replace(options, source=source, output=place))
+        except (ValueError, OSError, RuntimeError) as error:
+            failed.append(f"{source}: {error}")
+            say("failed", str(error))
+    if failed:
+        raise RuntimeError(f"{len(failed)} of {len(sources)} failed: {'; '.join(failed)}")
+
+
+def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
+    """Where the picture of each goes: into a folder, or by a name with `{}` in it; here without."""
+    names = [stem_of(source) for source in sources]
+    if len(set(names)) < len(names):  # equal names in two folders
+        names = [f"{Path(source).parent.name}_{name}".strip("_") for source, name in zip(sources, names, strict=True)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UsageError(f"two pictures would be called {twice}: render these files one by one, with -o")
+    if output is None:
+        return [Path(f"{name}.png") for name in names]
+    if NAME in output.name:
+        return [output.with_name(output.name.replace(NAME, name)) for name in names]
+    if output.suffix.lower() in IMAGES:
+        raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
+    return [output / f"{name}.png" for name in names]
+
+
+def _render(options: Any) -> None:
+    """One picture."""
+    settings, devices = settings_of(options), devices_of(options)
+    if options.progressive and options.screen == "pixels":
+        raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
+    cli_scene.require_something(options)
+    first = options.source or (options.volume or options.points)[0].file
+    output = options.output or Path(stem_of(first) + merge.suffix(options))
+    require_writable(output, "an image must be", IMAGES)
+    cli_look.check_key(options, output)
+    merge.check_tile(options, settings, output)
+    _check_background(options, output)
+    if options.from_disk is not None:
+        image, camera = disk.render_options(options, settings)
+        _save(image, options, output)
+        _say_written(output, image, camera, settings, options)
+        return
+    scene, camera, labels = cli_scene.scene_of(options)
+    say("camera", camera_line(camera, options))
+    started = time.perf_counter()
+    if options.progressive:
+        voice.release()
+        image = _in_stages(scene, camera, settings, output)
+    else:
+        with progress("render") as show:
+            if options.tile is None:
+                image = jaxsph.render(scene, camera, settings, progress=show, devices=devices)
+            else:
+                image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
+                first_row = dict(image.metadata)[tiles.FIRST_ROW]
+                say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
+    elapsed = time.perf_counter() - started
+    told = words.header("render", options.words, part=options.tile is not None)
+    image = dataclasses.replace(image, metadata=(*image.metadata, *cli_where.left_out(options), told))
+    if cli_look.has_key(options):
+        cli_look.save_with_key(_over(image, options), scene, camera, labels, options, output)
+    else:
+        _save(image, options, output)
+    say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
+    if settings.tolerance is not None:
+        say("error", f"{error_line(image, settings, options.progressive)}, tolerance {settings.tolerance:g}")
+    say("time", time_line(image, elapsed))
+    _say_written(output, image, camera, settings, options)
+    if options.tile is None and (scene.particles is None or scene.particles.num_particles):
+        tell_if_unseen(options.command, output, [image.color])
+
+
+def _say_written(output: Path, image: Image, camera: Camera, settings: Settings, options: Any) -> None:
+    """The path on stdout, and what a program wants to know."""
+    said = {name: getattr(settings, name) for name in ("samples", "integrator", "tolerance", "estimator", "relax", "screen")}
+    voice.written(
+        output,
+        camera=camera_line(camera, options),
+        size=[camera.width, camera.height],
+        settings=said,
+        stats={name: value for name, value in image.stats.items() if name != "seconds"},
+        seconds=image.stats.get("seconds", {}),
+        error={"bound": largest(image.error_bound), "certified": bool(image.certified)},
+    )
+
+
+def _check_background(options: Any, output: Path) -> None:
+    """Refuse what a format cannot hold."""
+    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
+        raise UsageError(
+            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
+        )
+    if options.background is not None and options.progressive:
+        raise UsageError("--background is put behind the finished picture; leave out --progressive")
+
+
+def _over(image: Image, options: Any) -> Image:
+    """The picture in front of its background."""
+    if options.background in (None, "transparent"):
+        return image
+    color: Any = image.over(options.background)
+    return dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
+
+
+def _save(image: Image, options: Any, output: Path) -> None:
+    """Write the picture, in front of its background or none."""
+    if output.suffix.lower() == ".exr" or options.background is None:
+        image.save(output)
+    else:
+        write_image(output, image, background=options.background)
+
+
+def _in_stages(scene: Scene, camera: Camera, settings: Settings, output: Path) -> Image:
+    """The last image; `output` is rewritten at each stage, whole or not at all, and keeps the last when interrupted."""
+    shown: Image | None = None
+    try:
+        for image in progressive(scene, camera, settings):
+            image.save(output)
+            shown, stats = image, image.stats
+            errors = f"estimated error {stats['max_error']:.2g} at most, {100 * stats['l2_error']:.2g} % in L2"
+            rays = f"{stats['rays']:,} rays cast, {stats['rays_left']:,} left at most"
+            say(f"stage {stats['stage']}", f"{errors}; {rays}; {sum(stats['seconds'].values()):.2f} s")
+    except KeyboardInterrupt:
+        if shown is not None:
+            say("stopped", f"{output} holds stage {shown.stats['stage']}")
+        raise
+    assert shown is not None
+    return shown

@@ -1,0 +1,139 @@
+"""The command `slice`: a quantity on a plane.
+
+Flow: file or scene, options -> Particles, Plane -> slice_of -> [slice] -> NPY, EXR or PNG.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from jaxsph.analysis.slices import slice_of
+from jaxsph.cli import look as cli_look
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
+from jaxsph.cli import where as cli_where
+from jaxsph.cli.console import UsageError, require_writable, span, wrong_usage
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OWN, option, output
+from jaxsph.cli.options.settings import SCENE, stem_of
+from jaxsph.cli.voice import say
+from jaxsph.io.images.slices import SUFFIXES
+from jaxsph.io.opening.looks import look_of
+from jaxsph.io.opening.opened import Loaded
+from jaxsph.io.opening.views import length_of, place_of
+from jaxsph.model import Particles, Scene, TransferFunction
+from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.clips.shapes import Plane
+
+
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Slice(groups.Options, groups.Look, groups.View, groups.Source):
+    """Options of the command."""
+
+    opacity_by: Annotated[str | None, NOT_HERE] = None
+    view: Annotated[
+        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "looked at along an axis (default z)")
+    ] = None
+    eye: Annotated[Any, NOT_HERE] = None
+    target: Annotated[Any, NOT_HERE] = None
+    fov_degrees: Annotated[float | None, NOT_HERE] = None
+    exposure: Annotated[float, NOT_HERE] = 0.0
+    optical_depth: Annotated[float | None, NOT_HERE] = None
+    plane: Annotated[
+        Any,
+        option(
+            "--plane",
+            "X,Y,Z,NX,NY,NZ",
+            values.plane,
+            OWN,
+            "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+        ),
+    ] = None
+    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")] = None
+
+
+SLICE = Slice()
+
+
+def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = SLICE) -> None:
+    """Show the quantity on a plane, write, and say."""
+    options = dataclasses.replace(asked, source=file)
+    if options.plane is not None and options.view is not None:
+        raise UsageError(
+            "--plane and --view exclude each other: one says which plane, the other looks at that through the middle"
+        )
+    output = options.output or Path(f"{stem_of(options.source)}.png")
+    require_writable(output, "an image must be", SUFFIXES)
+    particles, transfer, loaded = _shown(options)
+    center, plane = _place(particles, transfer, loaded, options)
+    width, height = options.size
+    unit = None if loaded is None or loaded.table is None else loaded.table.units.length
+    started = time.perf_counter()
+    with wrong_usage():
+        across = None if options.width is None else length_of(options.width, "width", unit)[0] * height / width
+    made = slice_of(
+        particles,
+        plane,
+        within=cli_where.clip_of(options),
+        center=center,
+        up=options.up,
+        view_height=across,
+        width=width,
+        height=height,
+    )
+    there = np.isfinite(made.values)
+    if not there.any():
+        raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
+    made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options)))
+    made.save(output, transfer)
+    say("slice", f"{span(made.values[there])}, {there.mean():.1%} of the pixels inside of supports")
+    say("image", f"{output}, {width} x {height}, {made.pixel_size:.6g} a pixel")
+    seconds = time.perf_counter() - started
+    say("time", f"{seconds:.2f} s")
+    found = made.values[there]
+    voice.written(
+        output,
+        lowest=float(found.min()),
+        highest=float(found.max()),
+        inside=float(there.mean()),
+        pixel_size=float(made.pixel_size),
+        seconds=seconds,
+    )
+
+
+def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
+    """The particles, and the colours of their quantity."""
+    if options.source.startswith(SCENE):
+        name, scene, _ = cli_scene.named_scene(options)
+        particles = scene.particle_set
+        say("scene", f"{name}, {particles.num_particles:,} particles")
+        if not cli_look.is_looked(options):
+            return particles, scene.looks[0], None
+        with wrong_usage():
+            return particles, look_of(particles, "concentration", options)[0], None
+    loaded = cli_scene.loaded_of(options)
+    if not isinstance(loaded.shown, Particles):
+        raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded
+
+
+def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane]:
+    """What is in the middle of the picture, and the plane."""
+    center = options.center
+    if center is not None:
+        with wrong_usage():
+            center = place_of(Scene(particles=particles, transfer=transfer), center, None if loaded is None else loaded.table)
+        assert center is not None
+        say("center", " ".join(f"{value:.6g}" for value in center))
+    if options.plane is not None:
+        return center, options.plane
+    middle = np.mean(particles.bounds(), 0) if center is None else center
+    forward, _ = VIEWS[options.view or "z"]
+    return center, Plane(tuple(middle), tuple(-np.asarray(forward, np.float64)))

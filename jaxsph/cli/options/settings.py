@@ -1,0 +1,44 @@
+"""Settings, devices and names of files from the options of a command.
+
+Flow: options -> [settings] -> Settings, devices, names -> commands.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jaxsph.cli.console import UsageError, wrong_usage
+from jaxsph.engine.runtime.devices import chosen_devices
+from jaxsph.model import Settings
+
+SCENE = "scene:"
+"""What the name of a built-in scene begins with."""
+SETTINGS = ("samples", "integrator", "tolerance", "estimator", "relax", "screen")
+
+
+def settings_of(options: Any) -> Settings:
+    """Settings from the options given; what `Settings` refuses is wrong usage."""
+    given = {name: getattr(options, name, None) for name in SETTINGS}
+    given["memory_limit"] = None if options.memory is None else int(options.memory * 2**30)
+    with wrong_usage():
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def devices_of(options: Any) -> str | int | None:
+    """The devices that are asked for, if this machine has them."""
+    wanted: str | int | None = options.devices
+    if wanted is not None:
+        if options.progressive:
+            raise UsageError("--devices is not for --progressive, whose stages go by one device; leave out one of them")
+        with wrong_usage("--devices: "):
+            chosen_devices(wanted)
+    return wanted
+
+
+def stem_of(source: str) -> str:
+    """The name of a picture: that of its source, without a suffix; a number behind a point is none, as in `snap.00001`."""
+    if source.startswith(SCENE):
+        return source.split(":")[1]
+    path = Path(source)
+    return path.name if path.suffix[1:].isdecimal() else path.stem

@@ -1,0 +1,110 @@
+"""The commands that there are.
+
+Flow: [table] -> main, help, files of options.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+from cyclopts import App, Parameter
+
+from jaxsph.numerics.version import __version__
+
+
+class Command(NamedTuple):
+    """A command.
+
+    Attributes:
+        kind: by which commands are told apart in the help.
+        module: of `jaxsph.cli.commands`, which has a function of the command's name; imported when it is asked for.
+        text: what it does.
+        examples: how it is called.
+    """
+
+    kind: str
+    module: str
+    text: str
+    examples: tuple[str, ...]
+
+
+PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
+COMMANDS = {
+    "render": Command(
+        PICTURES,
+        "render",
+        "make a picture; what you do not say is chosen, and said",
+        (
+            "jaxsph render snap_042.hdf5",
+            "jaxsph render snap_042.hdf5 --color-by Temperature --opacity-by Density --annotate",
+            "jaxsph render snap_042.hdf5 --center densest --width 30kpc --background white -o fig1.png",
+        ),
+    ),
+    "project": Command(
+        PICTURES,
+        "project",
+        "integrate along rays: column densities, means",
+        ("jaxsph project snap_042.hdf5 --view z -o column.png", "jaxsph project snap_042.hdf5 --of Temperature --weight mass"),
+    ),
+    "slice": Command(
+        PICTURES,
+        "slice",
+        "show a quantity on a plane",
+        ("jaxsph slice snap_042.hdf5 -o slice.png", "jaxsph slice snap_042.hdf5 --plane 0,0,0,1,0,0 --color-by Density"),
+    ),
+    "movie": Command(
+        PICTURES,
+        "movie",
+        "make a movie of a file, or of a sequence of files",
+        ("jaxsph movie snap_042.hdf5 --orbit 360", "jaxsph movie snap_*.hdf5 -o run.mp4"),
+    ),
+    "info": Command(DATA, "info", "say what a file holds, and what `render` would show of it", ("jaxsph info snap_042.hdf5",)),
+    "sort": Command(
+        DATA,
+        "disk",
+        "order a snapshot in space, for reading parts of it",
+        ("jaxsph sort snap.0.hdf5 -o sorted.hdf5",),
+    ),
+    "transfer": Command(
+        DATA,
+        "transfer",
+        "draw a transfer function over what rays meet",
+        ("jaxsph transfer snap_042.hdf5 --save look.json", "jaxsph transfer look.json"),
+    ),
+    "merge": Command(PARTS, "merge", "make a picture of the parts of `render --tile`", ("jaxsph merge part_*.exr -o whole.exr",)),
+    "sweep": Command(QUALITY, "sweep", "measure error against tolerance against time", ("jaxsph sweep scene:mixer -o sweep",)),
+    "demo": Command(QUALITY, "demo", "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
+    "doctor": Command(SYSTEM, "doctor", "say versions, devices and the cache", ("jaxsph doctor",)),
+    "cache": Command(SYSTEM, "cache", "say where compiled programs are kept, and how large they are", ("jaxsph cache",)),
+    "completion": Command(
+        SYSTEM,
+        "completion",
+        "print what completes commands in a shell",
+        ('eval "$(jaxsph completion bash)"', "jaxsph completion zsh"),
+    ),
+}
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted, 143 asked to end; one line on stderr says why. "
+    "Results are on stdout, all else is on stderr. After a command, -h shows less than --help."
+)
+
+
+@functools.cache
+def app() -> App:
+    """All commands; none of their modules is imported before it is asked for."""
+    made = App(
+        "jaxsph",
+        help="Render SPH particles as a volume.",
+        version=__version__,
+        help_format="plaintext",
+        help_formatter="plain",
+        help_epilogue=EXIT_CODES,
+        default_parameter=Parameter(negative=""),
+    )
+    for name, command in COMMANDS.items():
+        path = f"jaxsph.cli.commands.{command.module}:{name}"
+        examples = "\n".join(f"  {example}" for example in command.examples)
+        text = f"{command.text[0].upper()}{command.text[1:]}."
+        made.command(path, name=name, help=text, group=command.kind, help_prologue=f"Examples:\n{examples}")
+    return made

@@ -1,0 +1,158 @@
+"""What the command line says, and where: results on stdout, prose on stderr, or all of it in one JSON object.
+
+Flow: commands -> [voice] -> stdout, stderr.
+
+Nothing here needs an import that takes time: `jaxsph --help` goes through it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import sys
+from typing import Any
+
+OPTIONS = {
+    "values": "--range",
+    "low": "the low end of --range",
+    "fov_degrees": "--fov",
+    "num_particles": "particles of scene:NAME",
+    "frame": "frame of scene:NAME",
+    "box": "--box-size",
+    "clips": "--clip",
+    "frame_all": "--width all",
+    "domain": "--norm",
+}
+"""Options whose names in the library differ."""
+SAME = (
+    *("samples", "tolerance", "relax", "estimator", "integrator", "support", "share", "kernel", "color_by", "opacity_by", "mix"),
+    *("eye", "target", "up", "center", "width", "view", "size", "colormap", "norm", "range", "preset", "transfer", "exposure"),
+    *("optical_depth", "background", "screen", "part_type", "where"),
+)
+NAMED = re.compile(r"`(\w+)`")
+
+
+class UsageError(Exception):
+    """The command line asks for something that makes no sense."""
+
+
+def by_option(message: str) -> str:
+    """A message of the library, with the names of options in place of those of arguments."""
+    if message.startswith("`name`"):
+        message = "scene:NAME" + message.removeprefix("`name`")
+
+    def named(found: re.Match[str]) -> str:
+        name = found[1]
+        return OPTIONS.get(name, f"--{name.replace('_', '-')}" if name in SAME else found[0])
+
+    return NAMED.sub(named, message)
+
+
+@dataclasses.dataclass
+class Voice:
+    """How a command speaks.
+
+    Attributes:
+        quiet: say nothing but results and what is wrong.
+        as_json: say results as one JSON object, when the command is done.
+        aloud: what is said is the result, as that of `jaxsph info` is.
+        held: lines that wait for the command to be done, as one that fails says one line; None where a person watches.
+        said: pairs of a word and a sentence.
+        results: of the JSON object.
+    """
+
+    quiet: bool = False
+    as_json: bool = False
+    aloud: bool = False
+    held: list[str] | None = None
+    said: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    results: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+_VOICE = [Voice()]
+
+
+def begin(*, quiet: bool = False, verbose: bool = False, as_json: bool = False, aloud: bool = False) -> None:
+    """Begin a command."""
+    watched = verbose or sys.stderr.isatty()
+    _VOICE[0] = Voice(quiet, as_json, aloud, None if watched else [])
+
+
+def say(what: str, text: str) -> None:
+    """Say a line with its subject in front."""
+    voice = _VOICE[0]
+    voice.said.append((what, text))
+    line = f"{what:<10}{text}"
+    if voice.aloud:
+        result(line)
+    elif not voice.quiet:
+        _prose(line)
+
+
+def _prose(line: str) -> None:
+    held = _VOICE[0].held
+    if held is None:
+        print(line, file=sys.stderr, flush=True)
+    else:
+        held.append(line)
+
+
+def warn(command: str, text: str) -> None:
+    """A line on stderr that even who wants quiet should see, but not beside the one line of a command that fails."""
+    _prose(f"jaxsph {command}: {text}")
+
+
+def notice(text: str) -> None:
+    """A line on stderr at once, for a person who waits."""
+    if not _VOICE[0].quiet:
+        print(text, file=sys.stderr, flush=True)
+
+
+def release() -> None:
+    """Say what was held back: the work has begun that may take long, or it is done."""
+    voice = _VOICE[0]
+    held, voice.held = voice.held or [], None
+    for line in held:
+        print(line, file=sys.stderr, flush=True)
+
+
+def result(text: str) -> None:
+    """A line on stdout for a person or a program; in JSON, `report` says it."""
+    if not _VOICE[0].as_json:
+        print(text)
+
+
+def report(**values: Any) -> None:
+    """Values of the JSON object."""
+    _VOICE[0].results.update(values)
+
+
+def written(path: Any, **values: Any) -> None:
+    """A file that the command made: its path on stdout."""
+    files = _VOICE[0].results.setdefault("files", [])
+    files.append(str(path))
+    report(file=files[0], **values)
+    result(str(path))
+
+
+def end(command: str) -> None:
+    """The command is done."""
+    release()
+    voice = _VOICE[0]
+    if voice.as_json:
+        chosen = [{"what": what, "text": text} for what, text in voice.said]
+        print(json.dumps({"command": command, **voice.results, "said": chosen}, default=plain))
+
+
+def plain(value: Any) -> Any:
+    """What JSON has for arrays, paths, and numbers of NumPy."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def tell(command: str, text: str) -> None:
+    """Print a line on stderr that a command's user should see."""
+    print(f"jaxsph {command}: {' '.join(text.split())}", file=sys.stderr)
