@@ -50,6 +50,10 @@ RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "s
 """How extinction depends on the place in a range: not at all; as above; from 0, so that what is low is clear."""
 
 
+NARROW = _rising(STEEPNESS, 0.3)
+"""Of what a preset shows by decades, where there are none: all of it is seen."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Preset:
     """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`.
@@ -120,14 +124,15 @@ def default_transfer(
 
 
 def opacity_by_second(
-    transfer: TransferFunction, particles: Particles, optical_depth: float = OPTICAL_DEPTH, *, ramp: str = "steep"
+    transfer: TransferFunction, particles: Particles, optical_depth: float = OPTICAL_DEPTH, *, ramp: str | float = "steep"
 ) -> TransferFunction:
     """The colours of a transfer function, with an extinction over the second of two quantities.
 
     Args:
         transfer: whose colours are taken.
         particles: with two quantities.
-        optical_depth, ramp: as for `default_transfer`.
+        optical_depth: as for `default_transfer`.
+        ramp: as for `default_transfer`; or the power with which extinction rises from 0 over the range.
 
     Raises:
         ValueError: particles of one quantity.
@@ -136,7 +141,8 @@ def opacity_by_second(
     if second is None:
         raise ValueError("`particles` must have two quantities: give `quantity=(of_colour, of_extinction)`")
     at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), OWN_POINTS)
-    extinction = _extinction(particles, at, RAMPS[ramp], optical_depth)
+    rising = RAMPS[ramp] if isinstance(ramp, str) else _rising(ramp, 0)
+    extinction = _extinction(particles, at, rising, optical_depth)
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
 
 
@@ -209,8 +215,10 @@ def preset(
         if chosen.both_ways is not None and low < 0 < high:
             ramp, largest = chosen.both_ways, float(max(abs(low), abs(high)))
             given = given if values else {"low": -largest, "high": largest}
-        elif (domain == "percentile" and values) or (domain == "log" and not over_decades):
+        elif domain == "percentile" and values:
             domain = "linear"
+        elif domain == "log" and not over_decades:
+            domain, ramp = "linear", NARROW
     control = control_values(domain, quantity, **given, points=points)
     colors = colormap_name or chosen.colors()
     made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
