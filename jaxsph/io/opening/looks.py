@@ -47,7 +47,7 @@ KINDS = {
 TAILS = (0.5, 99.5)
 SIGNED = 0.05
 """Of the largest value, what the smallest must be below zero for a quantity to have both signs."""
-LEAST_POWER = 4.0
+LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; over more decades than that, as many."""
 DECADE, BETWEEN = 10.0, (2, 98)
 """Ratio between these percentiles from which opacity follows a logarithm."""
@@ -110,7 +110,7 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
     if not second:
         return made, called
     low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
-    return opacity_by_second(made, whole, depth, ramp=max(LEAST_POWER, float(high - low)) if by_log else "steep"), called
+    return opacity_by_second(made, whole, depth, ramp=max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"), called
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:
