@@ -54,7 +54,7 @@ def add_picture(parser: argparse.ArgumentParser, *, means: bool = True) -> None:
         add("--samples", type=int, metavar="N", help=f"samples along a ray (default {Settings().samples})")
         integrator = Settings().integrator
         add("--integrator", choices=INTEGRATORS, help=f"how samples become light: points, segments, ... (default {integrator})")
-    add("--colormap", metavar="NAME", help=f"{maps}, or any of matplotlib's (default viridis)")
+    add("--colormap", metavar="NAME", help=f"{maps}, or any of cmap's, as cmocean:thermal (default viridis)")
     span = "values that the colours span (default: nearly all)"
     add("--range", nargs=2, type=float, metavar=("LOW", "HIGH"), help=span)
     add("--opacity", type=float, metavar="DEPTH", help=f"typical optical depth (default {depth:g})")

@@ -18,6 +18,7 @@ from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.trees import tree
 
+COLORS = 256  # of a map in a picture
 NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
 SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
@@ -77,7 +78,7 @@ class Projection:
         """(H, W, 3) uint8: a colour map over values or their logarithms; black where there is no value.
 
         Args:
-            colormap: name of a colour map.
+            colormap: name of a colour map, see `jaxsph.scenes.colormap`.
             norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
             value_span: values that the colours span; default nearly all.
         """
@@ -88,7 +89,7 @@ class Projection:
         if log:
             shown, low, high = np.log10(shown), math.log10(low), math.log10(high)
         share = np.clip((shown - low) / (high - low), 0, 1)
-        colors = colors_of(colormap)
+        colors = colors_of(colormap, COLORS)
         at = np.linspace(0, 1, len(colors))
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
         filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
@@ -129,8 +130,9 @@ class Projection:
         log, (low, high) = self.span(norm, value_span)
         made = Figure(figsize=(6.4, 5.2), layout="constrained")
         axes = made.subplots()
-        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors_of(colormap))), 256)
-        map_of.set_bad("black" if self.weight is not None else tuple(colors_of(colormap)[0]))
+        colors = colors_of(colormap, COLORS)
+        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors)), COLORS)
+        map_of.set_bad("black" if self.weight is not None else tuple(colors[0]))
         height, width = self.shape
         side = math.sqrt(float(self.pixel_area))
         reach = (-width / 2 * side, width / 2 * side, -height / 2 * side, height / 2 * side)

@@ -59,11 +59,6 @@ def test_built_in_colour_maps(name):
     assert (colormap(name.removesuffix("_r")) == colormap(name.removesuffix("_r") + "_r")[::-1]).all()
 
 
-def test_matplotlib_names_work_where_it_is_installed():
-    pytest.importorskip("matplotlib")
-    assert colormap("plasma").shape[1] == 3 and (colormap("plasma_r") == colormap("plasma")[::-1]).all()
-
-
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match=r"viridis, heat, ice, coolwarm, gray.*'nope'"):
         colormap("nope")
