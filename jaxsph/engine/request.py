@@ -84,7 +84,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
 def _require_points(scene: Scene, integrator: str) -> None:
     """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
     given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-    refused = [(what, "put it into an octree by `jaxsph.in_octree`") for what, there in given.items() if there]
+    refused = [(what, "put it into an octree by `jaxsph.engine.media.in_octree`") for what, there in given.items() if there]
     refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
     for what, remedy in refused:
         raise ValueError(

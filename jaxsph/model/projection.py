@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
+from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.trees import tree
@@ -48,8 +48,8 @@ class Projection:
     unit: str = ""
     metadata: tuple[tuple[str, Any], ...] = ()
 
-    writer: ClassVar[Callable[..., None]]
-    """How projections become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
+    writer = Method()
+    """How projections become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
 
     @property
     def shape(self) -> tuple[int, int]:

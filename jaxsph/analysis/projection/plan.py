@@ -94,7 +94,7 @@ class ProjectionPlan:
         """Raise `ValueError` where the plan is for other shapes than those given."""
         if self.images is not None and particles.box is None:
             raise ValueError(
-                "`plan` was made for particles with a periodic box, and these have none; make one with `jaxsph.plan_projection`"
+                "`plan` was made for particles with a periodic box, and these have none; make one with `plan_projection`"
             )
         given = {
             "camera.width": (camera.width, self.width),
@@ -104,9 +104,7 @@ class ProjectionPlan:
         }
         for name, (have, planned) in given.items():
             if have != planned:
-                raise ValueError(
-                    f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan_projection`"
-                )
+                raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
 def plan_projection(

@@ -69,7 +69,7 @@ def project(
         pixel: `"mean"`: pixels are means over their area, and mass is kept however small a support is; `"ray"`: pixels are
             values along the rays through their middles, which miss supports that are smaller than a pixel.
         depth_range: depths that rays begin and end at, for those of the camera.
-        plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
+        plan: as for `jaxsph.render`, by `plan_projection`.
         name, unit: what the values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
 
@@ -104,9 +104,7 @@ def project(
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
     if traced:
-        raise ValueError(
-            "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection(particles, camera)`"
-        )
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
     return plan_projection(particles, camera, pixel=pixel)
 
 
@@ -123,7 +121,7 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -
 
 def _raise_for(word: int, planned: bool) -> None:
     if word & faults.OVERFLOWS and not planned:
-        raise CapacityError("`plan` is too small for these particles: make a new one with `jaxsph.plan_projection`")
+        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
     if word:
         raise ValueError(f"these particles cannot be projected: {faults.describe(word)}")
 

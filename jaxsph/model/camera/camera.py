@@ -19,8 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsph.model.camera.framing import parallel_view
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
@@ -55,7 +57,7 @@ class BoundingBox(NamedTuple):
 
 @tree(static=("width", "height", "projection", "stride"))
 class Camera:
-    """A perspective or orthographic camera; make it with `look_at`, `orthographic` or `framing`.
+    """A perspective or orthographic camera; make it with `look_at`, `orthographic`, `framing` or `along_axis`.
 
     Lengths are numbers in the unit of positions, which a camera does not know: what carries a unit is refused.
 
@@ -181,6 +183,34 @@ class Camera:
         eye = middle - forward * distance
         near = max(float(near), 1e-3 * float(far))
         return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
+
+    @classmethod
+    @renamed(slab="depth_range")
+    def along_axis(
+        cls,
+        shown: Bounded,
+        axis: str = "z",
+        width: int = 512,
+        height: int = 512,
+        *,
+        margin: float = 1.0,
+        depth_range: tuple[float, float] | None = None,
+    ) -> Camera:
+        """Orthographic camera along an axis that shows all of what there is (host side).
+
+        Args:
+            shown: particles, a volume, points, or a scene.
+            axis: `"x"` shows y (right) and z (up), seen from large x; `"y"` x and z, seen from small y; `"z"` x and y, from
+                large z.
+            width, height: size in pixels.
+            margin: 1 fills the image to its edge, larger leaves a border.
+            depth_range: coordinates along the axis between which rays are followed; by default all.
+
+        Raises:
+            ValueError: another axis, or coordinates that do not ascend.
+        """
+        view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range)
+        return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
 
     @property
     def is_perspective(self) -> bool:

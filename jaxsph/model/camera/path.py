@@ -9,14 +9,15 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.leg import Leg, made
+from jaxsph.model.registry import Method
 from jaxsph.numerics.given import plain
 
 MAX_TURN = 90.0  # degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one
@@ -36,9 +37,9 @@ class CameraPath:
 
     legs: tuple[Leg, ...]
 
-    writer: ClassVar[Callable[..., None]]
-    reader: ClassVar[Callable[..., CameraPath]]
-    """How paths become files, and files paths: given by `jaxsph.plot.methods`, from `jaxsph.io`."""
+    writer = Method()
+    reader = Method()
+    """How paths become files, and files paths: entered by `jaxsph.plot.methods`, from `jaxsph.io`."""
 
     def __post_init__(self) -> None:
         if not self.legs:

@@ -60,8 +60,8 @@ def control_values(
             `equalised`.
         low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of `percentile`
             these are percentages, 0.5 and 99.5 if not given; `equalised` counts only what lies between.
-        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met (`jaxsph.met`); `None`
-            counts all alike.
+        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met
+            (`jaxsph.visibility_histogram`); `None` counts all alike.
         width: of `symlog` alone: what is smaller than this is about linear; `None` is a thousandth of the largest.
         points: how many; up to 16 are looked up by comparisons, which is faster than any search.
 

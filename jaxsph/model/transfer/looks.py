@@ -150,7 +150,7 @@ def domain_transfer(
     optical_depth: float = OPTICAL_DEPTH,
     points: int = POINTS,
 ) -> TransferFunction:
-    """As `default_transfer`, with colours and extinction over a domain other than the linear one; see `jaxsph.control_values`.
+    """As `default_transfer`, with colours and extinction over a domain; see `TransferFunction.control_values`.
 
     Raises:
         ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
@@ -175,7 +175,7 @@ def preset(
     Args:
         name: one of `PRESETS`.
         shown: Particles or a Volume; or (low, high) of a quantity, for a peak of extinction of 1 a length unit.
-        values: ends of the colours, see `jaxsph.control_values`; `None` chooses them by the quantity.
+        values: ends of the colours, see `jaxsph.TransferFunction.control_values`; `None` chooses them by the quantity.
         domain: other than the preset's own.
         colormap_name: other than the preset's own.
         optical_depth: of typical columns; larger is more opaque.
@@ -290,6 +290,3 @@ def _cells(position: np.ndarray, support: np.ndarray, extinction: np.ndarray) ->
     covered = np.bincount(flat, sphere, int(shape.prod()))
     mean = np.bincount(flat, sphere * extinction, int(shape.prod())) / np.where(covered > 0, covered, 1)
     return (mean * np.minimum(covered / cell**3, 1)).reshape(shape), np.full(3, cell)
-
-
-TransferFunction.presets = staticmethod(preset)
