@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from jaxsph.model.projection import Projection
     from jaxsph.model.scene import Scene
     from jaxsph.model.settings import Settings
+    from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
     from jaxsph.model.transfer.function import TransferFunction
     from jaxsph.model.volume import Volume
     from jaxsph.numerics.faults import CapacityError
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from jaxsph.trade.sweep import sweep
 
 __all__ = [
+    "Bounds",
     "Box",
     "Camera",
     "CameraPath",
@@ -49,14 +51,19 @@ __all__ = [
     "Image",
     "IsoSurface",
     "Particles",
+    "Pilot",
     "Plan",
     "Plane",
     "Points",
     "Projection",
+    "Quadtree",
+    "Samples",
     "Scene",
+    "Segments",
     "Settings",
     "Snapshots",
     "Sphere",
+    "StepDoubling",
     "TransferFunction",
     "Volume",
     "Within",
@@ -108,6 +115,12 @@ NAMES = {
     "resample": "jaxsph.analysis.resample:resample",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",
+    "Samples": "jaxsph.model.strategies:Samples",
+    "Bounds": "jaxsph.model.strategies:Bounds",
+    "Pilot": "jaxsph.model.strategies:Pilot",
+    "Segments": "jaxsph.model.strategies:Segments",
+    "StepDoubling": "jaxsph.model.strategies:StepDoubling",
+    "Quadtree": "jaxsph.model.strategies:Quadtree",
     "Plan": "jaxsph.engine.planning.plan:Plan",
     "CapacityError": "jaxsph.numerics.faults:CapacityError",
     # Sequences.

@@ -214,5 +214,5 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
 
 
 def _look(options: argparse.Namespace) -> dict[str, Any]:
-    given = {"colormap": options.colormap, "norm": options.norm, "value_span": options.range}
+    given = {"colormap": options.colormap, "norm": options.norm, "range": options.range}
     return {name: value for name, value in given.items() if value is not None}

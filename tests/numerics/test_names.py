@@ -32,7 +32,7 @@ def test_names_are_found_once_and_kept(package):
     assert package.turned is math.pi and "turned" in vars(package)
     assert dir(package) == ["rooms", "turned"]
     with pytest.raises(AttributeError, match="module 'made_up' has no attribute 'turnd'"):
-        package.turnd  # noqa: B018
+        package.turnd
 
 
 def test_former_names_warn_once_and_tell_the_new_word(package):
