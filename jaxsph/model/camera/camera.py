@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import renamed
@@ -84,6 +85,19 @@ class Camera:
     projection: str = "perspective"
     eye_rest: Float[Array, "3"] | None = None
     stride: int = 1
+
+    def __repr__(self) -> str:
+        half = short.known(self.half_height)
+        if half is None or half.ndim:
+            opening = f"half_height {short.kind(self.half_height)}"
+        else:
+            fov = f"fov {math.degrees(2 * math.atan(half)):.4g} degrees"
+            opening = fov if self.is_perspective else f"view_height {2 * float(half):.4g}"
+        axes = short.known(self.axes)
+        forward = None if axes is None or axes.ndim != 2 else f"forward {short.vector(axes[2])}"
+        ends = f"near {short.span(self.near)}, far {short.span(self.far)}"
+        size = f"{self.projection}, {self.width} x {self.height}"
+        return short.line("Camera", size, f"eye {short.vector(self.eye)}", forward, opening, ends)
 
     @classmethod
     def look_at(

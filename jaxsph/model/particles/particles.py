@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.trees import tree
@@ -73,6 +74,21 @@ class Particles:
     extinction_quantity: Float[Array, " particles"] | None = None
     box: Box | None = None
     length_unit: str | None = None
+
+    def __len__(self) -> int:
+        """How many exist, without padding (host side)."""
+        return self.num_particles
+
+    def __repr__(self) -> str:
+        second = self.extinction_quantity
+        return short.line(
+            "Particles",
+            f"{short.count(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"quantity {short.span(self.quantity, self.valid)}",
+            None if second is None else f"extinction by {short.span(second, self.valid)}",
+            f"support {short.span(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            None if self.box is None else "periodic",
+        )
 
     @classmethod
     def from_arrays(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.model.registry import Method
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.trees import tree
 
@@ -45,6 +46,16 @@ class TransferFunction:
     reader = Method()
     drawer = Method()
     """What rooms above this one know, and looks: presets, files and figures."""
+
+    def __repr__(self) -> str:
+        shape, second = getattr(self.values, "shape", ()), self.extinction_values
+        return short.line(
+            "TransferFunction",
+            f"{shape[-1]} points" if shape else None,
+            f"values {short.span(self.values)}",
+            f"extinction {short.span(self.extinction)}",
+            None if second is None else f"over {short.span(second)}",
+        )
 
     @classmethod
     def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
