@@ -13,6 +13,7 @@ registry.METHODS |= {
     "Image.drawer": "jaxsph.plot.image_figure:image_figure",
     "Projection.writer": "jaxsph.io.images.projections:write_projection",
     "CameraPath.writer": "jaxsph.io.camera_paths:write_camera_path",
+    "Particles.settler": "jaxsph.io.settle.columns:particles_from_columns",
     "CameraPath.reader": "jaxsph.io.camera_paths:read_camera_path",
     "TransferFunction.writer": "jaxsph.io.transfers:write_transfer",
     "TransferFunction.reader": "jaxsph.io.transfers:read_transfer",
