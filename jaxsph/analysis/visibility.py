@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
@@ -84,6 +85,7 @@ def visibility_histogram(
     for name, number, most in (("rays", rays, 1 << 24), ("bins", bins, MAX_BINS)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= most:
             raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
+    camera = with_depths(camera, scene)
     parts, (transfer, record) = parts_of(scene, camera), _recording(scene, part)
     looked = [one for one in parts if isinstance(one, AllParticles | AllOfVolume)][part]
     looked.look = record

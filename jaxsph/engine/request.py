@@ -12,6 +12,7 @@ from jaxsph.engine.asked import require_asked
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
@@ -23,7 +24,7 @@ class Request(NamedTuple):
 
     Attributes:
         scene: with particles and points in octrees, where the integrator chooses for itself where it asks them.
-        camera: in whose view.
+        camera: in whose view, with depths.
         settings: as they were given.
         along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
     """
@@ -41,7 +42,7 @@ class Request(NamedTuple):
             ValueError: arguments of other kinds, or a combination that nothing can render.
         """
         require_asked(scene, camera, settings)
-        scene = reachable(scene, settings)
+        camera, scene = with_depths(camera, scene), reachable(scene, settings)
         return cls(scene, camera, settings, along_rays(scene, settings))
 
 

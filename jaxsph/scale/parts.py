@@ -25,6 +25,7 @@ from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -62,6 +63,7 @@ def render_tile(
     """
     settings = settings or Settings()
     _require_parts(scene, camera, settings, index, count)
+    camera = with_depths(camera, scene)
     mark = picture_of(scene, camera, settings)
     clock, asked = Clock(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)

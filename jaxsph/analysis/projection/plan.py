@@ -21,6 +21,7 @@ from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import MAX_CAPACITY
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import between_faces, num_ghosts, sees_images, unfolded
 from jaxsph.numerics.checks import is_traced
@@ -128,7 +129,7 @@ def plan_projection(
     """
     if is_traced(particles, camera):
         raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
-    made = _measured(particles, camera, pixel, memory_limit or memory_for(particles.support))
+    made = _measured(particles, with_depths(camera, particles), pixel, memory_limit or memory_for(particles.support))
     return made if like is None else like.grown(made)
 
 

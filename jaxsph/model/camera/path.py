@@ -171,7 +171,7 @@ class CameraPath:
 
 def middle(camera: Camera) -> tuple[float, float, float]:
     """The point straight ahead in the middle of what a camera sees of depth."""
-    x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (float(camera.near) + float(camera.far)) / 2
+    x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * sum(camera.near_and_far()) / 2
     return float(x), float(y), float(z)
 
 
@@ -215,4 +215,4 @@ def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
 def _turned(camera: Camera, center: np.ndarray, axis: np.ndarray, degrees: float) -> Camera:
     turn = Rotation.from_rotvec(np.radians(degrees) * axis)
     axes, eye = turn.apply(np.array(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
-    return made(eye, axes, float(camera.half_height), float(camera.near), float(camera.far), camera)
+    return made(eye, axes, float(camera.half_height), *camera.near_and_far(), camera)
