@@ -121,7 +121,7 @@ def _made(
         raise ValueError(f"{quantity} is a logarithm already: leave out --domain log, or give --quantity {other}")
     if preset is not None:
         own = "linear" if is_log and domain is None and PRESETS[preset].domain == "log" else domain
-        more: dict[str, Any] = {"values": options.range, "domain": own, "colormap_name": options.colormap}
+        more: dict[str, Any] = {"range": options.range, "norm": own, "colormap": options.colormap}
         return scenes.preset(preset, shown, **more, optical_depth=depth), f"preset {preset}"
     name = options.colormap or "viridis"
     if domain is not None and domain != "linear":

@@ -73,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
     for path in options.parts:
         if path.suffix.lower() != ".exr":
             raise UsageError(f"{path}: parts are .exr")
-    image = tiles.merge([io.read_image(path) for path in options.parts], names=[str(path) for path in options.parts])
+    image = tiles.merge_tiles([io.read_image(path) for path in options.parts], names=[str(path) for path in options.parts])
     image.save(options.output)
     height, width = image.shape
     say("image", f"{options.output}, {width} x {height}, of {len(options.parts)} parts")

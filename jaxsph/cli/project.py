@@ -27,8 +27,8 @@ from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.model import Camera, Particles
-from jaxsph.model.camera.framing import VIEWS, along_axis
-from jaxsph.model.particles.held import emission
+from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.projection import NORMS, Projection
 
@@ -196,7 +196,7 @@ def _asked(columns: _Columns, options: argparse.Namespace) -> tuple[np.ndarray, 
         times = "" if options.of is None else f"{options.of} x "
         name = f"emission.{options.of}" if options.of else "emission"
         said = f"integral of {times}density^{options.emission:g} along rays, each particle with its own density"
-        return emission(columns.mass, columns.density, factor, options.emission), None, name, said
+        return emission_measure(columns.mass, columns.density, factor, options.emission), None, name, said
     if options.weight is not None:
         of = options.of or "density"
         said = f"mean of {of} along rays, weighted by {options.weight}"
@@ -210,9 +210,9 @@ def _camera(particles: Particles, options: argparse.Namespace) -> Camera:
     if options.eye is not None:
         return cli_scene.camera_of(particles, options, depths)
     with wrong_usage():
-        return along_axis(particles, options.axis or "z", *options.size, slab=depths)
+        return Camera.along_axis(particles, options.axis or "z", *options.size, depth_range=depths)
 
 
 def _look(options: argparse.Namespace) -> dict[str, Any]:
-    given = {"colormap": options.colormap, "norm": options.norm, "value_span": options.range}
+    given = {"colormap": options.colormap, "norm": options.norm, "range": options.range}
     return {name: value for name, value in given.items() if value is not None}

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxsph
-from jaxsph.analysis.slices import slice_of
+from jaxsph.analysis import slices
 from jaxsph.cli import disk as cli_disk
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import merge as cli_merge
@@ -178,7 +178,7 @@ def _save_slice(scene: Scene, plane: Plane, camera: Camera, options: argparse.Na
     particles, started = scene.particles, time.perf_counter()
     assert particles is not None
     size = {"width": camera.width, "height": camera.height}
-    made = slice_of(particles, plane, within=scene.within, up=options.up, **size)
+    made = slices.slice(particles, plane, within=scene.within, up=options.up, **size)
     there = np.isfinite(made.values)
     if not there.any():
         ends = cli_where.ends_of(*particles.bounds())

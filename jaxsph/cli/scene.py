@@ -21,7 +21,7 @@ from jaxsph.engine.media.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
-from jaxsph.scenes.view import snug, snug_box
+from jaxsph.model.camera.snug import snug, snug_box
 
 COORDINATES = "x", "y", "z"
 ISO_COLOR = 0.85, 0.8, 0.7

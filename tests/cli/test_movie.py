@@ -64,7 +64,7 @@ def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, capsy
     code, out, _ = run(capsys, *sequence, "--camera", "keys.json", *more)
     assert code == 0 and "s_2.mp4, 4 frames" in out and "20 x 12" in out
     snapshots = js.Snapshots.from_files(sequence)
-    transfer = js.scenes.default_transfer(snapshots.survey.middle, values=(-1, 2))
+    transfer = js.scenes.default_transfer(snapshots.survey.middle, range=(-1, 2))
     path = js.CameraPath.load("keys.json")
     for frame in (1, 2, 4):
         scene = js.Scene(particles=snapshots.at(4 * (frame - 1) / 3).particles, transfer=transfer)

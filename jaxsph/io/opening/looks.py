@@ -48,7 +48,7 @@ TAILS = (0.5, 99.5)
 SIGNED = 0.05
 """Of the largest value, what the smallest must be below zero for a quantity to have both signs."""
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
-"""With which extinction rises over the logarithm of its quantity, at least; over more decades than that, as many."""
+"""With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
 DECADE, BETWEEN = 10.0, (2, 98)
 """Ratio between these percentiles from which opacity follows a logarithm."""
 
@@ -110,7 +110,9 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
     if not second:
         return made, called
     low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
-    return opacity_by_second(made, whole, depth, ramp=max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"), called
+    return opacity_by_second(
+        made, whole, depth, ramp=max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
+    ), called
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:
@@ -129,7 +131,7 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
     norm = look.norm
     if norm is None and is_log and PRESETS[kind].domain == "log":
         norm = "linear"
-    more: dict[str, Any] = {"values": look.range, "domain": norm, "colormap_name": look.colormap}
+    more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
     return preset(kind, shown, **more, optical_depth=depth), f"{look.colormap or PRESETS[kind].colormap} ({kind})"
 
 

@@ -143,7 +143,7 @@ def test_a_map_over_more_control_values_is_finer():
 
 
 def test_rows_of_colours_are_spread_over_control_values_of_a_domain():
-    values = js.control_values("log", low=1, high=100, points=5)
+    values = js.TransferFunction.control_values("log", low=1, high=100, points=5)
     made = js.TransferFunction.from_colormap([(0, 0, 0), (1, 0.5, 0)], values, extinction=[0, 4])
     np.testing.assert_allclose(made.values, np.geomspace(1, 100, 5), rtol=1e-6)
     np.testing.assert_allclose(made.colors[:, 0], np.linspace(0, 1, 5))
