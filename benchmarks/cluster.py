@@ -70,14 +70,14 @@ def rate(workers: int, snapshots: js.Snapshots, camera: js.Camera, folder: Path,
 def same_whatever_dies(paths: list[Path], camera: js.Camera, folder: Path) -> dict[str, object]:
     """Frames of one process, and of two workers one of which is killed; the broken file is one of the frames."""
 
-    def frames(client: object, output: Path, killed: list[int]) -> tuple[list[js.FrameFile], str]:
+    def frames(client: object, output: Path, killed: list[int]) -> tuple[list[js.sequence.FrameFile], str]:
         made, said = [], ""
         try:
             for frame in js.render_frames(paths, camera, SETTINGS, client, output=output):
                 made.append(frame)
                 if len(made) == FRAMES // 4 and killed:
                     os.kill(killed.pop(), signal.SIGKILL)
-        except js.FramesError as error:
+        except js.sequence.FramesError as error:
             said = str(error)
         return made, said
 

@@ -74,7 +74,7 @@ def write(folder: pathlib.Path, count: int) -> pathlib.Path:
 def one_way(options: argparse.Namespace) -> None:
     """Render one way, twice, and print what it took; in a process of its own."""
     begun = time.perf_counter()
-    on_disk = js.OnDisk.open(options.path, "InternalEnergy", kernel="cubic_spline")
+    on_disk = js.scale.OnDisk.open(options.path, "InternalEnergy", kernel="cubic_spline")
     opened = time.perf_counter() - begun
     transfer = js.TransferFunction.from_colormap("viridis", (0.5, 2.5), 3.0)
     camera = js.Camera.framing(on_disk, width=options.size, height=options.size)
@@ -82,9 +82,9 @@ def one_way(options: argparse.Namespace) -> None:
     for _ in range(options.frames):
         begun = time.perf_counter()
         if options.way == "disk":
-            on_disk = js.OnDisk.open(options.path, "InternalEnergy", kernel="cubic_spline")
+            on_disk = js.scale.OnDisk.open(options.path, "InternalEnergy", kernel="cubic_spline")
             try:
-                image = js.render_from_disk(on_disk, transfer, camera, js.Settings(samples=SAMPLES), memory=options.memory)
+                image = js.scale.render_from_disk(on_disk, transfer, camera, js.Settings(samples=SAMPLES), memory=options.memory)
             except TooLittleMemoryError as error:
                 print(json.dumps({"refused": str(error), "least": error.least}))
                 return

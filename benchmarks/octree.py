@@ -1,7 +1,7 @@
 """Claim: where samples lie in slabs, no frame is faster by octrees than by the perspective grid.
 
 Whole frames of particles and of points, everywhere alike and clustered, 256 x 256 pixels and 128 point samples, by the grid and
-by octrees (`jaxsph.in_octree`, made once), in turns.
+by octrees (`in_octree`, made once), in turns.
 
 And what octrees of 1,000,000 spheres take to build, how large they are, and at how many entries a sample looks: of a uniform
 fluid (the filled cube), a clustered halo (an NFW profile, supports by local density), and points of a hundredth of a support in
@@ -27,6 +27,7 @@ import workloads
 
 import jaxsph as js
 from jaxsph.engine.access.octree import build_octree
+from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.trade.measurement import of_this_run
 
 SAMPLES, SIZE, EVERY = 256, 512, 16
@@ -141,7 +142,7 @@ def frame_scenes(count: int) -> dict[str, tuple[js.Scene, js.Camera]]:
 def by_access(scene: js.Scene, camera: js.Camera, repeats: int) -> dict[str, Any]:
     """Seconds of a frame by the grid and by octrees, in turns; and how far their images are apart."""
     settings, started = js.Settings(samples=FRAME_SAMPLES), time.perf_counter()
-    shown = {"grid": scene, "octree": jax.block_until_ready(js.in_octree(scene))}
+    shown = {"grid": scene, "octree": jax.block_until_ready(in_octree(scene))}
     made = time.perf_counter() - started
     first = {name: np.asarray(js.render(one, camera, settings).color) for name, one in shown.items()}  # compiles
     times: dict[str, list[float]] = {name: [] for name in shown}

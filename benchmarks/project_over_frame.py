@@ -27,6 +27,7 @@ import jax
 import numpy as np
 
 import jaxsph as js
+from jaxsph.analysis.projection.plan import plan_projection
 from jaxsph.trade.measurement import of_this_run
 
 MOST, COUNT, SUPPORT, SAMPLES = 5.0, 32768, 0.05, 256
@@ -42,14 +43,14 @@ def uniform() -> js.Particles:
 
 def contenders(particles: js.Particles, size: int) -> dict[str, Callable[[], Any]]:
     """What is timed, with its plan made."""
-    camera = js.along_axis(particles, "z", size, size)
+    camera = js.Camera.along_axis(particles, "z", size, size)
     low, high = (float(end) for end in np.quantile(particles.to_numpy()["quantity"], [0, 1]))
     depth = float(camera.far - camera.near)
     look = js.TransferFunction.from_points([low, high], [[0.1, 0.2, 0.9], [0.9, 0.3, 0.1]], [1 / depth, 2 / depth])
     scene, settings = js.Scene(particles=particles, transfer=look), js.Settings(samples=SAMPLES)
     found: dict[str, Callable[[], Any]] = {"frame": lambda: js.render(scene, camera, settings).color}
     for rule in ("mean", "ray"):
-        plan = js.plan_projection(particles, camera, pixel=rule)
+        plan = plan_projection(particles, camera, pixel=rule)
         found[rule] = lambda rule=rule, plan=plan: js.project(particles, camera, pixel=rule, plan=plan).values  # type: ignore[misc]
     return found
 

@@ -33,6 +33,7 @@ import jax
 import numpy as np
 
 import jaxsph as js
+from jaxsph.analysis.projection.plan import plan_projection
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.trade.measurement import of_this_run
 
@@ -122,7 +123,7 @@ def measured(path: str, options: argparse.Namespace) -> dict[str, Any]:
     mass = np.ones(len(table)) if name is None else choose_quantity(table, name)[0]
     found: dict[str, Any] = {"particles": len(table), "periodic": particles.box is not None, "format": table.source, "sizes": {}}
     for size in sorted(options.sizes):
-        camera = js.along_axis(particles, "z", size, size)
+        camera = js.Camera.along_axis(particles, "z", size, size)
         peer = None
         if options.peer_python and size == min(options.sizes):  # the peer takes minutes
             peer = asked(options.peer_python, particles, mass / mass.mean(), camera)
@@ -136,7 +137,7 @@ def measured(path: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def row_of(particles: js.Particles, mass: np.ndarray, camera: js.Camera, rule: str, peer: Any, repeats: int) -> dict[str, Any]:
     """One image, its time, and how far it is from the peer's."""
-    plan, seconds = js.plan_projection(particles, camera, pixel=rule), []
+    plan, seconds = plan_projection(particles, camera, pixel=rule), []
     for _ in range(repeats + 1):
         started = time.perf_counter()
         image = js.project(particles, camera, mass, pixel=rule, plan=plan)

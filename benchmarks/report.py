@@ -332,7 +332,7 @@ def accesses(found: dict) -> str:
     size, of, run = frames["size"], f"{frames['samples']} point samples a ray", frames["run"]
     return f"""## Which access
 Frames of {frames["particles"]} particles or points, {size} x {size} pixels and {of}, by the perspective grid and by octrees
-that are made once (`jaxsph.in_octree`), medians of {frames["repeats"]} in turns, {run["device"]}, {run["cores"]} cores. Particles
+that are made once (`in_octree`), medians of {frames["repeats"]} in turns, {run["device"]}, {run["cores"]} cores. Particles
 show the same either way; points have exact chords by the grid, and are met or missed by samples in an octree.
 
 {table(header, rows)}

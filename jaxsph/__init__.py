@@ -1,80 +1,159 @@
-"""jaxsph: volume rendering of SPH particles, in JAX."""
+"""jaxsph: volume rendering of SPH particles, in JAX.
 
-import jaxsph.plot.methods  # noqa: F401 (images, paths, ... get their methods there)
-from jaxsph import io, reference, scenes
-from jaxsph.analysis.met import met
-from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
-from jaxsph.analysis.projection.project import project
-from jaxsph.analysis.resample import resample
-from jaxsph.analysis.slices import Slice, slice_of
-from jaxsph.engine.access.morton import prepare
-from jaxsph.engine.frame.progressive import progressive
-from jaxsph.engine.media.in_octree import in_octree
-from jaxsph.engine.media.iso_surface import IsoSurface
-from jaxsph.engine.media.within import Within
-from jaxsph.engine.planning.fit import plan
-from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.render import render
-from jaxsph.model import Camera, CameraPath, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
-from jaxsph.model.camera.framing import along_axis
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
-from jaxsph.model.particles.held import emission
-from jaxsph.model.projection import Projection
-from jaxsph.model.transfer.domains import control_values
-from jaxsph.numerics.faults import CapacityError
-from jaxsph.numerics.version import __version__
-from jaxsph.scale.from_disk import render_from_disk
-from jaxsph.scale.on_disk import OnDisk
-from jaxsph.scale.parts import merge, render_tile
-from jaxsph.sequence.frames import render_frames
-from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.task import FrameFile, FramesError
-from jaxsph.trade.sweep import sweep
+Names are imported when they are first used (PEP 562), so that importing this module imports nothing that takes time.
+"""
+
+from typing import TYPE_CHECKING
+
+import jaxsph.engine.cast
+import jaxsph.engine.screen
+import jaxsph.plot.methods  # noqa: F401 (integrators, screens and methods are entered there)
+from jaxsph.numerics.names import lazy
+from jaxsph.numerics.version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from jaxsph import io, reference, scale, scenes, sequence
+    from jaxsph.analysis.projection.project import project
+    from jaxsph.analysis.resample import resample
+    from jaxsph.analysis.slices import slice
+    from jaxsph.analysis.visibility import visibility_histogram
+    from jaxsph.engine.access.morton import prepare
+    from jaxsph.engine.frame.progressive import progressive
+    from jaxsph.engine.media.iso_surface import IsoSurface
+    from jaxsph.engine.media.within import Within
+    from jaxsph.engine.planning.fit import plan
+    from jaxsph.engine.planning.plan import Plan
+    from jaxsph.engine.render import render
+    from jaxsph.model.camera.camera import Camera
+    from jaxsph.model.camera.path import CameraPath
+    from jaxsph.model.clips.shapes import Box, Plane, Sphere
+    from jaxsph.model.image import Image
+    from jaxsph.model.particles.held import emission_measure
+    from jaxsph.model.particles.particles import Particles
+    from jaxsph.model.points import Points
+    from jaxsph.model.projection import Projection
+    from jaxsph.model.scene import Scene
+    from jaxsph.model.settings import Settings
+    from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
+    from jaxsph.model.transfer.function import TransferFunction
+    from jaxsph.model.volume import Volume
+    from jaxsph.numerics.faults import CapacityError
+    from jaxsph.sequence.frames import render_frames
+    from jaxsph.sequence.snapshots import Snapshots
+    from jaxsph.trade.sweep import sweep
 
 __all__ = [
+    "Bounds",
     "Box",
     "Camera",
     "CameraPath",
     "CapacityError",
-    "FrameFile",
-    "FramesError",
     "Image",
     "IsoSurface",
-    "OnDisk",
     "Particles",
+    "Pilot",
     "Plan",
     "Plane",
     "Points",
     "Projection",
-    "ProjectionPlan",
+    "Quadtree",
+    "Samples",
     "Scene",
+    "Segments",
     "Settings",
-    "Slice",
     "Snapshots",
     "Sphere",
+    "StepDoubling",
     "TransferFunction",
     "Volume",
     "Within",
-    "__version__",
-    "along_axis",
-    "control_values",
-    "emission",
-    "in_octree",
+    "emission_measure",
     "io",
-    "merge",
-    "met",
     "plan",
-    "plan_projection",
     "prepare",
     "progressive",
     "project",
     "reference",
     "render",
     "render_frames",
-    "render_from_disk",
-    "render_tile",
     "resample",
+    "scale",
     "scenes",
-    "slice_of",
+    "sequence",
+    "slice",
     "sweep",
+    "visibility_histogram",
 ]
+
+NAMES = {
+    # Things: what is in a picture, and what pictures are.
+    "Particles": "jaxsph.model.particles.particles:Particles",
+    "Points": "jaxsph.model.points:Points",
+    "Volume": "jaxsph.model.volume:Volume",
+    "IsoSurface": "jaxsph.engine.media.iso_surface:IsoSurface",
+    "Scene": "jaxsph.model.scene:Scene",
+    "Box": "jaxsph.model.clips.shapes:Box",
+    "Plane": "jaxsph.model.clips.shapes:Plane",
+    "Sphere": "jaxsph.model.clips.shapes:Sphere",
+    "Within": "jaxsph.engine.media.within:Within",
+    "Image": "jaxsph.model.image:Image",
+    "Projection": "jaxsph.model.projection:Projection",
+    # Looks.
+    "TransferFunction": "jaxsph.model.transfer.function:TransferFunction",
+    "visibility_histogram": "jaxsph.analysis.visibility:visibility_histogram",
+    # Cameras.
+    "Camera": "jaxsph.model.camera.camera:Camera",
+    "CameraPath": "jaxsph.model.camera.path:CameraPath",
+    # Verbs, how well they are to be done, and what they need or raise.
+    "render": "jaxsph.engine.render:render",
+    "progressive": "jaxsph.engine.frame.progressive:progressive",
+    "plan": "jaxsph.engine.planning.fit:plan",
+    "prepare": "jaxsph.engine.access.morton:prepare",
+    "project": "jaxsph.analysis.projection.project:project",
+    "emission_measure": "jaxsph.model.particles.held:emission_measure",
+    "slice": "jaxsph.analysis.slices:slice",
+    "resample": "jaxsph.analysis.resample:resample",
+    "sweep": "jaxsph.trade.sweep:sweep",
+    "Settings": "jaxsph.model.settings:Settings",
+    "Samples": "jaxsph.model.strategies:Samples",
+    "Bounds": "jaxsph.model.strategies:Bounds",
+    "Pilot": "jaxsph.model.strategies:Pilot",
+    "Segments": "jaxsph.model.strategies:Segments",
+    "StepDoubling": "jaxsph.model.strategies:StepDoubling",
+    "Quadtree": "jaxsph.model.strategies:Quadtree",
+    "Plan": "jaxsph.engine.planning.plan:Plan",
+    "CapacityError": "jaxsph.numerics.faults:CapacityError",
+    # Sequences.
+    "Snapshots": "jaxsph.sequence.snapshots:Snapshots",
+    "render_frames": "jaxsph.sequence.frames:render_frames",
+    # Rooms: files, built-in scenes, the oracle, pictures by parts, many frames.
+    "io": "jaxsph.io",
+    "scenes": "jaxsph.scenes",
+    "reference": "jaxsph.reference",
+    "scale": "jaxsph.scale",
+    "sequence": "jaxsph.sequence",
+}
+
+FORMER = {
+    "FrameFile": ("jaxsph.sequence.task:FrameFile", "jaxsph.sequence.FrameFile"),
+    "FramesError": ("jaxsph.sequence.task:FramesError", "jaxsph.sequence.FramesError"),
+    "OnDisk": ("jaxsph.scale.on_disk:OnDisk", "jaxsph.scale.OnDisk"),
+    "ProjectionPlan": ("jaxsph.analysis.projection.plan:ProjectionPlan", "jaxsph.analysis.projection.plan.ProjectionPlan"),
+    "Slice": ("jaxsph.analysis.slices:Slice", "jaxsph.analysis.slices.Slice"),
+    "along_axis": ("jaxsph.model.camera.camera:Camera.along_axis", "jaxsph.Camera.along_axis"),
+    "control_values": (
+        "jaxsph.model.transfer.function:TransferFunction.control_values",
+        "jaxsph.TransferFunction.control_values",
+    ),
+    "emission": ("jaxsph.model.particles.held:emission_measure", "jaxsph.emission_measure"),
+    "in_octree": ("jaxsph.engine.media.in_octree:in_octree", "jaxsph.engine.media.in_octree.in_octree"),
+    "merge": ("jaxsph.scale.parts:merge_tiles", "jaxsph.scale.merge_tiles"),
+    "met": ("jaxsph.analysis.visibility:visibility_histogram", "jaxsph.visibility_histogram"),
+    "plan_projection": ("jaxsph.analysis.projection.plan:plan_projection", "jaxsph.analysis.projection.plan.plan_projection"),
+    "render_from_disk": ("jaxsph.scale.from_disk:render_from_disk", "jaxsph.scale.render_from_disk"),
+    "render_tile": ("jaxsph.scale.parts:render_tile", "jaxsph.scale.render_tile"),
+    "slice_of": ("jaxsph.analysis.slices:slice", "jaxsph.slice"),
+}
+"""Names of the version before, and what they are called now."""
+
+__getattr__, __dir__ = lazy(__name__, NAMES, FORMER)

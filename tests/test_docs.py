@@ -101,4 +101,4 @@ def test_every_scene_and_format_is_named():
     assert all(f"`{name}`" in README for name in scenes.names())
     table = README[README.index("## Files") : README.index("## Built-in")]
     named = {*re.findall(r"`(\.\w+)`", table), ".gadget"}
-    assert {form.suffixes[0] for form in io.FORMATS} <= named
+    assert {suffix for form in io.FORMATS for suffix in form.suffixes[:1]} <= named

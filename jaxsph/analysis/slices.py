@@ -37,7 +37,7 @@ ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """The field on a plane; made by `slice_of`. Row 0 is the top, column 0 the left.
+    """The field on a plane; made by `slice`. Row 0 is the top, column 0 the left.
 
     Attributes:
         values: the quantity Q, float32 or float64; NaN outside of every support.
@@ -82,7 +82,7 @@ class Slice:
         files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata)
 
 
-def slice_of(
+def slice(
     particles: Particles,
     plane: Plane,
     *,

@@ -17,7 +17,7 @@ from jaxsph.cli.options.values import Beside
 from jaxsph.cli.voice import report, result, say, tell
 from jaxsph.model import Points, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
-from jaxsph.model.colors import NAMES, rgb
+from jaxsph.numerics.colors import NAMES, rgb
 
 CHECKED: dict[str, tuple[str, Callable[[float], bool]]] = {
     "radius": ("> 0", lambda value: bool(np.isfinite(value) and value > 0)),

@@ -17,9 +17,9 @@ from jaxsph.io.opening.views import FOV_DEGREES, UP, length_of
 from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.camera import Bounded, BoundingBox
-from jaxsph.model.camera.framing import VIEWS, along_axis
+from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.snug import snug, snug_box
 from jaxsph.model.clips.clips import Clip
-from jaxsph.scenes.view import snug, snug_box
 from jaxsph.sequence.snapshots import center_of
 from jaxsph.sequence.survey import Survey
 
@@ -60,7 +60,7 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
 def _along(shown: Bounded, options: Any, middle: Any, depths: tuple[float, float] | None, unit: CodeUnit | None) -> Camera:
     """With parallel rays along an axis; `depths` are coordinates along it."""
     width, height = options.size
-    whole = along_axis(shown, options.view, width, height, slab=depths)
+    whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths)
     across = getattr(options, "width", None)
     if across is None and middle is None:
         return whole

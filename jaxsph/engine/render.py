@@ -25,6 +25,7 @@ from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
 from jaxsph.engine.runtime.executors import Clock, Traced
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -87,7 +88,7 @@ def render(
         return _traced_image(scene, camera, settings, plan, devices)
     clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
     made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
-    return Work(seen, camera, settings, made, asked.scene.formulas).image(clock, progress, planned=plan is None)
+    return Work(seen, asked.camera, settings, made, asked.scene.formulas).image(clock, progress, planned=plan is None)
 
 
 def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:
@@ -97,6 +98,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         ValueError: no plan, one for another image, or a quadtree over a mesh.
     """
     require_asked(scene, camera, settings)
+    camera = with_depths(camera, scene)
     if plan is None:
         raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
     plan.check(scene, camera, along_rays(scene, settings))

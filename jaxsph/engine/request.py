@@ -12,6 +12,7 @@ from jaxsph.engine.asked import require_asked
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
@@ -23,7 +24,7 @@ class Request(NamedTuple):
 
     Attributes:
         scene: with particles and points in octrees, where the integrator chooses for itself where it asks them.
-        camera: in whose view.
+        camera: in whose view, with depths.
         settings: as they were given.
         along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
     """
@@ -41,7 +42,7 @@ class Request(NamedTuple):
             ValueError: arguments of other kinds, or a combination that nothing can render.
         """
         require_asked(scene, camera, settings)
-        scene = reachable(scene, settings)
+        camera, scene = with_depths(camera, scene), reachable(scene, settings)
         return cls(scene, camera, settings, along_rays(scene, settings))
 
 
@@ -84,7 +85,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
 def _require_points(scene: Scene, integrator: str) -> None:
     """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
     given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-    refused = [(what, "put it into an octree by `jaxsph.in_octree`") for what, there in given.items() if there]
+    refused = [(what, "put it into an octree by `jaxsph.engine.media.in_octree`") for what, there in given.items() if there]
     refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
     for what, remedy in refused:
         raise ValueError(

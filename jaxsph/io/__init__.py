@@ -80,11 +80,11 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | None = None, pr
     """Read a particle file as it is: positions, columns, and supports and volumes where the format defines them.
 
     The format is found by content, else by suffix: `.npz`, `.hdf5` `.h5` (Gadget, SWIFT, GIZMO, AREPO, Phantom,
-    points), `.vtk`, `.vtu`, `.vtp`, `.ply`, `.bgeo`, Gadget binary, `.csv` `.txt` `.xyz` `.dat`.
+    points), `.vtk`, `.vtu`, `.vtp`, `.ply`, `.bgeo`, Gadget binary, dumps of Phantom, `.csv` `.txt` `.xyz` `.dat`.
 
     Args:
         path: the file.
-        part_type: for formats with particle types (Gadget: 0 gas, 1 dark matter, ...; Phantom: 1 gas), which one to
+        part_type: for formats with particle types (Gadget: 0 gas, 1 dark matter, ...; Phantom: 1 gas, -1 sinks), which one to
             read; `None` means gas, or the first other type there is.
         progress: as for `read_particles`; reading alone shows no bar.
 
@@ -167,7 +167,7 @@ def read_points(
         opacity: that of a whole point along a ray through its centre; where neither is known, 0.8.
         profile: as for `Points.from_arrays`.
         colormap: name of a colour map.
-        part_type: which type of particles to read, see `read_table`; stars are 4 of a Gadget-like file.
+        part_type: which type of particles to read, see `read_table`; stars are 4 of a Gadget-like file, sinks -1 of Phantom's.
 
     Returns:
         Points; `points_from_table` also tells how they were found.

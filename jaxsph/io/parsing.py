@@ -22,6 +22,9 @@ TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
 SEPARATORS = " :._-["
 POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coords", "coord", "p", "r")
 
+TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
+"""What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
+
 DEFLATE_RATIO = 1032
 """The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
 LZMA_RATIO = 2**13
@@ -156,3 +159,13 @@ def choose_type(present: Sequence[int], part_type: int | None) -> int:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")
     return part_type if part_type is not None else next(iter(present), 0)
+
+
+def others_held(counts: Mapping[int, int | None], chosen: int) -> list[str]:
+    """A sentence on the other types of particles that a snapshot holds, by number; `None` where it does not say how many."""
+    found = []
+    for number, count in sorted(counts.items()):
+        if number != chosen and count != 0:
+            named = f"type {number} ({TYPE_NAMES[number]})" if number in TYPE_NAMES else f"type {number}"
+            found.append(named if count is None else f"{count:,} of {named}")
+    return [f"also holds {', '.join(found)}: `part_type=` or --part-type reads another"] if found else []

@@ -8,15 +8,15 @@ from __future__ import annotations
 import base64
 import io
 import os
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.colors import rgb
-from jaxsph.numerics import faults
+from jaxsph.model.registry import Method
+from jaxsph.numerics import faults, short
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.colors import rgb
 from jaxsph.numerics.trees import tree
 
 
@@ -53,10 +53,18 @@ class Image:
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
 
-    writer: ClassVar[Callable[..., None]]
-    """How images become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
-    drawer: ClassVar[Callable[..., Any]]
-    """How images become figures: given by `jaxsph.plot.methods`, from `jaxsph.plot.image_figure`."""
+    writer = Method()
+    """How images become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
+    drawer = Method()
+    """How images become figures: entered by `jaxsph.plot.methods`, from `jaxsph.plot.image_figure`."""
+
+    def __repr__(self) -> str:
+        shape: tuple[int, ...] = getattr(self.color, "shape", ())
+        size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else short.kind(self.color)
+        certified = short.known(self.certified)
+        proven = None if certified is None else "certified" if certified.all() else "not certified"
+        words = f"transmittance {short.span(self.transmittance)}", f"error {short.span(self.error_bound)}"
+        return short.line("Image", size, *words, proven, f"faults {short.span(self.faults)}")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.particles.packing import columns_of, packed, rest_of
 from jaxsph.model.particles.particles import Particles, room_for
 from jaxsph.model.profiles import Profile, profile_of
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
 from jaxsph.numerics.trees import tree
@@ -61,6 +62,15 @@ class Points:
     splats_beyond: Float[Array, ""] | None = None
     spread: str = "chords"
     length_unit: str | None = None
+
+    def __repr__(self) -> str:
+        return short.line(
+            "Points",
+            f"{short.count(self.valid)}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"radius {short.span(self.radius, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            f"extinction {short.span(self.extinction, self.valid)}",
+            None if self.spread == "chords" else f"spread at {self.spread}",
+        )
 
     @classmethod
     def from_arrays(

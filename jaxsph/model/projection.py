@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
+from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
+from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 
+COLORS = 256  # of a map in a picture
 NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
 SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
@@ -48,8 +50,8 @@ class Projection:
     unit: str = ""
     metadata: tuple[tuple[str, Any], ...] = ()
 
-    writer: ClassVar[Callable[..., None]]
-    """How projections become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
+    writer = Method()
+    """How projections become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,35 +69,38 @@ class Projection:
             raise ValueError(f"{what}: project amounts without `weight`, by an orthographic camera")
         return self.values.sum() * self.pixel_area
 
+    @renamed(value_span="range")
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
         type(self).writer(path, self, **look)
 
+    @renamed(value_span="range")
     def to_uint8(
-        self, colormap: str = "viridis", norm: str | None = None, value_span: tuple[float, float] | None = None
+        self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None
     ) -> np.ndarray:
         """(H, W, 3) uint8: a colour map over values or their logarithms; black where there is no value.
 
         Args:
-            colormap: name of a colour map.
+            colormap: name of a colour map, see `jaxsph.scenes.colormap`.
             norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
-            value_span: values that the colours span; default nearly all.
+            range: values that the colours span; default nearly all.
         """
         values: Any = np.asarray(self.values, np.float64)
-        log, (low, high) = self.span(norm, value_span)
+        log, (low, high) = self.span(norm, range)
         there = np.isfinite(values) & ((values > 0) | (not log))
         shown = np.where(there, values, high)
         if log:
             shown, low, high = np.log10(shown), math.log10(low), math.log10(high)
         share = np.clip((shown - low) / (high - low), 0, 1)
-        colors = colors_of(colormap)
+        colors = colors_of(colormap, COLORS)
         at = np.linspace(0, 1, len(colors))
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
         filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
         picture = np.where((np.isfinite(values) & ~there & filled)[..., None], colors[0], picture)
         return (np.where(filled[..., None], picture, EMPTY) * 255 + 0.5).astype(np.uint8)
 
-    def span(self, norm: str | None = None, value_span: tuple[float, float] | None = None) -> tuple[bool, tuple[float, float]]:
+    @renamed(value_span="range")
+    def span(self, norm: str | None = None, range: tuple[float, float] | None = None) -> tuple[bool, tuple[float, float]]:
         """Whether colours are of logarithms, and the values that they span.
 
         Raises:
@@ -107,15 +112,16 @@ class Projection:
         finite = values[np.isfinite(values)]
         ends = _ends(finite)
         log = norm == "log" or (norm is None and bool((finite >= 0).all()) and ends[1] > LARGE_SPAN * ends[0])
-        if value_span is None:
+        if range is None:
             return log, (ends if log else value_range(finite))
-        low, high = (float(value) for value in value_span)
+        low, high = (float(value) for value in range)
         if not (math.isfinite(low) and math.isfinite(high) and low < high) or (log and low <= 0):
             more = ", above 0 for logarithms" if log else ""
-            raise ValueError(f"`value_span` must be two finite values that ascend{more}, got ({low}, {high})")
+            raise ValueError(f"`range` must be two finite values that ascend{more}, got ({low}, {high})")
         return log, (low, high)
 
-    def figure(self, colormap: str = "viridis", norm: str | None = None, value_span: tuple[float, float] | None = None) -> Any:
+    @renamed(value_span="range")
+    def figure(self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None) -> Any:
         """A figure of matplotlib with a colour bar; arguments as for `to_uint8`.
 
         Raises:
@@ -126,11 +132,12 @@ class Projection:
             from matplotlib.figure import Figure
         except ImportError as error:
             raise ImportError('a figure needs the library `matplotlib`: pip install "jaxsph[color]"') from error
-        log, (low, high) = self.span(norm, value_span)
+        log, (low, high) = self.span(norm, range)
         made = Figure(figsize=(6.4, 5.2), layout="constrained")
         axes = made.subplots()
-        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors_of(colormap))), 256)
-        map_of.set_bad("black" if self.weight is not None else tuple(colors_of(colormap)[0]))
+        colors = colors_of(colormap, COLORS)
+        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors)), COLORS)
+        map_of.set_bad("black" if self.weight is not None else tuple(colors[0]))
         height, width = self.shape
         side = math.sqrt(float(self.pixel_area))
         reach = (-width / 2 * side, width / 2 * side, -height / 2 * side, height / 2 * side)

@@ -1,20 +1,35 @@
-"""What can be chosen by name: integrators and screen samplers, which rooms above this one enter.
+"""What rooms above this one enter: integrators and screen samplers that are chosen by name, and methods of what is here.
 
-Flow: settings -> [registry] -> stages.
+Flow: settings -> [registry] -> stages; `Image.save`, `TransferFunction.figure`, ... -> [registry] -> files, figures.
 
-Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast` and
-`jaxsph.engine.screen`; any other package may enter its own.
+Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast`,
+`jaxsph.engine.screen` and `jaxsph.plot.methods`, which `jaxsph` imports; any other package may enter its own.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
 from typing import Any
+
+from jaxsph.numerics.names import found
 
 INTEGRATORS: dict[str, str] = {}
 """Classes, each a `jaxsph.engine.cast.integrator.Integrator`; without arguments, but for those that ask for points."""
 SCREENS: dict[str, str] = {}  # classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`
+METHODS: dict[str, str] = {}  # functions, by class and attribute: `"Image.writer"`
+
+
+class Method:
+    """An attribute of a class that is a function of a room above, imported when it is first used.
+
+    It is assigned without an annotation, as dataclasses would look up what is annotated.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = f"{owner.__name__}.{name}"
+
+    def __get__(self, one: Any, owner: type) -> Any:
+        return found(METHODS[self.name])
 
 
 def integrator(name: str, *arguments: Any) -> Any:
@@ -24,7 +39,7 @@ def integrator(name: str, *arguments: Any) -> Any:
 
 def integrator_class(name: str) -> Any:
     """The class of the integrator of that name, which says what it needs: see `Integrator`."""
-    return _found(INTEGRATORS[name])
+    return found(INTEGRATORS[name])
 
 
 def estimates(name: str) -> bool:
@@ -39,9 +54,4 @@ def screen(name: str) -> Any:
 
 @functools.cache
 def _made(entry: str, *arguments: Any) -> Any:
-    return _found(entry)(*arguments)
-
-
-def _found(entry: str) -> Any:
-    module, _, name = entry.partition(":")
-    return getattr(importlib.import_module(module), name)
+    return found(entry)(*arguments)

@@ -9,6 +9,7 @@ all else is out of its range of numbers: each medium takes from a list what is i
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.numerics import short
 from jaxsph.numerics.trees import tree
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
@@ -78,6 +80,10 @@ class Scene:
         if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
         _require_one_unit({name: _all_of(getattr(self, name)) for name in ("particles", "volume", "points")})
+
+    def __repr__(self) -> str:
+        told = ((field.name, getattr(self, field.name), field.default) for field in dataclasses.fields(self))
+        return short.line("Scene", *(f"{name}={value!r}" for name, value, usual in told if value is not usual))
 
     def check(self) -> None:
         """Raise `ValueError` where there is nothing to look at, or a part without what it looks like."""

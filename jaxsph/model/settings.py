@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import numbers
 from typing import Any
 
@@ -9,8 +10,9 @@ import jax
 import numpy as np
 
 from jaxsph.model.registry import INTEGRATORS, SCREENS, estimates
+from jaxsph.model.strategies import alike, spread
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import fill, tree
 
 ESTIMATORS = ("interval", "pilot")
 NUMBERS = "tolerance", "relax", "min_transmittance"
@@ -20,7 +22,13 @@ ALLOCATIONS = ("budget", "greedy")
 
 @tree(traced=NUMBERS, unchecked=True, kw_only=True)
 class Settings:
-    """Choices of the user; hashable where they fix a shape. `tolerance`, `relax` and `min_transmittance` are leaves, and floats.
+    """Choices of the user; hashable where they fix a shape.
+
+    `integrator` and `screen` take names, or objects that have the knobs of what reads them: `js.Samples(errors=js.Pilot())`,
+    `js.Segments()`, `js.StepDoubling(tolerance=1e-3)`, `js.Quadtree(leaf_pixels=8)`. These are spread over the fields below: what
+    is kept is the name, and settings that say the same are equal.
+
+    `tolerance`, `relax` and `min_transmittance` are leaves, and floats.
 
     Changing leaves compiles nothing (but for `min_transmittance` from and to 0, which has nothing looked at).
 
@@ -41,11 +49,11 @@ class Settings:
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does.
-        integrator: how samples along a ray become light; `"samples"` are points, each of which stands for what lies around it
-            (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear from one to the next,
-            the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where supports begin and end
-            in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those that two halves disagree
-            with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
+        integrator: how samples along a ray become light, a name or a strategy; `"samples"` are points, each of which stands for
+            what lies around it (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear
+            from one to the next, the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where
+            supports begin and end in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those
+            that two halves disagree with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
         step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
             ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs
             are compiled for it.
@@ -67,12 +75,16 @@ class Settings:
     super_pixels: bool = True
     merge: bool = True
     allocation: str = "budget"
-    integrator: str = "samples"
+    integrator: Any = "samples"
     step_tolerance: float = 1e-3
-    screen: str = "pixels"
+    screen: Any = "pixels"
     leaf_pixels: int = 8
     min_transmittance: Any = 0.0
     memory_limit: int | None = None
+
+    def __repr__(self) -> str:
+        changed = ((field.name, getattr(self, field.name), field.default) for field in dataclasses.fields(self))
+        return f"Settings({', '.join(f'{name}={value!r}' for name, value, default in changed if not alike(value, default))})"
 
     @property
     def is_refined(self) -> bool:
@@ -80,6 +92,7 @@ class Settings:
         return self.tolerance is not None and estimates(self.integrator) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
+        fill(self, **spread(vars(self), {field.name: field.default for field in dataclasses.fields(self)}))
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         self._require_choices()
@@ -115,7 +128,7 @@ class Settings:
             raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
         named = {"estimator": ESTIMATORS, "allocation": ALLOCATIONS, "integrator": INTEGRATORS, "screen": SCREENS}
         for name, known in named.items():
-            if getattr(self, name) not in known:
+            if getattr(self, name) not in tuple(known):
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         step = self.step_tolerance
         if isinstance(step, bool) or not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.trees import tree
@@ -39,6 +40,12 @@ class Volume:
     spacing: Float[Array, "3"]
     lower_rest: Float[Array, "3"]
     length_unit: str | None = None
+
+    def __repr__(self) -> str:
+        unit = "" if self.length_unit is None else f" {self.length_unit}"
+        place = f"from {short.vector(self.lower)}", f"spacing {short.vector(self.spacing)}{unit}"
+        numbers = None if short.known(self.values) is None else f"values {short.span(self.values)}"
+        return short.line("Volume", short.kind(self.values), numbers, *place)
 
     @classmethod
     def from_array(cls, values: Any, lower: Any = (0.0, 0.0, 0.0), spacing: Any = 1.0) -> Volume:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from jaxsph.io.libraries import require
 from jaxsph.io.settle.labels import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, Axis, raised
@@ -70,6 +71,8 @@ def image_figure(
         ValueError: a camera of another size than the image, a target that is not ahead of it.
     """
     require("matplotlib", "pictures with a key", "color")
+    if camera is not None and scene is not None:
+        camera = with_depths(camera, scene)
     if camera is not None and (camera.height, camera.width) != image.shape:
         size, given = f"{image.shape[1]} x {image.shape[0]}", f"{camera.width} x {camera.height}"
         raise ValueError(f"`camera` must be the one of the image, of {size} pixels, got one of {given}")
@@ -98,7 +101,7 @@ def _bars(scene: Scene, labels: Labels) -> list[Axis]:
 def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:
     """Depth at which the scale bar holds."""
     if target is None and bounds is None:
-        return (float(camera.near) + float(camera.far)) / 2
+        return sum(camera.near_and_far()) / 2
     place = np.mean(bounds, 0) if target is None and bounds is not None else np.asarray(target, np.float64)
     if place.shape != (3,):
         raise ValueError(f"`target` must have shape (3,), got {place.shape}; give x, y and z")
@@ -106,7 +109,7 @@ def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target
     if camera.is_perspective and depth <= 0:
         if target is not None:
             raise ValueError(f"`target` = {place.tolist()} is not ahead of the eye; give a place that the camera looks at")
-        return (float(camera.near) + float(camera.far)) / 2
+        return sum(camera.near_and_far()) / 2
     return depth
 
 
@@ -249,7 +252,7 @@ def to_pixels(camera: Camera, position: Float[np.ndarray, "... 3"]) -> tuple[np.
     """
     view = (np.asarray(position, np.float64) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     depth = view[..., 2]
-    ahead = depth > AHEAD * abs(float(camera.far)) if camera.is_perspective else np.ones(depth.shape, bool)
+    ahead = depth > AHEAD * abs(camera.near_and_far()[1]) if camera.is_perspective else np.ones(depth.shape, bool)
     spread = np.where(ahead, depth, 1) if camera.is_perspective else np.ones_like(depth)
     half = float(camera.half_height)
     x = (view[..., 0] / spread / half * camera.height + camera.width) / 2

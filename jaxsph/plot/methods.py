@@ -1,24 +1,22 @@
 """Methods of what users make that rooms above `model` know how to do: said here for all of them, and nowhere else.
 
-Flow: `Image.save`, `TransferFunction.figure`, ... of `model` -> [methods] -> `io`, `scenes` and the figures.
+Flow: `Image.save`, `TransferFunction.figure`, ... of `model` -> `registry` -> [methods] -> `io`, looks and the figures.
 
-`model` declares the names (`writer`, `reader`, `drawer`, `presets`) and imports none of these rooms. `jaxsph` imports this
-module, so that the methods are there whatever of the package is imported.
+`model` has the attributes (`registry.Method`) and imports none of these rooms; they are imported when a method is used.
+`jaxsph` imports this module, so that methods are there whatever of the package is imported.
 """
 
-from jaxsph.io import read_camera_path, read_transfer, write_camera_path, write_image, write_projection, write_transfer
-from jaxsph.model import CameraPath, Image, TransferFunction
-from jaxsph.model.projection import Projection
-from jaxsph.model.transfer.looks import preset
-from jaxsph.plot.image_figure import image_figure
-from jaxsph.plot.transfer_figure import transfer_figure
+from jaxsph.model import registry
 
-Image.writer = staticmethod(write_image)
-Image.drawer = staticmethod(image_figure)
-Projection.writer = staticmethod(write_projection)
-CameraPath.writer = staticmethod(write_camera_path)
-CameraPath.reader = staticmethod(read_camera_path)
-TransferFunction.writer = staticmethod(write_transfer)
-TransferFunction.reader = staticmethod(read_transfer)
-TransferFunction.presets = staticmethod(preset)
-TransferFunction.drawer = staticmethod(transfer_figure)
+registry.METHODS |= {
+    "Image.writer": "jaxsph.io.images.image_files:write_image",
+    "Image.drawer": "jaxsph.plot.image_figure:image_figure",
+    "Projection.writer": "jaxsph.io.images.projections:write_projection",
+    "CameraPath.writer": "jaxsph.io.camera_paths:write_camera_path",
+    "Particles.settler": "jaxsph.io.settle.columns:particles_from_columns",
+    "CameraPath.reader": "jaxsph.io.camera_paths:read_camera_path",
+    "TransferFunction.writer": "jaxsph.io.transfers:write_transfer",
+    "TransferFunction.reader": "jaxsph.io.transfers:read_transfer",
+    "TransferFunction.presets": "jaxsph.model.transfer.looks:preset",
+    "TransferFunction.drawer": "jaxsph.plot.transfer_figure:transfer_figure",
+}

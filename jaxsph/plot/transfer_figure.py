@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.analysis.met import Met, met
+from jaxsph.analysis.visibility import VisibilityHistogram, visibility_histogram
 from jaxsph.io.libraries import require
 from jaxsph.io.settle.labels import Labels
 from jaxsph.model.camera.camera import Camera
@@ -43,7 +43,7 @@ def transfer_figure(
 
     Args:
         transfer: one of the scene's own, or another for its particles (without particles, its first volume).
-        scene, camera: see `jaxsph.met`; without them the function alone is drawn.
+        scene, camera: see `jaxsph.visibility_histogram`; without them the function alone is drawn.
         labels: see `jaxsph.io.labels_of`; or the name of the quantity, in code units.
         title: above the figure.
         rays, bins: of the histogram.
@@ -53,7 +53,7 @@ def transfer_figure(
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: a scene without a camera, or what `jaxsph.met` refuses.
+        ValueError: a scene without a camera, or what `jaxsph.visibility_histogram` refuses.
     """
     require("matplotlib", "figures of transfer functions", "color")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -83,21 +83,21 @@ def transfer_figure(
     return figure
 
 
-def _met(transfer: TransferFunction, scene: Scene, camera: Camera, rays: int, bins: int) -> Met:
+def _met(transfer: TransferFunction, scene: Scene, camera: Camera, rays: int, bins: int) -> VisibilityHistogram:
     """Of the part that has this function; of the first part under it where none has."""
     looks = scene.looks
     number = next((number for number, look in enumerate(looks) if look is transfer), None)
     if number is not None:
-        return met(scene, camera, rays=rays, bins=bins, of=number)
+        return visibility_histogram(scene, camera, rays=rays, bins=bins, part=number)
     if scene.transfer is not None:
-        return met(dataclasses.replace(scene, transfer=transfer), camera, rays=rays, bins=bins)
+        return visibility_histogram(dataclasses.replace(scene, transfer=transfer), camera, rays=rays, bins=bins)
     if not looks:
         raise ValueError("`scene` must have particles or a volume for a histogram; leave out `scene` and `camera`")
     shown = transfer if len(looks) == 1 else (transfer, *looks[1:])
-    return met(dataclasses.replace(scene, volume_transfer=shown), camera, rays=rays, bins=bins)
+    return visibility_histogram(dataclasses.replace(scene, volume_transfer=shown), camera, rays=rays, bins=bins)
 
 
-def _limits(axis: Axis, found: Met | None) -> tuple[float, float]:
+def _limits(axis: Axis, found: VisibilityHistogram | None) -> tuple[float, float]:
     """What the axis reaches over: all that is drawn, and a margin."""
     scale = axis.scale
     ends = scale.values[[0, -1]] if found is None else axis.shown(found.edges[[0, -1]])
@@ -125,7 +125,7 @@ def _draw_strip(strip: Any, axis: Axis, low: float, high: float) -> None:
         strip.plot(values, np.full(len(values), 1.0), "v", color=DARK, markersize=4, clip_on=False, zorder=3)
 
 
-def _draw_histogram(upper: Any, axis: Axis, found: Met) -> None:
+def _draw_histogram(upper: Any, axis: Axis, found: VisibilityHistogram) -> None:
     edges = axis.shown(found.edges)
     middles = axis.shown(found.middles)
     absorbed, there = (share / max(share.sum(), np.finfo(float).tiny) for share in (found.absorbed, found.there))

@@ -56,7 +56,7 @@ class Rays(NamedTuple):
 def rays_of(camera: Camera, rows: Int[np.ndarray, " rays"], columns: Int[np.ndarray, " rays"]) -> Rays:
     """The rays through the middles of pixels."""
     u, v = ray_coordinates(camera, columns + 0.5, rows + 0.5)
-    return Rays(u, v, float(camera.near), float(camera.far), camera.is_perspective)
+    return Rays(u, v, *camera.near_and_far(), camera.is_perspective)
 
 
 def blocks(rays: Rays, size: int) -> list[Int[np.ndarray, " some"]]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import held_by
 from jaxsph.model.particles.particles import Particles
@@ -42,7 +43,7 @@ def project(
     """
     held = held_by(particles, of, weight)
     amounts = np.ldexp(np.asarray(held.amounts, np.float64), held.exponents)
-    near, far = (float(depth) for depth in (depth_range or (camera.near, camera.far)))
+    near, far = (float(depth) for depth in (depth_range or with_depths(camera, particles).near_and_far()))
     number = 1 if pixel == "ray" else subrays
     places, shares = np.polynomial.legendre.leggauss(number)
     columns, rows = ((np.arange(size)[:, None] + (1 + places) / 2).ravel() for size in (camera.width, camera.height))

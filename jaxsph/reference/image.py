@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles import kernels
 from jaxsph.model.points import Points
@@ -54,6 +55,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     scene.check()
     if scene.media:
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
+    camera = with_depths(camera, scene)
     numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
     quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
@@ -130,7 +132,7 @@ def _ray_coordinates(camera: Camera, every: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _depth(camera: Camera, u: np.ndarray, samples: int) -> np.ndarray:
-    near, far = float(camera.near), float(camera.far)
+    near, far = camera.near_and_far()
     if camera.is_perspective:
         return near * (far / near) ** (u / samples)
     return near + (far - near) * u / samples

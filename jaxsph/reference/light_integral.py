@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.reference.chords import Rays, blocks, rays_of
@@ -79,6 +80,7 @@ def integral(
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
     if not tolerance >= LEAST_TOLERANCE:
         raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
+    camera = with_depths(camera, scene)
     rows, columns = _pixels(camera, pixels, every)
     rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
     found, counts = _all(rays, parts, tolerance, progress)

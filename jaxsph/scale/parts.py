@@ -1,6 +1,6 @@
 """One picture by several processes: each renders some rows of it, and all of these make the picture.
 
-Flow: scene, camera, settings -> measures of the whole -> rows of each part -> [tiles: render_tile] -> parts -> [merge] -> Image.
+Flow: scene, camera, settings -> measures of the whole -> rows of each -> [parts: render_tile] -> parts -> [merge_tiles] -> Image.
 
 Rays of one bundle know nothing of those of another, and all that is chosen by how large supports appear is chosen by the whole
 picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates.
@@ -25,6 +25,7 @@ from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -42,7 +43,7 @@ OF_FILES = ("certified", "faults")
 def render_tile(
     scene: Scene, camera: Camera, settings: Settings | None, index: int, count: int, *, progress: Progress | None = None
 ) -> Image:
-    """Render one of `count` parts of a picture, each some of its rows; `jaxsph.merge` makes the picture of them.
+    """Render one of `count` parts of a picture, each some of its rows; `jaxsph.scale.merge_tiles` makes the picture of them.
 
     Parts are cut between tiles of 16 x 16 pixels so that all have about as many pairs of particles and bundles of rays. A part is
     the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently.
@@ -62,6 +63,7 @@ def render_tile(
     """
     settings = settings or Settings()
     _require_parts(scene, camera, settings, index, count)
+    camera = with_depths(camera, scene)
     mark = picture_of(scene, camera, settings)
     clock, asked = Clock(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)
@@ -130,7 +132,7 @@ def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int,
         raise ValueError(f"`index` must lie in [0, {count - 1}] for {count} parts, got {index}")
 
 
-def merge(parts: Iterable[Image], *, names: Sequence[str] | None = None) -> Image:
+def merge_tiles(parts: Iterable[Image], *, names: Sequence[str] | None = None) -> Image:
     """The picture that parts of `render_tile` make, in whatever order they are given.
 
     Args:
@@ -160,7 +162,7 @@ def _told(image: Image, name: str) -> dict[str, Any]:
     told = dict(image.metadata)
     if any(key not in told for key in OF_PARTS):
         raise ValueError(
-            f"{name} is not a part of a picture; parts are made by `jaxsph render --tile I/N` or `jaxsph.render_tile`"
+            f"{name} is not a part of a picture; parts are made by `jaxsph render --tile I/N` or `jaxsph.scale.render_tile`"
         )
     return told
 

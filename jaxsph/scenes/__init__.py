@@ -20,7 +20,6 @@ from __future__ import annotations
 from jaxsph.model import Camera, Scene
 from jaxsph.model.transfer import looks as appearance
 from jaxsph.model.transfer.looks import (
-    colormap,
     default_transfer,
     default_volume_transfer,
     domain_transfer,
@@ -28,6 +27,7 @@ from jaxsph.model.transfer.looks import (
     opacity_by_second,
     preset,
 )
+from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.nearest import did_you_mean
 from jaxsph.scenes import cosmos, fields
 from jaxsph.scenes.checker_board import checker_board

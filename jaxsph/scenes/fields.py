@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from jaxsph.model import Camera, Scene, TransferFunction, Volume
-from jaxsph.model.transfer.looks import colormap
+from jaxsph.model.transfer.maps import colormap
 
 Field = Float[np.ndarray, "nx ny nz"]
 ALUMINIUM, STEEL = 110.0, 230.0  # bytes

@@ -5,53 +5,16 @@ Flow: Particles -> [view] -> Camera.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model import Camera, Particles
-
-NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
-ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
+from jaxsph.model.camera.snug import snug
 
 FOV_DEGREES = 35.0
 UP = (0.0, 1.0, 0.0)
 BORDER = 0.06  # part of the image that stays empty around a scene
-
-
-def snug(camera: Camera, particles: Particles) -> Camera:
-    """`camera` with near and far moved to the particles' supports; unchanged where none lies in front of the eye."""
-    valid = np.asarray(particles.valid)
-    if not valid.any():
-        return camera
-    if particles.box is not None:
-        return snug_box(camera, *particles.bounds())
-    depth = _depth(camera, particles.exact_position()[valid])
-    support = np.asarray(particles.support, np.float64)[valid]
-    return _between(camera, (depth - support).min(), (depth + support).max())
-
-
-def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
-    """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
-    depth = _depth(camera, np.array(list(itertools.product(*zip(lower, upper, strict=True)))))
-    return _between(camera, depth.min(), depth.max())
-
-
-def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
-    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
-
-
-def _between(camera: Camera, near: float, far: float) -> Camera:
-    if camera.is_perspective:
-        if far <= 0:
-            return camera
-        near = max(near, NEAREST * far)
-    margin = ROUNDING * max(abs(near), abs(far))
-    near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
-    dtype = camera.dtype
-    return dataclasses.replace(camera, near=jnp.asarray(near, dtype), far=jnp.asarray(far + margin, dtype))
 
 
 def looking_at_box(

@@ -12,6 +12,7 @@ import pytest
 from derivatives import QUICKLY
 
 import jaxsph as js
+from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.model.particles import kernels
 from jaxsph.numerics import faults
@@ -26,7 +27,7 @@ LISTS = ListPlan(1, 2, 1024, 4096, 1)  # room for all that is projected here, su
 
 
 def plan_of(pixel, capacity):
-    return js.ProjectionPlan(20, 13, capacity, pixel, 1, LISTS, LISTS if pixel == "mean" else None)
+    return ProjectionPlan(20, 13, capacity, pixel, 1, LISTS, LISTS if pixel == "mean" else None)
 
 
 def project(particles, camera, *what, pixel="mean", **more):
@@ -125,7 +126,7 @@ def test_a_uniform_box_has_its_column_density_to_7e_5(kernel, spacings):
     position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
     particles = js.Particles.from_arrays(position, spacings / 12, 0.0, 3.0 * 12.0**-3, kernel)
     turned = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=0.7, near=1, far=9, **SIZE)
-    plan = js.plan_projection(particles, turned)
+    plan = plan_projection(particles, turned)
     plan = dataclasses.replace(plan, rays=plan.shares)  # where depths cut
     np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=7e-5)
     part = js.project(particles, turned, plan=plan, depth_range=(4.6, 5.3)).values
@@ -141,7 +142,7 @@ def test_a_plan_has_room_however_programs_round(spacings, ends, monkeypatch):
     position = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
     view = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=13 / 8, near=ends[0], far=ends[1], **SIZE)
     particles = js.Particles.from_arrays(position, spacings / 8, 0.0, 1.0)
-    plan = js.plan_projection(particles, view)
+    plan = plan_projection(particles, view)
     eps, still = np.finfo(np.float32).eps, js.project(particles, view, plan=plan).values
     for seed in range(3):
         off = np.random.default_rng(seed).uniform(-3, 3, (2, len(position), 3)) * eps
@@ -165,7 +166,7 @@ def periodic(count=60, seed=17, **more):
 @pytest.mark.parametrize("pixel", ["mean", "ray"])
 def test_along_an_axis_a_periodic_set_is_its_copies_between_the_faces(pixel):
     particles, copies = periodic(25)
-    camera = js.along_axis(particles, "z", 18, 12)  # pixels end at the faces
+    camera = js.Camera.along_axis(particles, "z", 18, 12)  # pixels end at the faces
     truth = js.reference.project(copies, camera, pixel=pixel, depth_range=(0.375, 1.125), subrays=10).values
     image = js.project(particles, camera, pixel=pixel)
     np.testing.assert_allclose(image.values, truth, atol=3e-4 * truth.max())
@@ -193,7 +194,7 @@ def test_other_cameras_see_each_particle_of_a_periodic_set_once():
     particles, _ = periodic()
     aslant = js.Camera.orthographic((3, 2, 4), (0.75, 0.5, 0.4), view_height=3.5, near=0.5, far=9, **SIZE)
     image = js.project(particles, aslant)
-    assert js.plan_projection(particles, aslant).images is None
+    assert plan_projection(particles, aslant).images is None
     assert abs(float(image.total()) / particles.to_numpy()["volume"].sum() - 1) < 1e-4
     outside = dataclasses.replace(particles, position=particles.position + particles.box.sides)
     np.testing.assert_allclose(js.project(outside, aslant).values, image.values, atol=1e-3 * float(image.values.max()))
@@ -201,11 +202,11 @@ def test_other_cameras_see_each_particle_of_a_periodic_set_once():
 
 @pytest.mark.slow
 def test_a_plan_for_a_periodic_set_grows_and_is_for_periodic_sets():
-    camera = js.along_axis(periodic()[0], "z", 20, 13)
+    camera = js.Camera.along_axis(periodic()[0], "z", 20, 13)
     few, many = (periodic(count)[0].padded(64) for count in (20, 60))
-    small, large = (js.plan_projection(particles, camera) for particles in (few, many))
-    grown = js.plan_projection(many, camera, like=small)
-    assert grown.images == large.images > small.images and js.plan_projection(few, camera, like=grown) == grown
+    small, large = (plan_projection(particles, camera) for particles in (few, many))
+    grown = plan_projection(many, camera, like=small)
+    assert grown.images == large.images > small.images and plan_projection(few, camera, like=grown) == grown
     with pytest.raises(ValueError, match="a periodic box, and these have none"):
         js.project(dataclasses.replace(many, box=None), camera, plan=grown)
     with pytest.raises(js.CapacityError):
@@ -252,17 +253,17 @@ def test_amounts_that_float32_cannot_hold_are_projected():
 
 def test_emission_of_power_one_is_the_column_density_and_others_weigh_by_density():
     mass, density = np.array([1.0, 2.0]), np.array([3.0, 5.0])
-    np.testing.assert_allclose(js.emission(mass, density, power=1), mass)
-    np.testing.assert_allclose(js.emission(mass, density, 0.5), 0.5 * density * mass)
-    np.testing.assert_allclose(jax.jit(js.emission)(mass, density), density * mass, rtol=1e-6)
+    np.testing.assert_allclose(js.emission_measure(mass, density, power=1), mass)
+    np.testing.assert_allclose(js.emission_measure(mass, density, 0.5), 0.5 * density * mass)
+    np.testing.assert_allclose(jax.jit(js.emission_measure)(mass, density), density * mass, rtol=1e-6)
 
 
 def test_a_plan_grows_to_what_is_needed():
     few, many, camera = particles_of(15, count=10), particles_of(16), camera_of()
-    small, large = js.plan_projection(few, camera), js.plan_projection(many, camera)
-    grown = js.plan_projection(many, camera, like=small)
+    small, large = plan_projection(few, camera), plan_projection(many, camera)
+    grown = plan_projection(many, camera, like=small)
     assert grown.shares.list_capacity >= large.shares.list_capacity
-    assert js.plan_projection(few, camera, like=grown) == grown
+    assert plan_projection(few, camera, like=grown) == grown
     np.testing.assert_array_equal(*(js.project(few, camera, plan=plan).values for plan in (small, grown)))
 
 
@@ -271,7 +272,7 @@ def test_a_plan_grows_to_what_is_needed():
 def test_bands_change_nothing(pixel):
     particles = particles_of(11)
     camera = camera_of(height=40)
-    whole = js.plan_projection(particles, camera, pixel=pixel)
+    whole = plan_projection(particles, camera, pixel=pixel)
     cut = dataclasses.replace(whole, bands=3)
     cut = dataclasses.replace(cut, **{
         name: dataclasses.replace(getattr(cut, name), tile_rows=1) for name in ("rays", "shares") if getattr(cut, name)
@@ -292,7 +293,7 @@ def test_bands_change_nothing(pixel):
 def test_gradients_are_those_of_differences(pixel, projection, x64):
     particles = particles_of(12, "wendland_c2", 12, decades=1.0, dtype=np.float64)
     camera = jax.tree.map(lambda leaf: leaf.astype(np.float64), camera_of(projection, near=2.2, far=3.4))
-    plan = js.plan_projection(particles, camera, pixel=pixel)
+    plan = plan_projection(particles, camera, pixel=pixel)
     pattern = np.random.default_rng(0).normal(size=(13, 20))
 
     def loss(position, support, mass, eye, far):
@@ -320,7 +321,7 @@ def test_gradients_are_those_of_differences(pixel, projection, x64):
 
 def test_one_program_serves_moved_particles_and_many_at_once():
     particles, camera = particles_of(13), camera_of()
-    plan = js.plan_projection(particles, camera)
+    plan = plan_projection(particles, camera)
 
     def shifted(shift):
         moved = dataclasses.replace(particles, position=particles.position + shift)
@@ -335,7 +336,7 @@ def test_one_program_serves_moved_particles_and_many_at_once():
 @pytest.mark.slow
 def test_a_plan_that_is_too_small_is_refused_or_a_fault():
     particles, camera = particles_of(14), camera_of()
-    plan = js.plan_projection(particles, camera, pixel="ray")
+    plan = plan_projection(particles, camera, pixel="ray")
     small = dataclasses.replace(plan, rays=dataclasses.replace(plan.rays, list_capacity=3))
     with pytest.raises(js.CapacityError, match="plan_projection"):
         js.project(particles, camera, pixel="ray", plan=small)
@@ -375,6 +376,6 @@ def test_bad_particles_and_missing_plans_are_refused():
     with pytest.raises(ValueError, match="plan_projection"):
         jax.jit(lambda particles: js.project(particles, camera).values)(particles)
     with pytest.raises(ValueError, match=r"camera\.width"):
-        js.project(particles, camera_of(width=21), plan=js.plan_projection(particles, camera))
+        js.project(particles, camera_of(width=21), plan=plan_projection(particles, camera))
     with pytest.raises(ValueError, match="memory_limit"):
-        js.plan_projection(particles, camera, memory_limit=100)
+        plan_projection(particles, camera, memory_limit=100)

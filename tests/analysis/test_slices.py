@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.analysis.slices import Slice
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 SIZE = {"width": 24, "height": 17}
@@ -37,7 +38,7 @@ def agree(values, truth, atol):
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0, -2, 0), (1, 0.4, -2)])
 def test_values_are_those_of_the_reference_and_nothing_where_nothing_is(normal):
     particles, plane = particles_of(), js.Plane((0.5, 0.6, 0.4), normal)
-    found = js.slice_of(particles, plane, **SIZE)
+    found = js.slice(particles, plane, **SIZE)
     truth = truth_of(particles, found)
     assert 0.05 < np.isnan(truth).mean() < 0.9
     agree(found.values, truth, 1e-5 * np.ptp(particles.to_numpy()["quantity"]))
@@ -45,7 +46,7 @@ def test_values_are_those_of_the_reference_and_nothing_where_nothing_is(normal):
 
 def test_places_are_on_the_plane_one_pixel_apart_and_where_values_are():
     point, normal = np.array([0.5, 0.6, 0.4]), np.array([1, 0.4, -2.0]) / np.linalg.norm([1, 0.4, -2])
-    found = js.slice_of(particles_of(), js.Plane(point, normal), view_height=1.0, center=(0.5, 0.5, 0.5), **SIZE)
+    found = js.slice(particles_of(), js.Plane(point, normal), view_height=1.0, center=(0.5, 0.5, 0.5), **SIZE)
     place = found.positions()
     assert np.abs((place - point) @ normal).max() < 1e-6
     np.testing.assert_allclose(np.linalg.norm(np.diff(place, axis=0), axis=-1), 1 / 17, rtol=1e-5)
@@ -58,7 +59,7 @@ def test_places_are_on_the_plane_one_pixel_apart_and_where_values_are():
 
 def test_double_precision_is_exact(x64):
     particles = particles_of(dtype=np.float64)
-    found = js.slice_of(particles, js.Plane(np.array([0.5, 0.6, 0.4]), np.array([0, 0, 1.0])), **SIZE)
+    found = js.slice(particles, js.Plane(np.array([0.5, 0.6, 0.4]), np.array([0, 0, 1.0])), **SIZE)
     assert found.values.dtype == np.float64
     agree(found.values, truth_of(particles, found), 1e-10)
 
@@ -66,7 +67,7 @@ def test_double_precision_is_exact(x64):
 @pytest.mark.parametrize("height", [0.45, 0.02], ids=["middle", "face"])
 def test_of_a_periodic_set_images_count_and_there_is_nothing_outside_of_its_box(height):
     particles = particles_of(SIDES)
-    found = js.slice_of(particles, js.Plane((0, 0, height), (0, 0, 1)), view_height=1.8, **SIZE)
+    found = js.slice(particles, js.Plane((0, 0, height), (0, 0, 1)), view_height=1.8, **SIZE)
     copies = [particles.exact_position() + SIDES * turns for turns in itertools.product((-1, 0, 1), repeat=3)]
     columns = {name: np.tile(column, 27) for name, column in particles.to_numpy().items() if name != "position"}
     free = js.Particles.from_arrays(np.concatenate([copy[:150] for copy in copies]), **columns)
@@ -79,7 +80,7 @@ def test_of_a_periodic_set_images_count_and_there_is_nothing_outside_of_its_box(
 
 def test_within_a_clip_values_stay_and_there_are_none_outside():
     particles, plane, ball = particles_of(), js.Plane((0.5, 0.6, 0.4), (0, 0, 1)), js.Sphere((0.4, 0.6, 0.4), 0.35)
-    whole, part = (js.slice_of(particles, plane, within=clip, **SIZE) for clip in (None, ball))
+    whole, part = (js.slice(particles, plane, within=clip, **SIZE) for clip in (None, ball))
     inside = np.linalg.norm(part.positions() - (0.4, 0.6, 0.4), axis=-1) < 0.35
     assert np.isnan(part.values[~inside]).all() and np.isfinite(part.values[inside]).any()
     np.testing.assert_allclose(part.values[inside], whole.values[inside], atol=1e-5)
@@ -88,9 +89,9 @@ def test_within_a_clip_values_stay_and_there_are_none_outside():
 @pytest.mark.slow
 def test_a_constant_is_that_constant_and_nothing_is_nothing():
     plane = js.Plane((0.5, 0.6, 0.4), (0, 0, 1))
-    found = js.slice_of(particles_of(quantity=np.full(150, 7.25)), plane, **SIZE)
+    found = js.slice(particles_of(quantity=np.full(150, 7.25)), plane, **SIZE)
     np.testing.assert_allclose(found.values[np.isfinite(found.values)], 7.25, rtol=2e-6)
-    nobody = js.slice_of(js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0), plane, **SIZE)
+    nobody = js.slice(js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0), plane, **SIZE)
     assert np.isnan(nobody.values).all()
 
 
@@ -98,7 +99,7 @@ def test_a_picture_has_the_colours_of_the_values_and_black_elsewhere():
     values = np.array([[0.0, 0.5], [2.0, np.nan]], np.float32)
     camera = js.Camera.orthographic((0, 0, 0), (0, 0, 1), view_height=2.0, width=2, height=2, near=-1, far=1)
     look = js.TransferFunction.from_points([0, 1], [[0, 0, 0], [1, 0.5, 0]], [0, 0])  # extinction is not asked
-    image = js.Slice(values, camera).image(look)
+    image = Slice(values, camera).image(look)
     np.testing.assert_allclose(image.color, [[[0, 0, 0], [0.5, 0.25, 0]], [[1, 0.5, 0], [0, 0, 0]]])
     np.testing.assert_array_equal(image.transmittance, [[0, 0], [0, 1]])
 
@@ -107,7 +108,7 @@ def test_a_picture_has_the_colours_of_the_values_and_black_elsewhere():
     ("normal", "right", "up"), [((0, 0, 1), "x", "y"), ((1, 0, 0), "y", "z"), ((0, -1, 0), "x", "z"), ((0, 0, 3), "x", "y")]
 )
 def test_a_slice_along_axes_has_them_to_the_right_and_upwards(normal, right, up):
-    rise = {axis: np.diff(js.slice_of(particles_of(), js.Plane((0.5, 0.6, 0.4), normal), width=3, height=3).positions(), axis=k)
+    rise = {axis: np.diff(js.slice(particles_of(), js.Plane((0.5, 0.6, 0.4), normal), width=3, height=3).positions(), axis=k)
             for k, axis in ((1, "right"), (0, "up"))}  # fmt: skip
     assert (rise["right"][..., "xyz".index(right)] > 0).all() and (rise["up"][..., "xyz".index(up)] < 0).all()
 
@@ -123,4 +124,4 @@ def test_a_slice_along_axes_has_them_to_the_right_and_upwards(normal, right, up)
 )
 def test_bad_input_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match=said):
-        js.slice_of(particles_of(), **({"plane": js.Plane((0, 0, 0), (0, 0, 1))} | given))
+        js.slice(particles_of(), **({"plane": js.Plane((0, 0, 0), (0, 0, 1))} | given))

@@ -26,7 +26,7 @@ def test_a_snapshot_is_sorted_and_rendered_from_disk_as_from_memory(file, capsys
     code, out, err = run(capsys, "render", "sorted.hdf5", "--from-disk", 0.1, "-o", "a.exr", *look)
     assert (code, err) == (0, []) and "1, of at most 800 particles" in out and "jaxsph-index.npz" in out
     scene = js.Scene(particles=io.read_particles("sorted.hdf5", "InternalEnergy"), transfer=transfer)
-    camera = js.Camera.framing(js.OnDisk.open("sorted.hdf5", "InternalEnergy"), width=24, height=32)
+    camera = js.Camera.framing(js.scale.OnDisk.open("sorted.hdf5", "InternalEnergy"), width=24, height=32)
     a = np.asarray(io.read_image("a.exr").color)
     b = np.asarray(js.render(scene, camera, js.Settings(samples=16)).color)
     assert b.max() > 0.1

@@ -118,7 +118,7 @@ def test_a_tolerance_is_what_the_renderer_is_asked_for_and_its_bound_is_told(fil
 
 @pytest.mark.slow
 def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_integral_is(file, tmp_path, capsys):
-    arguments = ["--size", "12x8", "--samples", "16"]
+    arguments = ["--size", "12x8", "--samples", "64"]
     code, out, err = run(capsys, "render", file, "-o", "out.exr", *arguments, "--integrator", "segments", "--tolerance", 0.01)
     assert (code, err) == (0, [])
     (line,) = (line for line in out.splitlines() if line.startswith("error"))

@@ -53,14 +53,14 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
         assert said in out
     found = io.read_projection("gas.exr")
     particles, given, _ = gas()
-    truth = js.reference.project(particles, js.along_axis(particles, "z", 18, 12), given["mass"]).values
+    truth = js.reference.project(particles, js.Camera.along_axis(particles, "z", 18, 12), given["mass"]).values
     np.testing.assert_allclose(found.values, truth, atol=1e-3 * truth.max())
     assert found.name == "column.mass" and abs(float(found.total()) / given["mass"].sum() - 1) < 1e-4
 
 
 def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
     particles, given, volume = gas()
-    camera = js.along_axis(particles, "x", 18, 12)
+    camera = js.Camera.along_axis(particles, "x", 18, 12)
     ray = {"pixel": "ray"}
     for arguments, of, weight, more in (
         (["--of", "number"], np.ones(COUNT), None, {}),
@@ -68,10 +68,10 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
         (["--of", "temperature", "--weight", "mass"], given["temperature"], given["mass"], {}),
         (["--emission", 2], given["density"] * given["mass"], None, {}),
         (["--emission", 1.5, "--of", "temperature"], given["temperature"] * given["density"] ** 0.5 * given["mass"], None, {}),
-        (["--depth-range", "0.4,0.6"], given["mass"], None, {"slab": (0.4, 0.6)}),
+        (["--depth-range", "0.4,0.6"], given["mass"], None, {"depth_range": (0.4, 0.6)}),
     ):
         found, _ = values(capsys, file, "--view", "x", "--pixel", "ray", *arguments)
-        view = js.along_axis(particles, "x", 18, 12, **more) if more else camera
+        view = js.Camera.along_axis(particles, "x", 18, 12, **more) if more else camera
         truth = js.reference.project(particles, view, of, weight, **ray).values
         there = np.isfinite(truth) & np.isfinite(found)
         assert (np.isfinite(truth) != np.isfinite(found)).mean() < 0.03  # within rounding of a support's edge
@@ -83,9 +83,9 @@ def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file
     whole, some = (values(capsys, "bare.npz", "--of", "density", *more)[0] for more in ([], ["--where", "x < 0.5"]))
     others, out = values(capsys, "bare.npz", "--of", "density", "--where", "x >= 0.5")
     assert "left out by x >= 0.5" in out
-    frames = [js.along_axis(io.read_particles("bare.npz", "x", where=one), "z", 18, 12) for one in ("x < 0.5", "x >= 0.5")]
+    frames = [js.Camera.along_axis(io.read_particles("bare.npz", "x", where=one), "z", 18, 12) for one in ("x < 0.5", "x >= 0.5")]
     sums = [image.sum() * 4 * float(frame.half_height) ** 2 for image, frame in zip((some, others), frames, strict=True)]
-    frame = js.along_axis(io.read_particles("bare.npz", "x"), "z", 18, 12)
+    frame = js.Camera.along_axis(io.read_particles("bare.npz", "x"), "z", 18, 12)
     np.testing.assert_allclose(sum(sums), whole.sum() * 4 * float(frame.half_height) ** 2, rtol=1e-3)
     image, out = values(capsys, "bare.npz", "--box-size", "1,1,1", "--size", "12x12")
     assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area

@@ -139,7 +139,7 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
         code, out, err = run(capsys, "slice", file, "-o", name, *plane)
         assert (code, err) == (0, []) and "of the pixels inside of supports" in out
     particles = io.read_particles(file, "pressure")
-    expected = js.slice_of(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
+    expected = js.slice(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
     np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)
     assert np.asarray(io.read_image("a.png").color).max() > 0.3
 
@@ -224,5 +224,5 @@ def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, capsy
     assert (code, err) == (0, [])
     particles = io.read_particles(file)
     plane = js.Plane((0.5, 0.5, 0.4), (1, 0, 0))
-    expected = js.slice_of(particles, plane, center=(0.5, 0.5, 0.4), view_height=0.4, width=24, height=16)
+    expected = js.slice(particles, plane, center=(0.5, 0.5, 0.4), view_height=0.4, width=24, height=16)
     np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)

@@ -1,6 +1,7 @@
 """Small files of every format, written from scratch: readers are tested against the format, not against themselves."""
 
 import contextlib
+import functools
 import gzip
 import struct
 import tracemalloc
@@ -147,6 +148,66 @@ def write_phantom(path, p, h=None, itype=None):
         file.create_group("sinks")
 
 
+def fortran(*parts, order="<", limit=2**31 - 9):
+    """A record as gfortran writes it: in several of at most `limit` bytes, the signs of whose lengths say which go on."""
+    data = b"".join(np.asarray(part).tobytes() if not isinstance(part, bytes) else part for part in parts)
+    pieces = [data[at : at + limit] for at in range(0, len(data), limit)] or [b""]
+    last, made = len(pieces) - 1, b""
+    for n, piece in enumerate(pieces):
+        head, tail = (len(piece) if n == last else -len(piece)), (-len(piece) if n else len(piece))
+        made += np.array(head, f"{order}i4").tobytes() + piece + np.array(tail, f"{order}i4").tobytes()
+    return made
+
+
+PHANTOM_HEADER = {
+    "i0": {"nparttot": [7], "ntypes": [7], "npartoftype": [7, 0, 0, 0, 0, 0, 0], "nblocks": [1]},
+    "i8": {"nparttot": [7], "npartoftype": [7, 0, 0, 0, 0, 0, 0]},
+    "f0": {"time": [3.0], "hfact": [1.25], "massoftype": [2.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0]},
+    "f8": {"udist": [1e16], "umass": [2e33], "utime": [1e10], "umagfd": [1.0]},
+}
+
+
+def phantom_records(
+    blocks, header=PHANTOM_HEADER, *, order="<", int_bytes=4, real_bytes=8, name="FT:Phantom:2025.0.0", limit=2**31 - 9
+):
+    """The records of a dump: `blocks` are (rows, {kind: {tag: array}}), kinds i0 (default), i1 .. i8, f0 (default), f4, f8."""
+    kinds = ("i0", "i1", "i2", "i4", "i8", "f0", "f4", "f8")
+    stored = {"i0": f"{order}i{int_bytes}", "f0": f"{order}f{real_bytes}"}
+    dtype = {kind: np.dtype(stored.get(kind, f"{order}{kind}")) for kind in kinds}
+    record, letters = functools.partial(fortran, order=order, limit=limit), lambda tag: tag.encode().ljust(16)
+    magic = [np.array(v, dtype["f0" if n == 1 else "i0"]) for n, v in enumerate((60769, 60878, 60878, 1, 690706))]
+    made = [record(*magic), record(name.encode().ljust(100))]
+    for kind in kinds:
+        values = [(tag, value) for tag, each in header.get(kind, {}).items() for value in each]
+        made.append(record(np.array(len(values), f"{order}i4")))
+        if values:
+            made += [record(*(letters(tag) for tag, _ in values)), record(np.array([v for _, v in values], dtype[kind]))]
+    made.append(record(np.array(len(blocks), f"{order}i4")))
+    processes = header.get("i0", {}).get("nblocks", [1])[0]
+    for begin in range(0, len(blocks), len(blocks) // processes):
+        piece = blocks[begin : begin + len(blocks) // processes]
+        for rows, arrays in piece:
+            made.append(
+                record(np.array(rows, f"{order}i8"), np.array([len(arrays.get(kind, ())) for kind in kinds], f"{order}i4"))
+            )
+        for _, arrays in piece:
+            for kind in kinds:
+                for tag, values in arrays.get(kind, {}).items():
+                    made += [record(letters(tag)), record(np.asarray(values, dtype[kind]))]
+    return made
+
+
+def phantom_particles(p, h=0.5, itype=1, real="f0", **more):
+    """The block of particles: positions and velocities in reals of the kind `real`."""
+    rows = len(p.position)
+    vectors = {"xyz"[n]: p.position[:, n] for n in range(3)} | {"v" + "xyz"[n]: p.velocity[:, n] for n in range(3)}
+    return rows, {"i1": {"itype": np.broadcast_to(itype, rows)}, real: vectors, "f4": {"h": np.broadcast_to(h, rows)} | more}
+
+
+def write_phantom_native(path, p, **how):
+    path.write_bytes(b"".join(phantom_records([phantom_particles(p), (0, {}), (0, {}), (0, {})], **how)))
+
+
 def write_points(path, p, **options):
     import h5py
 
@@ -208,6 +269,8 @@ WRITERS = {
     "gadget.hdf5": write_gadget_hdf5,
     "swift.hdf5": lambda path, p: write_gadget_hdf5(path, p, swift_kernel="Wendland C2"),
     "phantom.h5": write_phantom,
+    "disc_00010": write_phantom_native,
+    "sphere_00020": lambda path, p: write_phantom_native(path, p, order=">", real_bytes=4),
     "points.hdf5": write_points,
     "two.gadget": write_gadget_binary,
     "one.gadget": lambda path, p: write_gadget_binary(path, p, ">", form=1),
@@ -220,7 +283,7 @@ WRITERS = {
 @pytest.fixture(scope="session")
 def samples():
     """What makes small files: `samples.particles()`, `samples.writers[name](path, particles)`, `write_...`."""
-    writers = {name: value for name, value in globals().items() if name.startswith("write_")}
+    writers = {name: value for name, value in globals().items() if name.lower().startswith(("write_", "phantom_", "fortran"))}
     return SimpleNamespace(particles=make_particles, writers=WRITERS, **writers)
 
 

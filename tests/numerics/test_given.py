@@ -110,7 +110,7 @@ def test_a_grid_is_in_the_unit_of_its_place_or_of_its_spacing_at_the_origin(made
         (lambda x: js.TransferFunction.from_points([0, 1], np.ones((2, 3)), x([1, 1])), "extinction"),
         (lambda x: js.TransferFunction.from_colormap("viridis", x([0, 1]), 1.0), "values"),
         (lambda x: js.resample(particles(POSITION), x([0, 0, 0]), 0.5, (2, 2, 2)), "lower"),
-        (lambda x: js.emission(x([1, 1, 1]), 1.0), "mass"),
+        (lambda x: js.emission_measure(x([1, 1, 1]), 1.0), "mass"),
     ],
 )  # fmt: skip
 def test_a_unit_that_nothing_can_be_held_against_is_refused_by_name(made, call, name):
@@ -191,7 +191,7 @@ def test_masked_grids_rows_and_control_points_are_refused():
     with pytest.raises(ValueError, match="`extinction` is masked"):
         js.TransferFunction.from_points([0, 1], np.ones((2, 3)), np.ma.masked_array([1, 1], [0, 1]))
     with pytest.raises(ValueError, match="`quantity` is masked"):
-        js.control_values("linear", np.ma.masked_array([1.0, 2], [0, 1]))
+        js.TransferFunction.control_values("linear", np.ma.masked_array([1.0, 2], [0, 1]))
 
 
 @pytest.mark.parametrize("dtype", [">f4", ">f8", "<f4", "<f8", ">i4", np.longdouble])

@@ -61,7 +61,9 @@ def test_a_colour_of_the_bar_is_that_of_an_opaque_place_of_its_value(share):
 @pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
 def test_the_bar_spans_the_control_points_on_their_scale(domain):
     values = np.geomspace(1e-3, 10, 17)
-    look = js.TransferFunction.from_colormap("viridis", js.control_values(domain, values, low=1e-3, high=10), 100.0)
+    look = js.TransferFunction.from_colormap(
+        "viridis", js.TransferFunction.control_values(domain, values, low=1e-3, high=10), 100.0
+    )
     scene, image = ramp(values, look)
     axes = bar_of(image.figure(scene, labels="density"))
     assert axes.get_ylim() == pytest.approx((1e-3, 10), rel=1e-5)

@@ -6,7 +6,7 @@ import pytest
 import jaxsph as js
 
 pytest.importorskip("matplotlib")
-LOOK = js.TransferFunction.from_colormap("viridis", js.control_values("log", low=0.01, high=100), [0, 1, 4])
+LOOK = js.TransferFunction.from_colormap("viridis", js.TransferFunction.control_values("log", low=0.01, high=100), [0, 1, 4])
 CAMERA = js.Camera.orthographic((0.5, 0.5, -2), (0.5, 0.5, 0), view_height=0.5, width=6, height=6, near=1.0, far=5.0)
 
 

@@ -34,10 +34,10 @@ def test_panes_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
     columns = particles(6000)
     columns["SmoothingLength"] *= np.float32(0.5)
     path = write(tmp_path, columns, files=3)
-    on_disk = js.OnDisk.open(path, QUANTITY)
+    on_disk = js.scale.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, width=96, height=88), on_disk.transfer()
     told = []
-    image = js.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=10 << 20, progress=lambda *at: told.append(at))
+    image = js.scale.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=10 << 20, progress=lambda *at: told.append(at))
     whole = in_memory(path, transfer, camera)
     for layer in ("color", "transmittance", "error_bound"):
         np.testing.assert_allclose(getattr(image, layer), getattr(whole, layer), atol=3e-7)
@@ -48,19 +48,19 @@ def test_panes_of_few_particles_make_the_picture_of_all(tmp_path, monkeypatch):
 
 def test_memory_for_all_is_one_pane_and_the_same_bits(tmp_path):
     path = write(tmp_path, particles(2000))
-    on_disk = js.OnDisk.open(path, QUANTITY)
+    on_disk = js.scale.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, height=40), on_disk.transfer()
-    image = js.render_from_disk(on_disk, transfer, camera, SETTINGS)
+    image = js.scale.render_from_disk(on_disk, transfer, camera, SETTINGS)
     np.testing.assert_array_equal(image.color, in_memory(path, transfer, camera).color)
     assert image.stats["panes"] == 1
 
 
 def test_memory_that_does_not_suffice_says_how_much_does(tmp_path):
-    on_disk = js.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
+    on_disk = js.scale.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
     with pytest.raises(ValueError, match=r"which need [\d,]+; give more"):
-        js.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), SETTINGS, memory=1000)
+        js.scale.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), SETTINGS, memory=1000)
     with pytest.raises(ValueError, match="quadtree"):
-        js.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), js.Settings(screen="quadtree", tolerance=0.1))
+        js.scale.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), js.Settings(screen="quadtree", tolerance=0.1))
 
 
 def renderer_of(on_disk, camera, memory, settings=SETTINGS):
@@ -101,7 +101,7 @@ PILOT = js.Settings(samples=24, tolerance=0.03, estimator="pilot")
 def test_the_least_memory_that_is_named_has_panes_and_half_of_it_has_none(tmp_path, change, size, settings):
     columns = particles(2000)
     change(columns)
-    on_disk = js.OnDisk.open(write(tmp_path, columns), QUANTITY)
+    on_disk = js.scale.OnDisk.open(write(tmp_path, columns), QUANTITY)
     camera = camera_of(on_disk, width=size[0], height=size[1])
     least = least_of(on_disk, camera, settings)
     assert renderer_of(on_disk, camera, least, settings).panes()
@@ -111,11 +111,11 @@ def test_the_least_memory_that_is_named_has_panes_and_half_of_it_has_none(tmp_pa
 
 def test_panes_that_need_more_than_the_sample_tells_are_cut_and_the_picture_is_the_same(tmp_path, monkeypatch):
     path = write(tmp_path, particles(6000), files=3)
-    on_disk = js.OnDisk.open(path, QUANTITY)
+    on_disk = js.scale.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, width=40, height=40), on_disk.transfer()
     least, told = least_of(on_disk, camera), []
     monkeypatch.setattr(from_disk, "cut_to_fit", lambda *given, **how: ({Pane(0, 40, 0, 40): 1}, True))
-    image = js.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=least, progress=lambda *at: told.append(at))
+    image = js.scale.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=least, progress=lambda *at: told.append(at))
     whole = in_memory(path, transfer, camera)
     for layer in ("color", "transmittance", "error_bound"):
         np.testing.assert_allclose(getattr(image, layer), getattr(whole, layer), atol=3e-7)
@@ -123,7 +123,7 @@ def test_panes_that_need_more_than_the_sample_tells_are_cut_and_the_picture_is_t
 
 
 def test_the_limit_of_a_frame_is_named_where_it_is_what_is_too_little(tmp_path):
-    on_disk = js.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
+    on_disk = js.scale.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
     with pytest.raises(from_disk.TooLittleMemoryError, match=r"`settings.memory_limit` = 1000 bytes") as refused:
         renderer_of(on_disk, camera_of(on_disk), 1 << 30, js.Settings(samples=24, memory_limit=1000)).panes()
     settings = js.Settings(samples=24, memory_limit=refused.value.least)
@@ -135,9 +135,9 @@ def test_the_limit_of_a_frame_is_named_where_it_is_what_is_too_little(tmp_path):
 def test_panes_of_other_ways_are_as_near_as_the_whole(tmp_path, monkeypatch, way):
     monkeypatch.setattr(from_disk, "BYTES_A_PARTICLE", 3500)
     path, settings = write(tmp_path, particles(6000), files=3), js.Settings(samples=48, **way)
-    on_disk = js.OnDisk.open(path, QUANTITY)
+    on_disk = js.scale.OnDisk.open(path, QUANTITY)
     camera, transfer = camera_of(on_disk, width=96, height=88), on_disk.transfer()
-    image = js.render_from_disk(on_disk, transfer, camera, settings, memory=22 << 20)
+    image = js.scale.render_from_disk(on_disk, transfer, camera, settings, memory=22 << 20)
     whole = in_memory(path, transfer, camera, settings)
     apart = np.abs(np.asarray(image.color) - whole.color).max(-1)
     assert (

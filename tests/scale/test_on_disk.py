@@ -20,7 +20,7 @@ def short_runs(monkeypatch):
 
 
 def test_only_runs_that_the_rows_can_see_are_read(tmp_path, monkeypatch):
-    on_disk = js.OnDisk.open(write(tmp_path, particles(6000)), QUANTITY)
+    on_disk = js.scale.OnDisk.open(write(tmp_path, particles(6000)), QUANTITY)
     camera, read = js.Camera.framing(on_disk, width=40, height=72), []
     real = snapshot_rows.Snapshot.read
 
@@ -36,7 +36,7 @@ def test_only_runs_that_the_rows_can_see_are_read(tmp_path, monkeypatch):
 def test_log_density_gives_opacity_where_densities_spread(tmp_path):
     columns = particles(1000)
     columns["Density"] = np.geomspace(1e-3, 10, 1000).astype(np.float32)
-    on_disk = js.OnDisk.open(write(tmp_path, columns), QUANTITY, opacity_by="auto")
+    on_disk = js.scale.OnDisk.open(write(tmp_path, columns), QUANTITY, opacity_by="auto")
     assert on_disk.quantities == (QUANTITY, "log10:Density") and on_disk.sample.extinction_quantity is not None
     assert np.asarray(on_disk.transfer().extinction)[0] == 0
 
@@ -47,6 +47,6 @@ def test_a_periodic_snapshot_is_framed_as_in_memory(tmp_path, side):
     for name in ("snap.0.hdf5", "snap.1.hdf5"):
         with h5py.File(tmp_path / name, "r+") as file:
             file["Header"].attrs["BoxSize"] = side
-    on_disk, in_memory = js.OnDisk.open(path, QUANTITY), js.io.read_particles(path, QUANTITY)
+    on_disk, in_memory = js.scale.OnDisk.open(path, QUANTITY), js.io.read_particles(path, QUANTITY)
     assert (in_memory.box is None) == (side < 1)
     np.testing.assert_allclose(on_disk.bounds(), in_memory.bounds(), rtol=1e-6)

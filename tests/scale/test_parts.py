@@ -27,7 +27,7 @@ def view(height=56, count=300):
 
 
 def parts_of(scene, camera, settings, count):
-    return [js.render_tile(scene, camera, settings, index, count) for index in range(count)]
+    return [js.scale.render_tile(scene, camera, settings, index, count) for index in range(count)]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def three():
 def test_parts_are_together_the_same_bits_as_the_whole(settings):
     scene, camera = view()
     whole = js.render(scene, camera, settings)
-    merged = js.merge(reversed(parts_of(scene, camera, settings, 3)))
+    merged = js.scale.merge_tiles(reversed(parts_of(scene, camera, settings, 3)))
     for name in LAYERS:
         np.testing.assert_array_equal(getattr(merged, name), getattr(whole, name), name)
     assert (whole.levels is None) == (merged.levels is None)
@@ -68,7 +68,7 @@ def test_files_of_parts_make_the_same_file_as_the_whole(three, tmp_path):
     js.render(scene, camera, SETTINGS).save(tmp_path / "whole.exr")
     for number, part in enumerate(three):
         part.save(tmp_path / f"{number}.exr")
-    js.merge(js.io.read_image(tmp_path / f"{number}.exr") for number in (1, 2, 0)).save(tmp_path / "merged.exr")
+    js.scale.merge_tiles(js.io.read_image(tmp_path / f"{number}.exr") for number in (1, 2, 0)).save(tmp_path / "merged.exr")
     whole, merged = (js.io.read_image(tmp_path / name) for name in ("whole.exr", "merged.exr"))
     for name in LAYERS:
         np.testing.assert_array_equal(getattr(merged, name), getattr(whole, name), name)
@@ -108,30 +108,30 @@ def test_a_part_is_told_what_it_is_a_part_of(three):
     scene, camera = view()
     moved = dataclasses.replace(camera, eye=camera.eye + 0.001)
     others = {
-        "camera": js.render_tile(scene, moved, SETTINGS, 2, 3),
-        "scene": js.render_tile(view(count=299)[0], camera, SETTINGS, 2, 3),
-        "settings": js.render_tile(scene, camera, js.Settings(samples=32, min_transmittance=1e-4), 2, 3),
+        "camera": js.scale.render_tile(scene, moved, SETTINGS, 2, 3),
+        "scene": js.scale.render_tile(view(count=299)[0], camera, SETTINGS, 2, 3),
+        "settings": js.scale.render_tile(scene, camera, js.Settings(samples=32, min_transmittance=1e-4), 2, 3),
     }
     for other in others.values():
         with pytest.raises(ValueError, match=r"c\.exr is part of another picture than a\.exr"):
-            js.merge([*three[:2], other], names=["a.exr", "b.exr", "c.exr"])
+            js.scale.merge_tiles([*three[:2], other], names=["a.exr", "b.exr", "c.exr"])
     with pytest.raises(ValueError, match=r"c is one of 4 parts, but a is one of 3"):
-        js.merge([*three[:2], js.render_tile(scene, camera, SETTINGS, 3, 4)], names=["a", "b", "c"])
+        js.scale.merge_tiles([*three[:2], js.scale.render_tile(scene, camera, SETTINGS, 3, 4)], names=["a", "b", "c"])
 
 
 def test_a_part_that_is_missing_or_there_twice_is_named(three):
     with pytest.raises(ValueError, match="1 of 3 parts of the picture are missing: --tile 1/3"):
-        js.merge([three[0], three[2]])
+        js.scale.merge_tiles([three[0], three[2]])
     with pytest.raises(ValueError, match="x and z are both part 0"):
-        js.merge([three[0], three[1], three[0]], names="xyz")
+        js.scale.merge_tiles([three[0], three[1], three[0]], names="xyz")
     whole = js.render(*view(), SETTINGS)
     with pytest.raises(ValueError, match="image 1 is not a part"):
-        js.merge([three[0], whole])
+        js.scale.merge_tiles([three[0], whole])
     with pytest.raises(ValueError, match="at least one"):
-        js.merge([])
+        js.scale.merge_tiles([])
     shorter = dataclasses.replace(three[1], **{name: getattr(three[1], name)[1:] for name in LAYERS})
     with pytest.raises(ValueError, match="b ends at row"):
-        js.merge([three[0], shorter, three[2]], names="abc")
+        js.scale.merge_tiles([three[0], shorter, three[2]], names="abc")
 
 
 @pytest.mark.parametrize(
@@ -147,13 +147,13 @@ def test_a_part_that_is_missing_or_there_twice_is_named(three):
 )
 def test_parts_that_there_are_not_are_refused(index, count, settings, said):
     with pytest.raises(ValueError, match=said):
-        js.render_tile(*view(), settings, index, count)
+        js.scale.render_tile(*view(), settings, index, count)
 
 
 def test_what_the_memory_limit_is_does_not_make_another_picture(three):
     scene, camera = view()
-    tight = js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=1 << 30), 1, 3)
-    np.testing.assert_array_equal(js.merge([three[0], tight, three[2]]).color, js.merge(three).color)
+    tight = js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=1 << 30), 1, 3)
+    np.testing.assert_array_equal(js.scale.merge_tiles([three[0], tight, three[2]]).color, js.scale.merge_tiles(three).color)
 
 
 def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
@@ -167,8 +167,8 @@ def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
     monkeypatch.setattr(Work, "drawn", stop)
     for limit in (None, 1000):
         with pytest.raises((InterruptedError, ValueError)) as ended:
-            js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)
+            js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)
     least = int(str(ended.value).split("needs about ")[1].split()[0])
     with pytest.raises(InterruptedError):
-        js.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least), 1, 3)
+        js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=least), 1, 3)
     assert planned[-1].bytes <= least

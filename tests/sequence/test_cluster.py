@@ -83,7 +83,7 @@ def test_frames_that_outgrow_the_plan_are_the_same_bits_too(client):
 def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     results = []
-    with pytest.raises(js.FramesError, match="2 of 6 frames could not be made: frames 3 to 4: cut short") as raised:
+    with pytest.raises(js.sequence.FramesError, match="2 of 6 frames could not be made: frames 3 to 4: cut short") as raised:
         for frame in js.render_frames(sources(6, bad=(2, 3)), CAMERA, SETTINGS, client, output="on/{:02d}.exr"):
             results.append(frame)
     assert [(frame.number, frame.rendered, frame.error) for frame in results] == [
@@ -91,14 +91,14 @@ def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, t
     ]
     assert [frame.number for frame in raised.value.failed] == [3, 4] and str(results[0].path) == "on/01.exr"
     assert results[0].stats["pairs"] > 0
-    with pytest.raises(js.FramesError, match="frames 3 to 4: cut short"):
+    with pytest.raises(js.sequence.FramesError, match="frames 3 to 4: cut short"):
         list(js.render_frames(sources(6, bad=(2, 3)), CAMERA, SETTINGS, output="alone/{:02d}.exr"))
     for number in (1, 2, 5, 6):
         same(js.io.read_image(f"on/{number:02d}.exr"), js.io.read_image(f"alone/{number:02d}.exr"))
 
 
 def test_what_is_there_is_left_alone_and_what_was_bad_is_made_again(client, tmp_path):
-    with pytest.raises(js.FramesError):
+    with pytest.raises(js.sequence.FramesError):
         list(js.render_frames(sources(3, bad=(1,)), CAMERA, SETTINGS, client, output=tmp_path))
     again = list(js.render_frames(sources(3), CAMERA, SETTINGS, client, output=tmp_path))
     assert [frame.rendered for frame in again] == [False, True, False]
@@ -107,7 +107,7 @@ def test_what_is_there_is_left_alone_and_what_was_bad_is_made_again(client, tmp_
 
 
 def test_choices_are_those_of_the_first_frame_that_can_be_read(client, tmp_path):
-    with pytest.raises(js.FramesError, match="frame 1: cut short"):
+    with pytest.raises(js.sequence.FramesError, match="frame 1: cut short"):
         list(js.render_frames(sources(3, bad=(0,)), CAMERA, SETTINGS, client, output=tmp_path))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00002.png", "00003.png"]
 
@@ -142,7 +142,7 @@ def test_a_sequence_of_files_is_the_same_bits_and_a_truncated_file_is_one_frame(
     snapshots[1].write_bytes(snapshots[1].read_bytes()[:500])
     for given in (client, None):
         frames = []
-        with pytest.raises(js.FramesError, match=r"1 of 3 frames could not be made: frame 2: .*s_1\.npz"):
+        with pytest.raises(js.sequence.FramesError, match=r"1 of 3 frames could not be made: frame 2: .*s_1\.npz"):
             for frame in js.render_frames(snapshots, CAMERA, SETTINGS, given, output=tmp_path / str(given is None)):
                 frames.append(frame)
         assert [frame.error is None for frame in frames] == [True, False, True]

@@ -102,6 +102,7 @@ KINDS = {
     "zipped.bgeo": Kind(table, checked=whole),
     "two.gadget": Kind(table, exact=whole),
     "one.gadget": Kind(table, exact=whole),
+    "disc_00010": Kind(table, exact=whole),
     "a.tipsy": Kind(table, exact=whole, counts=((b"\0\0\0\x3c", b"\0\0\0%c"),)),
     "a.csv": Kind(table),
     "a.txt": Kind(table),

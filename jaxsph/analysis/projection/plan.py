@@ -21,6 +21,7 @@ from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import MAX_CAPACITY
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import between_faces, num_ghosts, sees_images, unfolded
 from jaxsph.numerics.checks import is_traced
@@ -94,7 +95,7 @@ class ProjectionPlan:
         """Raise `ValueError` where the plan is for other shapes than those given."""
         if self.images is not None and particles.box is None:
             raise ValueError(
-                "`plan` was made for particles with a periodic box, and these have none; make one with `jaxsph.plan_projection`"
+                "`plan` was made for particles with a periodic box, and these have none; make one with `plan_projection`"
             )
         given = {
             "camera.width": (camera.width, self.width),
@@ -104,9 +105,7 @@ class ProjectionPlan:
         }
         for name, (have, planned) in given.items():
             if have != planned:
-                raise ValueError(
-                    f"`plan` was made for {name} = {planned}, got {have}; make a new one with `jaxsph.plan_projection`"
-                )
+                raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
 def plan_projection(
@@ -130,7 +129,7 @@ def plan_projection(
     """
     if is_traced(particles, camera):
         raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
-    made = _measured(particles, camera, pixel, memory_limit or memory_for(particles.support))
+    made = _measured(particles, with_depths(camera, particles), pixel, memory_limit or memory_for(particles.support))
     return made if like is None else like.grown(made)
 
 

@@ -28,6 +28,7 @@ from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, besi
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, unit_held
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import between_faces, with_sources
@@ -57,7 +58,8 @@ def project(
 
     Without a weight a pixel is $\sum_j a_j F_j$: an amount a unit of area, such as a column density where $a_j$ is a mass. $F_j$
     is the integral of the kernel, whose integral over space is 1, along the ray between two depths, in closed form. With a weight
-    it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see `emission`.
+    it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see
+    `emission_measure`.
 
     Args:
         particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.
@@ -69,7 +71,7 @@ def project(
         pixel: `"mean"`: pixels are means over their area, and mass is kept however small a support is; `"ray"`: pixels are
             values along the rays through their middles, which miss supports that are smaller than a pixel.
         depth_range: depths that rays begin and end at, for those of the camera.
-        plan: as for `jaxsph.render`, by `jaxsph.plan_projection`.
+        plan: as for `jaxsph.render`, by `plan_projection`.
         name, unit: what the values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
 
@@ -87,7 +89,7 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    camera = _between(camera, depth_range, particles.length_unit)
+    camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
     held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
     traced = is_traced(particles, camera, held.amounts)
     planned, plan = plan is None, plan or _planned(particles, camera, pixel, traced)
@@ -104,9 +106,7 @@ def project(
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
     if traced:
-        raise ValueError(
-            "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection(particles, camera)`"
-        )
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
     return plan_projection(particles, camera, pixel=pixel)
 
 
@@ -123,7 +123,7 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -
 
 def _raise_for(word: int, planned: bool) -> None:
     if word & faults.OVERFLOWS and not planned:
-        raise CapacityError("`plan` is too small for these particles: make a new one with `jaxsph.plan_projection`")
+        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
     if word:
         raise ValueError(f"these particles cannot be projected: {faults.describe(word)}")
 

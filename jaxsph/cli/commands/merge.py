@@ -60,7 +60,7 @@ def merge(
     for path in files:
         if path.suffix.lower() != ".exr":
             raise UsageError(f"{path}: parts are .exr")
-    image = tiles.merge([io.read_image(path) for path in files], names=[str(path) for path in files])
+    image = tiles.merge_tiles([io.read_image(path) for path in files], names=[str(path) for path in files])
     image.save(asked.output)
     height, width = image.shape
     say("image", f"{asked.output}, {width} x {height}, of {len(files)} parts")

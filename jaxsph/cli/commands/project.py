@@ -32,7 +32,7 @@ from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import VIEWS
-from jaxsph.model.particles.held import emission
+from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.projection import NORMS, Projection
 from jaxsph.model.transfer.looks import default_transfer
 
@@ -219,7 +219,7 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
         times = "" if options.of is None else f"{options.of} x "
         name = f"emission.{options.of}" if options.of else "emission"
         said = f"integral of {times}density^{options.emission:g} along rays, each particle with its own density"
-        return emission(columns.mass, columns.density, factor, options.emission), None, name, said
+        return emission_measure(columns.mass, columns.density, factor, options.emission), None, name, said
     if options.weight is not None:
         of = options.of or "density"
         said = f"mean of {of} along rays, weighted by {options.weight}"
@@ -242,5 +242,5 @@ def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Came
 
 
 def _look(options: Any) -> dict[str, Any]:
-    given = {"colormap": options.colormap, "norm": options.norm, "value_span": options.range}
+    given = {"colormap": options.colormap, "norm": options.norm, "range": options.range}
     return {name: value for name, value in given.items() if value is not None}

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from jaxsph.analysis.slices import slice_of
+from jaxsph.analysis.slices import slice as slice_of
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice

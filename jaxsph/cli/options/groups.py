@@ -238,7 +238,7 @@ def colormap_option(help: str) -> Parameter:
     return option("--colormap", "NAME", values.colormap, LOOK, help)
 
 
-_COLORMAP = colormap_option(f"{', '.join(COLORMAPS)}, or any of matplotlib's (default: by the quantity)")
+_COLORMAP = colormap_option(f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)")
 _RANGE = option("--range", "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "values that the colours span (default: nearly all)")
 
 
@@ -326,7 +326,8 @@ class Key:
         str | None, option("--unit", "UNIT", str, OUTPUT, "of the quantity, as Msun/kpc**3; draws the key (default: the file's)")
     ] = None
     length_unit: Annotated[
-        str | None, option("--length-unit", "UNIT", str, OUTPUT, "of lengths, as kpc; draws the key (default: the file's)", show=False)
+        str | None,
+        option("--length-unit", "UNIT", str, OUTPUT, "of lengths, as kpc; draws the key (default: the file's)", show=False),
     ] = None
 
 

@@ -233,7 +233,7 @@ def tile(text: str) -> Part:
 
 def background(text: str) -> str:
     """`transparent`, or a colour."""
-    from jaxsph.model.colors import rgb
+    from jaxsph.numerics.colors import rgb
 
     if text != "transparent":
         try:

@@ -107,7 +107,7 @@ class Progressive:
 
         def frame_by(run: Executor) -> Frame:
             shards = shards_at_hand(plan.cast.tuning)
-            return Frame.begun(self._seen, self._camera, self._settings, plan, asked.scene.formulas, shards, run)
+            return Frame.begun(self._seen, asked.camera, self._settings, plan, asked.scene.formulas, shards, run)
 
         def rehearse(known: list[bool]) -> None:
             run = Forecast(known)
@@ -152,7 +152,7 @@ class Progressive:
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        return image_of(drawn, self._camera, self._settings, self._frame.plan, self._clock, **told)
+        return image_of(drawn, self._frame.camera, self._settings, self._frame.plan, self._clock, **told)
 
 
 class _Stage(NamedTuple):

@@ -37,8 +37,8 @@ def in_octree(scene: Scene) -> Scene:
     scene.check()
     if is_traced(scene):
         raise ValueError(
-            "`scene` must be of concrete arrays, as octrees are built on the host; call `jaxsph.in_octree` outside of `jax.jit` "
-            "and `jax.grad`, and give them the scene that it returns"
+            "`scene` must be of concrete arrays, as octrees are built on the host; call `in_octree` outside of `jax.jit` and "
+            "`jax.grad`, and give them the scene that it returns"
         )
     media: list[Medium] = []
     if scene.particles is not None and scene.transfer is not None:

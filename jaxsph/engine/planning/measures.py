@@ -71,7 +71,7 @@ def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int
 
 def _extents(z: np.ndarray, reach: np.ndarray, camera: Camera, samples: int) -> np.ndarray:
     """Diameters along depth, in samples, as far as they lie between near and far."""
-    near, far = float(camera.near), float(camera.far)
+    near, far = camera.near_and_far()
     front, back = (np.clip(np.asarray(z + side, np.float64), near, far) for side in (-reach, reach))
     if camera.is_perspective:
         return samples * np.log(back / front) / np.log(far / near)

@@ -24,12 +24,14 @@ from jaxsph.io.images.exr import read_layers, write_layers
 from jaxsph.io.images.png import write_pixels
 from jaxsph.io.replace import written_whole
 from jaxsph.model.projection import Projection
+from jaxsph.numerics.names import renamed
 
 SUFFIXES = (".exr", ".npy", ".png")
 WEIGHT = "weight"
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
 
+@renamed(value_span="range")
 def write_projection(path: str | os.PathLike[str], projection: Projection, **look: Any) -> None:
     """Write a projection, whole or not at all; `look` is that of `Projection.to_uint8`, for pictures.
 
@@ -48,7 +50,7 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         with written_whole(file) as temporary, temporary.open("wb") as stream:
             np.save(stream, np.asarray(projection.values), allow_pickle=False)
     else:
-        log, (low, high) = projection.span(look.get("norm"), look.get("value_span"))
+        log, (low, high) = projection.span(look.get("norm"), look.get("range"))
         shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
         more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
         write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)

@@ -47,6 +47,8 @@ KINDS = {
 TAILS = (0.5, 99.5)
 SIGNED = 0.05
 """Of the largest value, what the smallest must be below zero for a quantity to have both signs."""
+LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
+"""With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
 DECADE, BETWEEN = 10.0, (2, 98)
 """Ratio between these percentiles from which opacity follows a logarithm."""
 
@@ -80,7 +82,7 @@ def by_logarithm(particles: Particles, opacity_by: str | None) -> tuple[Particle
     return dataclasses.replace(particles, extinction_quantity=logarithm), LOG_PREFIX + opacity_by
 
 
-def look_of(shown: Particles | Volume, name: str, look: Look) -> tuple[TransferFunction, str]:
+def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = False) -> tuple[TransferFunction, str]:
     """The transfer function that is asked for, or chosen by the kind of data; and its name, for people.
 
     Its extinction is that of typical columns (`jaxsph.scenes.fitted`): `opening` fits it to the picture afterwards.
@@ -89,6 +91,8 @@ def look_of(shown: Particles | Volume, name: str, look: Look) -> tuple[TransferF
         shown: what is looked at.
         name: of the quantity that colours are looked up by.
         look: what was asked for.
+        by_log: extinction is looked up by a logarithm: over more decades it rises the more steeply, as else thin gas in a large
+            box hides what is dense.
 
     Raises:
         ValueError: a norm or a range that the quantity does not suit.
@@ -103,7 +107,12 @@ def look_of(shown: Particles | Volume, name: str, look: Look) -> tuple[TransferF
     whole: Any = shown
     alone = dataclasses.replace(whole, extinction_quantity=None) if second else whole
     made, called = _made(alone, name, look, depth)
-    return (opacity_by_second(made, whole, depth), called) if second else (made, called)
+    if not second:
+        return made, called
+    low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
+    return opacity_by_second(
+        made, whole, depth, ramp=max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
+    ), called
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:
@@ -122,7 +131,7 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
     norm = look.norm
     if norm is None and is_log and PRESETS[kind].domain == "log":
         norm = "linear"
-    more: dict[str, Any] = {"values": look.range, "domain": norm, "colormap_name": look.colormap}
+    more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
     return preset(kind, shown, **more, optical_depth=depth), f"{look.colormap or PRESETS[kind].colormap} ({kind})"
 
 

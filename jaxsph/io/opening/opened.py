@@ -134,7 +134,7 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
-    transfer, called = look_of(loaded.shown, loaded.quantity, look)
+    transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
@@ -174,6 +174,10 @@ def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Sce
     looks = ((shown, transfer), *more.volumes)
     volumes, transfers = zip(*looks, strict=True)
     return dataclasses.replace(more, volume=tuple(volumes), volume_transfer=tuple(transfers))
+
+
+def _is_log(name: str | None) -> bool:
+    return name is not None and name.lower().startswith(LOG_PREFIX)
 
 
 def _rows(loaded: Loaded, source: Source | None, view: View) -> ParticleTable | None:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type
+from jaxsph.io.parsing import choose_type, others_held
 from jaxsph.io.table import ParticleTable, box_of, time_of
 
 SOURCE = "Gadget binary"
@@ -48,7 +48,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         header = _header(blocks.pop("HEAD"), order)
         counts = header["count"].astype(np.int64)
         chosen = choose_type(np.flatnonzero(counts).tolist(), part_type)
-        said = [f"particles of type {chosen}"]
+        whole = header["total"] if header["files"] > 1 else counts
+        said = [f"particles of type {chosen}", *others_held(dict(enumerate(whole.tolist())), chosen)]
         mass = float(header["mass"][chosen])
         if not 0 <= mass < np.inf:
             raise DataError(f"has mass {mass:g} for particles of type {chosen} in its header; correct that number there")

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
-from jaxsph.io.parsing import choose_type
+from jaxsph.io.parsing import choose_type, others_held
 from jaxsph.io.readers.hdf5_links import holds, member
 from jaxsph.io.readers.hdf5_storage import columns_of, read_dataset, read_positions
 from jaxsph.io.readers.stated_units import number_of, of_gadget
@@ -59,6 +59,10 @@ GIZMO_KERNELS = {
 """By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
 the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
 MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
+MESH_NOTE = (
+    "the cells of a moving mesh (AREPO) are read as SPH particles at their mesh-generating points: volumes are the cells' "
+    "own, mass / density, and supports reach 32 neighbours, so that the field is smoother than the cells"
+)
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
 
@@ -72,12 +76,12 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     Raises:
         ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
-    chosen, group = _choose(file, part_type)
+    (chosen, group), present = _choose(file, part_type)
     position = read_positions(group["Coordinates"], rows)
     count = group["Coordinates"].shape[0]
     header = file["Header"].attrs if "Header" in file else {}
     _refuse_other_count(header, chosen, count)
-    said = [f"particles of PartType{chosen}"]
+    said = [f"particles of PartType{chosen}", *others_held(_counts(header, present), chosen)]
     swift = _is_swift(file)
     columns, dropped = {}, []
     for name, dataset in columns_of(group).items():
@@ -104,6 +108,8 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     if smoothing is not None:
         support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
         said.append(sentence)
+    if support is None and chosen == 0 and _is_moving_mesh(file, group):
+        said.append(MESH_NOTE)
     kernel, sentence = _kernel(file, header, swift)
     said.append(sentence)
     edges = np.ravel(header.get("BoxSize", 0.0)).astype(np.float64)
@@ -115,14 +121,25 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 
-def _choose(file: Any, part_type: int | None) -> tuple[int, Any]:
+def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:
+    """The type that is read and its group, and all types that can be."""
     found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
     usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
     if not usable:
         raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
     chosen = choose_type(usable, part_type)
     member(found[chosen], "Coordinates")
-    return chosen, found[chosen]
+    return (chosen, found[chosen]), usable
+
+
+def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
+    """How many particles of each type the whole snapshot has, as its header says; `None` of those `present` that it does not."""
+    counts: dict[int, int | None] = dict.fromkeys(present)
+    for name, factor in (("NumPart_Total", 1), ("NumPart_Total_HighWord", 2**32)):
+        told = np.ravel(np.asarray(header.get(name, ())))
+        for number, count in enumerate(told.tolist() if told.dtype.kind in "iu" else []):
+            counts[number] = (counts.get(number) or 0) + count * factor
+    return counts
 
 
 def _is_swift(file: Any) -> bool:
@@ -166,6 +183,12 @@ def _kernel(file: Any, header: Any, swift: bool) -> tuple[str, str]:
             return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
         return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number:g} is none that is known here"
     return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
+
+
+def _is_moving_mesh(file: Any, group: Any) -> bool:
+    """Whether gas is cells: AREPO says so, or writes what its family alone does (as IllustrisTNG does)."""
+    compiled = set(file["Config"].attrs) if "Config" in file else set()
+    return bool(compiled & MOVING_MESH) or any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)
 
 
 def _refuse_other_count(header: Any, chosen: int, count: int) -> None:

@@ -3,7 +3,7 @@
 | inside | read as |
 |---|---|
 | `PartType0`, `PartType1`, ... | Gadget, GADGET-4, SWIFT, GIZMO, AREPO (`gadget_hdf5`) |
-| `particles/xyz` and `header` | Phantom (`phantom`) |
+| `particles/xyz` and `header` | Phantom (`phantom.hdf5_dump`) |
 | `Coordinates` or `position` at the top | plain points, below |
 """
 
@@ -12,9 +12,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.readers import gadget_hdf5, phantom
+from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_links import opened
 from jaxsph.io.readers.hdf5_storage import numeric_datasets, read_positions
+from jaxsph.io.readers.phantom import hdf5_dump
 from jaxsph.io.table import ParticleTable, plain, table_from_columns
 
 SOURCE = "HDF5 points"
@@ -32,7 +33,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if any(name.startswith("PartType") for name in file):
             return gadget_hdf5.from_hdf5(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
-            return phantom.from_hdf5(file, part_type)
+            return hdf5_dump.from_hdf5(file, part_type)
         stored = next((name for want in POSITION_NAMES for name in file if plain(name) == want), None)
         if stored is None:
             raise DataError(

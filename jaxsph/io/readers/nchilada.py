@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type
+from jaxsph.io.parsing import choose_type, others_held
 from jaxsph.io.readers.tipsy import table_of_changa
 from jaxsph.io.table import ParticleTable
 
@@ -41,7 +41,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         ValueError: damaged; files of different numbers of particles; no particles of that type.
     """
     with explained(path, SOURCE):
-        present = [number for number in FOLDERS if (file := _positions(path, number)) is not None and _count(_header(file))]
+        held = {n: _count(_header(file)) for n in FOLDERS if (file := _positions(path, n)) is not None}
+        present = [number for number, count in held.items() if count]
         chosen = choose_type(present, part_type if present else part_type or 0)
         where = _positions(path, chosen)
         assert where is not None
@@ -53,7 +54,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
                 if len(columns[file.name]) != len(position):
                     stated = f"{len(columns[file.name])} values, but there are {len(position)} positions"
                     raise DataError(f"{where.parent.name}/{file.name} has {stated}; it is damaged or of another snapshot")
-        said = [f"particles of type {chosen} ({where.parent.name})"]
+        said = [f"particles of type {chosen} ({where.parent.name})", *others_held(held, chosen)]
         return table_of_changa(path, position, columns, chosen, said, time, SOURCE, SMOOTHING)
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type, refuse_leftover
+from jaxsph.io.parsing import choose_type, others_held, refuse_leftover
 from jaxsph.io.readers.stated_units import units_beside
 from jaxsph.io.settle.stored import with_stored_lengths
 from jaxsph.io.table import ParticleTable
@@ -77,7 +77,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         values = values.astype(np.float32)
         columns = {name: values[:, nth] for nth, name in enumerate(fields) if name not in PLACE[1:]}
         columns |= {"velocity": values[:, 4:7], **beside}
-        said = [f"particles of type {chosen} ({RECORDS[chosen][0]})", *said]
+        said = [f"particles of type {chosen} ({RECORDS[chosen][0]})", *others_held(counts, chosen), *said]
         return table_of_changa(path, values[:, 1:4], columns, chosen, said, float(header["time"]), SOURCE, SMOOTHING)
 
 

@@ -178,7 +178,7 @@ def _vector(what: str, name: str, key: Mapping[str, Any]) -> tuple[float, float,
 
 def _written_key(time: float, camera: Camera) -> dict[str, Any]:
     axes, eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
-    near, far, half = (float(value) for value in (camera.near, camera.far, camera.half_height))
+    (near, far), half = camera.near_and_far(), float(camera.half_height)
     target = eye + axes[2] * max(abs(near), abs(far))
     opening = {"fov": 2 * math.degrees(math.atan(half))} if camera.is_perspective else {"view_height": 2 * half}
     place = {"time": time, "eye": eye.tolist(), "target": target.tolist(), "up": axes[1].tolist()}

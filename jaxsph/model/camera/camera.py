@@ -10,6 +10,7 @@ one (u, v are lengths). Samples are uniform in *sample space* `[0, N]`.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
@@ -19,8 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsph.model.camera.framing import parallel_view
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
@@ -55,7 +59,7 @@ class BoundingBox(NamedTuple):
 
 @tree(static=("width", "height", "projection", "stride"))
 class Camera:
-    """A perspective or orthographic camera; make it with `look_at`, `orthographic` or `framing`.
+    """A perspective or orthographic camera; make it with `look_at`, `orthographic`, `framing` or `along_axis`.
 
     Lengths are numbers in the unit of positions, which a camera does not know: what carries a unit is refused.
 
@@ -63,8 +67,8 @@ class Camera:
         eye: position of the eye in world space, length units.
         axes: rows are right, up and forward, orthonormal.
         half_height: tan(fov / 2), or half the visible height (length units) if orthographic.
-        near: depth of the first sample slab's front, length units; > 0 if perspective.
-        far: depth of the last sample slab's back, > near.
+        near: depth of the first sample slab's front, length units; > 0 if perspective. None is "from the scene".
+        far: depth of the last sample slab's back, > near; or None.
         width: pixels a row.
         height: rows.
         projection: `"perspective"` or `"orthographic"`.
@@ -83,6 +87,20 @@ class Camera:
     eye_rest: Float[Array, "3"] | None = None
     stride: int = 1
 
+    def __repr__(self) -> str:
+        half = short.known(self.half_height)
+        if half is None or half.ndim:
+            opening = f"half_height {short.kind(self.half_height)}"
+        else:
+            fov = f"fov {math.degrees(2 * math.atan(half)):.4g} degrees"
+            opening = fov if self.is_perspective else f"view_height {2 * float(half):.4g}"
+        axes = short.known(self.axes)
+        forward = None if axes is None or axes.ndim != 2 else f"forward {short.vector(axes[2])}"
+        depths = {"near": self.near, "far": self.far}
+        ends = ", ".join(f"{name} {'of the scene' if end is None else short.span(end)}" for name, end in depths.items())
+        size = f"{self.projection}, {self.width} x {self.height}"
+        return short.line("Camera", size, f"eye {short.vector(self.eye)}", forward, opening, ends)
+
     @classmethod
     def look_at(
         cls,
@@ -93,8 +111,8 @@ class Camera:
         width: int = 512,
         height: int = 512,
         *,
-        near: Any,
-        far: Any,
+        near: Any = None,
+        far: Any = None,
     ) -> Camera:
         """Perspective camera at `eye` that looks at `target`.
 
@@ -105,7 +123,8 @@ class Camera:
             fov_degrees: vertical field of view, in (0, 180).
             width, height: size in pixels, at least 1.
             near, far: depths between which samples are taken, 0 < near < far, length units. The depth of a sample is
-                `near * (far / near) ** (u / N)`: snug values sample better.
+                `near * (far / near) ** (u / N)`: snug values sample better. None is "from the scene": `jaxsph.render`, `plan`,
+                `progressive`, `project` and the reference find what is snug; under `jit` both must be given.
 
         Raises:
             ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
@@ -129,10 +148,10 @@ class Camera:
         width: int = 512,
         height: int = 512,
         *,
-        near: Any,
-        far: Any,
+        near: Any = None,
+        far: Any = None,
     ) -> Camera:
-        """Camera with parallel rays; `view_height` is the visible height (length units), depths may be negative.
+        """Camera with parallel rays; `view_height` is the visible height (length units), depths may be negative or None.
 
         Raises:
             ValueError: as `look_at`, and for `view_height` <= 0.
@@ -181,6 +200,34 @@ class Camera:
         eye = middle - forward * distance
         near = max(float(near), 1e-3 * float(far))
         return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
+
+    @classmethod
+    @renamed(slab="depth_range")
+    def along_axis(
+        cls,
+        shown: Bounded,
+        axis: str = "z",
+        width: int = 512,
+        height: int = 512,
+        *,
+        margin: float = 1.0,
+        depth_range: tuple[float, float] | None = None,
+    ) -> Camera:
+        """Orthographic camera along an axis that shows all of what there is (host side).
+
+        Args:
+            shown: particles, a volume, points, or a scene.
+            axis: `"x"` shows y (right) and z (up), seen from large x; `"y"` x and z, seen from small y; `"z"` x and y, from
+                large z.
+            width, height: size in pixels.
+            margin: 1 fills the image to its edge, larger leaves a border.
+            depth_range: coordinates along the axis between which rays are followed; by default all.
+
+        Raises:
+            ValueError: another axis, or coordinates that do not ascend.
+        """
+        view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range)
+        return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
 
     @property
     def is_perspective(self) -> bool:
@@ -238,6 +285,16 @@ class Camera:
     def _pixel(self, place: Float[Array, "..."], size: int) -> Float[Array, "..."]:
         return place if self.stride == 1 else jnp.minimum((place - 0.5) * self.stride, size - 1) + 0.5
 
+    def near_and_far(self) -> tuple[float, float]:
+        """Both depths as numbers, length units (host side).
+
+        Raises:
+            ValueError: where one is None, and no scene is at hand to take it from.
+        """
+        if self.near is None or self.far is None:
+            raise ValueError("`near` and `far` must be numbers here, where no scene tells them; give both to the camera")
+        return float(self.near), float(self.far)
+
     def exact_eye(self) -> np.ndarray:
         """The eye in float64, (3,), with what float32 could not hold (host side)."""
         eye = np.asarray(self.eye, np.float64)
@@ -250,7 +307,8 @@ class Camera:
             f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
         )
         size = f"{self.width}x{self.height}"
-        return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={float(self.near):.9g} far={float(self.far):.9g}"
+        near, far = self.near_and_far()
+        return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={near:.9g} far={far:.9g}"
 
 
 def num_nodes(size: int, stride: int) -> int:
@@ -291,7 +349,8 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
     axes = _axes(forward, up.astype(forward.dtype), xp)
     dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
     rest = jnp.asarray(eye - eye.astype(dtype), dtype)
-    eye, axes, half, near, far = (jnp.asarray(v, dtype) for v in (eye, axes, half, near, far))
+    eye, axes, half = (jnp.asarray(v, dtype) for v in (eye, axes, half))
+    near, far = (end if end is None else jnp.asarray(end, dtype) for end in (near, far))
     return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)
 
 
@@ -315,12 +374,12 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
     if not np.isfinite(length):
         raise ValueError(f"`eye` = {np.asarray(eye).tolist()} is too far from `target` for float64; move one of them")
     _check_up(forward / length, up)
-    near, far = float(near), float(far)
-    if not (np.isfinite(near) and np.isfinite(far) and near < far):
+    given = [float(end) for end in (near, far) if end is not None]
+    if not (np.isfinite(given).all() and all(one < other for one, other in itertools.pairwise(given))):
         raise ValueError(
             f"`near` must be less than `far`, both finite, got near = {near}, far = {far}; they are depths from the eye"
         )
-    if projection == "perspective" and near <= 0:
+    if projection == "perspective" and near is not None and float(near) <= 0:
         raise ValueError(f"`near` must be > 0 for a perspective camera, got {near}; samples are spaced geometrically from it")
-    if np.float32(near) >= np.float32(far) and not jax.config.read("jax_enable_x64"):
+    if len(given) == 2 and np.float32(near) >= np.float32(far) and not jax.config.read("jax_enable_x64"):
         raise ValueError(f"`near` = {near} and `far` = {far} are the same number in float32; move them apart")

@@ -1,13 +1,14 @@
-"""Cameras with parallel rays along the axes of the world, as projections are usually taken.
+"""Where an orthographic camera stands that looks along an axis of the world, as projections are usually taken.
 
-Flow: particles -> [framing] -> Camera.
+Flow: box around particles, axis -> [framing] -> Camera.along_axis.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from jaxsph.model.camera.camera import Bounded, Camera
 from jaxsph.numerics.given import plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
@@ -16,42 +17,40 @@ VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0,
 WIDENED = 1e-4  # of the depths, so that no support touches an end by rounding
 
 
-def along_axis(
-    bounded: Bounded,
-    axis: str = "z",
-    width: int = 512,
-    height: int = 512,
-    *,
-    margin: float = 1.0,
-    slab: tuple[float, float] | None = None,
-) -> Camera:
-    """Orthographic camera along an axis that shows all of what there is (host side).
+class ParallelView(NamedTuple):
+    """What `Camera.orthographic` takes; all in float64, length units."""
 
-    Args:
-        bounded: particles, a volume or points.
-        axis: `"x"` shows y (right) and z (up), seen from large x; `"y"` x and z, seen from small y; `"z"` x and y, from large z.
-        width, height: size in pixels.
-        margin: 1 fills the image to its edge, larger leaves a border.
-        slab: coordinates along the axis between which rays are followed; by default all.
+    eye: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+    view_height: float
+    near: float
+    far: float
+
+
+def parallel_view(
+    bounds: tuple[np.ndarray, np.ndarray], axis: str, aspect: float, margin: float, depth_range: tuple[Any, Any] | None
+) -> ParallelView:
+    """The view along an axis that shows all of a box; `aspect` is height over width. See `Camera.along_axis`.
 
     Raises:
-        ValueError: another axis, or a slab that is none.
+        ValueError: another axis, or coordinates that do not ascend.
     """
     if axis not in VIEWS:
         raise ValueError(f"`axis` must be 'x', 'y' or 'z', got {axis!r}")
     forward, up = (np.asarray(direction, np.float64) for direction in VIEWS[axis])
-    lower, upper = bounded.bounds()
+    lower, upper = bounds
     if not (upper > lower).any():
         lower, upper = lower - 0.5, upper + 0.5
     middle, extent = (lower + upper) / 2, upper - lower
     across, deep = float(extent @ np.abs(np.cross(forward, up))), float(extent @ np.abs(forward))
-    view_height = max(float(extent @ up), across * height / width) * margin
+    view_height = max(float(extent @ up), across * aspect) * margin
     view_height, distance = view_height or 1.0, deep or 1.0
     near, far = 0.5 * distance - WIDENED * deep, 1.5 * distance + WIDENED * deep
     eye = middle - forward * distance
-    if slab is not None:
-        slab = plain("slab", slab[0]), plain("slab", slab[1])
-        if not (np.isfinite(slab[0]) and np.isfinite(slab[1]) and slab[0] < slab[1]):
-            raise ValueError(f"`slab` must be two finite coordinates that ascend, got {tuple(slab)}")
-        near, far = sorted(float((end - eye["xyz".index(axis)]) * forward.sum()) for end in slab)
-    return Camera.orthographic(eye, middle, up, view_height, width, height, near=near, far=far)
+    if depth_range is not None:
+        begin, end = (plain("depth_range", one) for one in depth_range)
+        if not (np.isfinite(begin) and np.isfinite(end) and begin < end):
+            raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {(begin, end)}")
+        near, far = sorted(float((one - eye["xyz".index(axis)]) * forward.sum()) for one in (begin, end))
+    return ParallelView(eye, middle, up, view_height, near, far)

@@ -63,7 +63,7 @@ def seen_by(camera: Camera, top: int, bottom: int, left: int, right: int) -> Pla
     along_row, up, forward = np.asarray(camera.axes, np.float64)
     low, high = sorted(float(camera.row(jnp.asarray(row, camera.dtype))) for row in (top - 1, bottom + 1))
     least, most = sorted(float(camera.column(jnp.asarray(column, camera.dtype))) for column in (left - 1, right + 1))
-    near, far = float(camera.near), float(camera.far)
+    near, far = camera.near_and_far()
     depths = [(-forward, -near), (forward, far)]
     if camera.is_perspective:
         sides = [

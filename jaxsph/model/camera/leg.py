@@ -90,7 +90,8 @@ class Leg:
     def _opening(self) -> Values:
         """Half of the visible height, near and far: geometrically where they are positive by nature."""
         half, near, far = (
-            np.array([float(getattr(one, name)) for one in self.cameras]) for name in ("half_height", "near", "far")
+            np.array(numbers)
+            for numbers in zip(*((float(one.half_height), *one.near_and_far()) for one in self.cameras), strict=True)
         )
         zoom = monotone(self._key_times, np.log(half))
         if not self.cameras[0].is_perspective:

@@ -9,14 +9,15 @@ import dataclasses
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.leg import Leg, made
+from jaxsph.model.registry import Method
 from jaxsph.numerics.given import plain
 
 MAX_TURN = 90.0  # degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one
@@ -36,9 +37,9 @@ class CameraPath:
 
     legs: tuple[Leg, ...]
 
-    writer: ClassVar[Callable[..., None]]
-    reader: ClassVar[Callable[..., CameraPath]]
-    """How paths become files, and files paths: given by `jaxsph.plot.methods`, from `jaxsph.io`."""
+    writer = Method()
+    reader = Method()
+    """How paths become files, and files paths: entered by `jaxsph.plot.methods`, from `jaxsph.io`."""
 
     def __post_init__(self) -> None:
         if not self.legs:
@@ -170,7 +171,7 @@ class CameraPath:
 
 def middle(camera: Camera) -> tuple[float, float, float]:
     """The point straight ahead in the middle of what a camera sees of depth."""
-    x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (float(camera.near) + float(camera.far)) / 2
+    x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * sum(camera.near_and_far()) / 2
     return float(x), float(y), float(z)
 
 
@@ -214,4 +215,4 @@ def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
 def _turned(camera: Camera, center: np.ndarray, axis: np.ndarray, degrees: float) -> Camera:
     turn = Rotation.from_rotvec(np.radians(degrees) * axis)
     axes, eye = turn.apply(np.array(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
-    return made(eye, axes, float(camera.half_height), float(camera.near), float(camera.far), camera)
+    return made(eye, axes, float(camera.half_height), *camera.near_and_far(), camera)

@@ -63,7 +63,7 @@ def held_by(particles: Particles, of: Any, weight: Any) -> Held:
     return Held(*_scaled(particles, [values * weights, weights]), True, name)
 
 
-def emission(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0) -> Any:
+def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0) -> Any:
     r"""Amounts whose projection is the integral of $A \rho^n$ along rays: $A_j \rho_j^{n-1} m_j$.
 
     For n = 1 that is $A$ times the column density, exactly. For others it is the SPH sum of $A \rho^{n-1}$, each particle with

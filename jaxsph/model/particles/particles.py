@@ -19,6 +19,8 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
+from jaxsph.model.registry import Method
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.trees import tree
@@ -73,6 +75,24 @@ class Particles:
     extinction_quantity: Float[Array, " particles"] | None = None
     box: Box | None = None
     length_unit: str | None = None
+
+    settler = Method()
+    """How columns become particles: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows their names."""
+
+    def __len__(self) -> int:
+        """How many exist, without padding (host side)."""
+        return self.num_particles
+
+    def __repr__(self) -> str:
+        second = self.extinction_quantity
+        return short.line(
+            "Particles",
+            f"{short.count(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"quantity {short.span(self.quantity, self.valid)}",
+            None if second is None else f"extinction by {short.span(second, self.valid)}",
+            f"support {short.span(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            None if self.box is None else "periodic",
+        )
 
     @classmethod
     def from_arrays(
@@ -134,6 +154,49 @@ class Particles:
         entries = {name: jnp.asarray(value) for name, value in columns.items()}
         valid, period, called = jnp.arange(room) < count, _period(box, arrays["support"], dtype), name_of(unit)
         return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=called)
+
+    @classmethod
+    def from_columns(
+        cls,
+        columns: Any,
+        *,
+        quantity: Any = None,
+        support: Any = None,
+        support_in_h: float | None = None,
+        kernel: str | None = None,
+        box: Any = None,
+        where: str | None = None,
+        share: float | None = None,
+        opacity_by: str | None = None,
+    ) -> Particles:
+        """Particles of named columns: a dictionary, a data frame, a structured array, or a snapshot of another library.
+
+        Roles are told by names, as in files: positions by `position`, `pos`, `coordinates` or `x`, `y`, `z`; masses, densities,
+        volumes, velocities by theirs. Columns may carry units (unyt, astropy, pynbody, swiftsimio): lengths are converted to that
+        of positions, quantities keep their own. What cannot be settled otherwise is: supports by the 32nd neighbour, volumes
+        by sums of kernels.
+
+        Args:
+            columns: what has columns by `[name]`, or as attributes.
+            quantity: name of a column, or of what is derived (`"density"`, `"speed"`, `"log10:temperature"`), or (N,) numbers;
+                None picks the most telling one, see `jaxsph.io.read_particles`.
+            support: a support radius, (N,) of them, or the name of a column; None for the column `support`.
+            support_in_h: how many smoothing lengths a support radius is, where a column holds these: 2 where the kernel ends at
+                two of them (Phantom, pynbody), 1 where it ends at one (Gadget). `support` may name the column.
+            kernel: name of the smoothing kernel; None is poly6.
+            box: (Lx, Ly, Lz) or one side of a periodic box whose lower corner is the origin.
+            where, share, opacity_by: as for `jaxsph.io.read_particles`.
+
+        Raises:
+            ValueError: no positions, columns of several lengths, smoothing lengths without `support_in_h`, an unknown quantity,
+                numbers that are not finite, units that cannot be converted.
+
+        Example:
+            `js.Particles.from_columns({"x": x, "y": y, "z": z, "h": h, "mass": m, "rho": rho}, quantity="rho", support_in_h=2)`
+        """
+        settle = {"quantity": quantity, "support": support, "support_in_h": support_in_h, "kernel": kernel, "box": box}
+        found: Particles = cls.settler(columns, **settle, where=where, share=share, opacity_by=opacity_by)[0]
+        return found
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.

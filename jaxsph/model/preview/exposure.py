@@ -33,6 +33,16 @@ def exposure(seen: Glimpse) -> float:
     return float(scale)
 
 
+def typical_exposure(seen: Glimpse) -> float:
+    r"""A factor of the extinction, > 0, at which what is most opaque has an alpha of 0.95, however small it is in the picture.
+
+    That is the mean optical depth weighted by itself, $\sum \tau^2 / \sum \tau$; 1 where nothing is met.
+    """
+    depth = seen.optical_depth
+    total = float(depth.sum())
+    return float(-np.log1p(-ALPHA) * total / (depth**2).sum()) if total > 0 else 1.0
+
+
 def _lit(seen: Glimpse, scale: float) -> np.ndarray:
     lit: np.ndarray = seen.picture(scale).max(-1) > LIT
     return lit

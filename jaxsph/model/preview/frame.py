@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.preview.exposure import exposure
+from jaxsph.model.preview.exposure import typical_exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
 
@@ -26,8 +26,8 @@ CENTRAL = 0.99
 FILLED = 0.88
 EDGE = 0.04
 """Of a side: light that comes so near to an edge goes on beyond it."""
-BULK = (2.0, 98.0)
-"""Percentiles of the particles along each direction that the first camera shows."""
+BULK = (0.03, 0.97)
+"""Between which quantiles of volume times extinction, along each direction, the first camera shows particles."""
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05
@@ -94,7 +94,7 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
     camera = direction.camera(middle, height, scene)
     for nth in range(STEPS_BACK + LOOKS):
         seen = glimpse(scene, camera)
-        weights = seen.weights(exposure(seen))
+        weights = seen.weights(typical_exposure(seen))
         alpha = weights.sum(2)
         sides = float(camera.half_height) * np.array([aspect, 1.0])
         light = alpha.any()
@@ -181,12 +181,31 @@ def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tup
     if scene.particles is not None and scene.particles.num_particles:
         valid = np.asarray(scene.particles.valid)
         local = scene.particles.exact_position()[valid] @ direction.axes.T
-        margin = float(np.median(np.asarray(scene.particles.support, np.float64)[valid]))
-        inner = np.percentile(local, BULK, 0) + np.array([[-margin], [margin]])
+        light = _strength(scene)[valid]
+        share = light / light.sum() if light.any() else np.full(len(light), 1 / len(light))
+        margin = float(np.average(np.asarray(scene.particles.support, np.float64)[valid], weights=share))
+        inner = np.stack([_quantiles(axis, share, BULK) for axis in local.T], 1) + np.array([[-margin], [margin]])
         low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
     middle = (low + high) / 2 @ direction.axes if center is None else np.asarray(center, np.float64)
     height = max(high[1] - low[1], (high[0] - low[0]) / aspect)
     return middle, float(min(height, largest)), float(largest)
+
+
+def _strength(scene: Scene) -> np.ndarray:
+    """Volume times extinction of each particle, without regard to what lies in front of it."""
+    particles, look = scene.particle_set, scene.transfer
+    assert look is not None
+    own = look.values if look.extinction_values is None else look.extinction_values
+    quantity = np.asarray(particles.quantities[-1], np.float64)
+    extinction = np.interp(quantity, np.asarray(own, np.float64), np.asarray(look.extinction, np.float64))
+    return extinction * np.asarray(particles.volume, np.float64)
+
+
+def _quantiles(values: np.ndarray, share: np.ndarray, at: tuple[float, float]) -> np.ndarray:
+    """Of values that weigh by shares of 1."""
+    order = np.argsort(values)
+    summed = np.cumsum(share[order]) - share[order] / 2
+    return np.interp(at, summed, values[order])
 
 
 def _central(places: np.ndarray, light: np.ndarray) -> tuple[float, float]:

@@ -34,6 +34,7 @@ from jaxtyping import Float
 
 from jaxsph.model.transfer.maps import POINTS, TAILS, value_range
 from jaxsph.numerics.given import own
+from jaxsph.numerics.names import renamed
 
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
 EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
@@ -42,8 +43,9 @@ WIDE = 2.0  # largest over least of control values from which an even spacing of
 UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
 
 
+@renamed(domain="norm")
 def control_values(
-    domain: str,
+    norm: str,
     quantity: Any = None,
     *,
     low: float | None = None,
@@ -55,13 +57,13 @@ def control_values(
     """Values at which a map of evenly placed colours has its control points (host side, float64).
 
     Args:
-        domain: one of `DOMAINS`.
+        norm: one of `DOMAINS`: matplotlib's word for a domain.
         quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
             `equalised`.
         low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of `percentile`
             these are percentages, 0.5 and 99.5 if not given; `equalised` counts only what lies between.
-        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met (`jaxsph.met`); `None`
-            counts all alike.
+        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met
+            (`jaxsph.visibility_histogram`); `None` counts all alike.
         width: of `symlog` alone: what is smaller than this is about linear; `None` is a thousandth of the largest.
         points: how many; up to 16 are looked up by comparisons, which is faster than any search.
 
@@ -71,15 +73,15 @@ def control_values(
     Raises:
         ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
     """
-    if domain not in DOMAINS:
-        raise ValueError(f"`domain` must be one of {', '.join(DOMAINS)}, got {domain!r}")
+    if norm not in DOMAINS:
+        raise ValueError(f"`norm` must be one of {', '.join(DOMAINS)}, got {norm!r}")
     if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 2:
         raise ValueError(f"`points` must be an integer of at least 2, got {points!r}; a domain has two ends")
-    if width is not None and domain != "symlog":
-        raise ValueError(f"`width` is of the domain 'symlog', and `domain` is {domain!r}; leave it out")
+    if width is not None and norm != "symlog":
+        raise ValueError(f"`width` is of the domain 'symlog', and `norm` is {norm!r}; leave it out")
     values, weight = _known(quantity, weights)
     place = np.linspace(0, 1, points)
-    return DOMAINS[domain](_Asked(place, values, weight, low, high, width))
+    return DOMAINS[norm](_Asked(place, values, weight, low, high, width))
 
 
 def log_departure(values: Any, colors: Any) -> float:

@@ -6,8 +6,7 @@ Flow: [transfer] -> cast -> image.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.model.registry import Method
+from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.trees import tree
 
@@ -39,11 +41,21 @@ class TransferFunction:
     extinction: Float[Array, " points_of_extinction"]
     extinction_values: Float[Array, " points_of_extinction"] | None = None
 
-    presets: ClassVar[Callable[..., TransferFunction]]
-    writer: ClassVar[Callable[..., None]]
-    reader: ClassVar[Callable[..., TransferFunction]]
-    drawer: ClassVar[Callable[..., Any]]
-    """What rooms above this one know: presets, files and figures."""
+    presets = Method()
+    writer = Method()
+    reader = Method()
+    drawer = Method()
+    """What rooms above this one know, and looks: presets, files and figures."""
+
+    def __repr__(self) -> str:
+        shape, second = getattr(self.values, "shape", ()), self.extinction_values
+        return short.line(
+            "TransferFunction",
+            f"{shape[-1]} points" if shape else None,
+            f"values {short.span(self.values)}",
+            f"extinction {short.span(self.extinction)}",
+            None if second is None else f"over {short.span(second)}",
+        )
 
     @classmethod
     def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
@@ -102,7 +114,7 @@ class TransferFunction:
 
         Args:
             colors: name of a colour map, or (M, 3) colours from low to high.
-            values: (K,) control values, as `jaxsph.control_values` lays them; or two ends, between which 16 are evenly spaced.
+            values: (K,) control values, as `control_values` lays them; or two ends, between which 16 are evenly spaced.
             extinction: per length unit: a number, or any number of them from the low end to the high, evenly placed.
 
         Raises:
@@ -136,6 +148,8 @@ class TransferFunction:
             ValueError: an unknown name, a norm without its ends or without an inverse.
         """
         return cls.from_points(*of_matplotlib(cmap, norm, low, high, extinction, points))
+
+    control_values = staticmethod(control_values)
 
     @classmethod
     def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:

@@ -26,10 +26,12 @@ import numpy as np
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, colormap, value_range
+from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
+from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.names import renamed
 
-__all__ = ["COLORMAPS", "colormap", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
+__all__ = ["COLORMAPS", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
 OPTICAL_DEPTH = 3.0  # optical depth through the bulk of the particles: 5 % of the light behind gets through
 FAINTEST = 0.03  # extinction at the low end of a range, over that at the high end: what is lowest is seen, but hides nothing
@@ -50,6 +52,10 @@ RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "s
 """How extinction depends on the place in a range: not at all; as above; from 0, so that what is low is clear."""
 
 
+NARROW = _rising(STEEPNESS, 0.3)
+"""Of what a preset shows by decades, where there are none: all of it is seen."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Preset:
     """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`.
@@ -65,7 +71,7 @@ class Preset:
 
     def colors(self) -> np.ndarray:
         """Of the map, (K, 3)."""
-        rows = colormap(self.colormap)
+        rows = colors_of(self.colormap)
         place = np.linspace(self.lift, 1, len(rows)) * (len(rows) - 1)
         return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
 
@@ -81,10 +87,11 @@ PRESETS: dict[str, Preset] = {
 """By name."""
 
 
+@renamed(colormap_name="colormap", values="range")
 def default_transfer(
     particles: Particles,
-    colormap_name: str = "viridis",
-    values: tuple[float, float] | None = None,
+    colormap: str = "viridis",
+    range: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
     *,
     ramp: str | None = None,
@@ -97,19 +104,19 @@ def default_transfer(
 
     Args:
         particles: the set to show; their quantity fixes the range and the extinction.
-        colormap_name: as for `colormap`.
-        values: low and high end of the colours, in units of the quantity; `None` chooses (`value_range`).
+        colormap: its name, as for `jaxsph.scenes.colormap`.
+        range: low and high end of the colours, in units of the quantity; `None` chooses (`value_range`).
         optical_depth: larger is more opaque.
         ramp: `"even"`; `"rising"` with the square of the place in the range, from 3 % of the peak; or `"steep"`, by the fourth
             power from 0, as suits the logarithm of a density over decades. By default steep of particles that have a quantity for
             extinction alone, else rising.
 
     Raises:
-        ValueError: an unknown colour map or ramp, values that do not ascend, an optical depth that is not positive.
+        ValueError: an unknown colour map or ramp, a range that does not ascend, an optical depth that is not positive.
     """
     if ramp is not None and ramp not in RAMPS:
         raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
-    colors, (low, high) = colormap(colormap_name), _span(particles, values, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(particles, range, optical_depth)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     if particles.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
@@ -120,14 +127,15 @@ def default_transfer(
 
 
 def opacity_by_second(
-    transfer: TransferFunction, particles: Particles, optical_depth: float = OPTICAL_DEPTH, *, ramp: str = "steep"
+    transfer: TransferFunction, particles: Particles, optical_depth: float = OPTICAL_DEPTH, *, ramp: str | float = "steep"
 ) -> TransferFunction:
     """The colours of a transfer function, with an extinction over the second of two quantities.
 
     Args:
         transfer: whose colours are taken.
         particles: with two quantities.
-        optical_depth, ramp: as for `default_transfer`.
+        optical_depth: as for `default_transfer`.
+        ramp: as for `default_transfer`; or the power with which extinction rises from 0 over the range.
 
     Raises:
         ValueError: particles of one quantity.
@@ -136,47 +144,51 @@ def opacity_by_second(
     if second is None:
         raise ValueError("`particles` must have two quantities: give `quantity=(of_colour, of_extinction)`")
     at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), OWN_POINTS)
-    extinction = _extinction(particles, at, RAMPS[ramp], optical_depth)
+    rising = RAMPS[ramp] if isinstance(ramp, str) else _rising(ramp, 0)
+    extinction = _extinction(particles, at, rising, optical_depth)
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
 
 
+@renamed(colormap_name="colormap", values="range")
 def default_volume_transfer(
     volume: Volume,
-    colormap_name: str = "viridis",
-    values: tuple[float, float] | None = None,
+    colormap: str = "viridis",
+    range: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
 ) -> TransferFunction:
     """As `default_transfer`, of a volume. Extinction rises from 0: what is lowest, as the air of a scan, is not shown."""
-    colors, (low, high) = colormap(colormap_name), _span(volume, values, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(volume, range, optical_depth)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
 
 
+@renamed(domain="norm", colormap_name="colormap", values="range")
 def domain_transfer(
     shown: Particles | Volume,
-    domain: str,
-    colormap_name: str = "viridis",
-    values: tuple[float, float] | None = None,
+    norm: str,
+    colormap: str = "viridis",
+    range: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
     points: int = POINTS,
 ) -> TransferFunction:
-    """As `default_transfer`, with colours and extinction over a domain other than the linear one; see `jaxsph.control_values`.
+    """As `default_transfer`, with colours and extinction over a domain; see `TransferFunction.control_values`.
 
     Raises:
         ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
     """
-    control = control_values(domain, _quantity(shown), **_ends(values), points=points)
+    control = control_values(norm, _quantity(shown), **_ends(range), points=points)
     ramp = _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
-    return fitted(TransferFunction.from_colormap(colormap_name, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
+    return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
 
+@renamed(domain="norm", colormap_name="colormap", values="range")
 def preset(
     name: str,
     shown: Any,
     *,
-    values: tuple[float, float] | None = None,
-    domain: str | None = None,
-    colormap_name: str | None = None,
+    range: tuple[float, float] | None = None,
+    norm: str | None = None,
+    colormap: str | None = None,
     optical_depth: float = OPTICAL_DEPTH,
     points: int = POINTS,
 ) -> TransferFunction:
@@ -185,9 +197,9 @@ def preset(
     Args:
         name: one of `PRESETS`.
         shown: Particles or a Volume; or (low, high) of a quantity, for a peak of extinction of 1 a length unit.
-        values: ends of the colours, see `jaxsph.control_values`; `None` chooses them by the quantity.
-        domain: other than the preset's own.
-        colormap_name: other than the preset's own.
+        range: ends of the colours, see `jaxsph.TransferFunction.control_values`; `None` chooses them by the quantity.
+        norm: other than the preset's own.
+        colormap: other than the preset's own.
         optical_depth: of typical columns; larger is more opaque.
         points: control points.
 
@@ -200,20 +212,21 @@ def preset(
     if isinstance(shown, Particles | Volume):
         quantity = _quantity(shown)
     else:
-        values, shown = tuple(shown), None
-    given, ramp = _ends(values), chosen.ramp
-    if domain is None:
-        domain = chosen.domain
-        low, high = values or (np.percentile(quantity, TAILS) if quantity is not None and quantity.size else (0.0, 0.0))
+        range, shown = tuple(shown), None
+    given, ramp = _ends(range), chosen.ramp
+    if norm is None:
+        norm = chosen.domain
+        low, high = range or (np.percentile(quantity, TAILS) if quantity is not None and quantity.size else (0.0, 0.0))
         over_decades = low > 0 and np.log10(high / low) >= MIN_DECADES
         if chosen.both_ways is not None and low < 0 < high:
             ramp, largest = chosen.both_ways, float(max(abs(low), abs(high)))
-            given = given if values else {"low": -largest, "high": largest}
-        elif (domain == "percentile" and values) or (domain == "log" and not over_decades):
-            domain = "linear"
-    control = control_values(domain, quantity, **given, points=points)
-    colors = colormap_name or chosen.colors()
-    made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
+            given = given if range else {"low": -largest, "high": largest}
+        elif norm == "percentile" and range:
+            norm = "linear"
+        elif norm == "log" and not over_decades:
+            norm, ramp = "linear", NARROW
+    control = control_values(norm, quantity, **given, points=points)
+    made = TransferFunction.from_colormap(colormap or chosen.colors(), control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 
 
@@ -244,19 +257,19 @@ def _quantity(shown: Particles | Volume) -> np.ndarray:
     return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
 
 
-def _span(shown: Particles | Volume, values: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
+def _span(shown: Particles | Volume, range: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
     """What colours span: as asked for, or by the quantity."""
-    low, high = value_range(_quantity(shown)) if values is None else (float(values[0]), float(values[1]))
+    low, high = value_range(_quantity(shown)) if range is None else (float(range[0]), float(range[1]))
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"`values` must be two finite numbers that ascend, got ({low}, {high})")
+        raise ValueError(f"`range` must be two finite numbers that ascend, got ({low}, {high})")
     _require_depth(optical_depth)
     return low, high
 
 
-def _ends(values: tuple[float, float] | None) -> dict[str, float | None]:
-    if values is not None and len(values) != 2:
-        raise ValueError(f"`values` must be two numbers, low and high, got {len(values)}")
-    return {"low": None, "high": None} if values is None else {"low": float(values[0]), "high": float(values[1])}
+def _ends(range: tuple[float, float] | None) -> dict[str, float | None]:
+    if range is not None and len(range) != 2:
+        raise ValueError(f"`range` must be two numbers, low and high, got {len(range)}")
+    return {"low": None, "high": None} if range is None else {"low": float(range[0]), "high": float(range[1])}
 
 
 def _require_depth(optical_depth: float) -> None:
@@ -301,6 +314,3 @@ def _cells(position: np.ndarray, support: np.ndarray, extinction: np.ndarray) ->
     covered = np.bincount(flat, sphere, int(shape.prod()))
     mean = np.bincount(flat, sphere * extinction, int(shape.prod())) / np.where(covered > 0, covered, 1)
     return (mean * np.minimum(covered / cell**3, 1)).reshape(shape), np.full(3, cell)
-
-
-TransferFunction.presets = staticmethod(preset)

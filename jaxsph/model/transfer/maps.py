@@ -6,50 +6,72 @@ Flow: name, quantity -> [transfer_maps] -> TransferFunction, Points, Projection.
 from __future__ import annotations
 
 import copy
+import difflib
+import sys
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsph.numerics.given import plain
-from jaxsph.numerics.nearest import did_you_mean
 
-COLORMAPS: dict[str, tuple[str, ...]] = {
-    "viridis": ("440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"),
+COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")
+"""Names of maps that looks are made of, and that messages list first."""
+
+OWN: dict[str, tuple[str, ...]] = {
     "heat": ("2a0510", "6b0f1a", "b11226", "e0401f", "f57f17", "fbb52c", "fde67a", "fffbe0"),
     "ice": ("0b1d51", "13418f", "1b6fb8", "2f9fd0", "66c6dd", "a9e2e6", "e8f8f5"),
-    "coolwarm": ("3b4cc0", "6788ee", "9abbff", "c9d7f0", "edd1c2", "f7a889", "e26952", "b40426"),
     "gray": ("202020", "ffffff"),
 }
-"""Control colours of the built-in maps, from low to high, evenly spaced; sRGB as displayed."""
+"""Control colours of the maps of this package, from low to high, evenly spaced; sRGB as displayed.
+
+They hide those of the same names elsewhere, which begin at black: what is low would not be seen on black.
+"""
 
 POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
+LIKE = 3  # names that are offered in place of an unknown one
 
 
-def colormap(name: str) -> Float[np.ndarray, "points 3"]:
-    """16 colours of a map from low to high, evenly spaced, in [0, 1]; a name that ends in `_r` is reversed.
+def colormap(name: str, points: int = POINTS) -> Float[np.ndarray, "points 3"]:
+    """Colours of a map from low to high, evenly spaced, in [0, 1]; a name that ends in `_r` is reversed.
 
-    Built in are `viridis`, `heat`, `ice`, `coolwarm` and `gray`; with matplotlib installed, all of its names too.
+    Args:
+        name: `heat`, `ice`, `gray`; or one of the many hundreds of the package cmap, with or without the collection that it is
+            of: `viridis`, `coolwarm`, `cmocean:thermal`, `crameri:batlow`, `cmasher:rainforest`; or one that was registered with
+            matplotlib.
+        points: how many colours.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: an unknown name; the message has those that are most like it.
     """
-    known: list[str] = list(COLORMAPS)
     base, reverse = (name[:-2], -1) if name.endswith("_r") else (name, 1)
-    if base in COLORMAPS:
-        rows = np.array([[int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)] for code in COLORMAPS[base]])
-        place = np.linspace(0, len(rows) - 1, POINTS)
-        return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)[::reverse]
+    place = np.linspace(0, 1, points)
+    if base in OWN:
+        rows = np.array([[int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)] for code in OWN[base]])
+        at = np.linspace(0, 1, len(rows))
+        return np.stack([np.interp(place, at, channel) for channel in rows.T], 1)[::reverse]
+    return np.clip(np.asarray(_catalogued(base)(place), np.float64)[::reverse, :3], 0, 1)
+
+
+def _catalogued(name: str) -> Any:
+    """The map of a name of cmap's, or of matplotlib's where that is in use: takes places in [0, 1], gives RGBA."""
+    from cmap import Catalog, Colormap
+
+    catalog = Catalog()
     try:
-        from matplotlib import colormaps
-    except ImportError:
-        more = "; matplotlib has more: pip install 'jaxsph[color]'"
-    else:
-        if base in colormaps:
-            return np.asarray(colormaps[base](np.linspace(0, 1, POINTS)))[::reverse, :3]
-        more, known = " or a name of matplotlib's", [*COLORMAPS, *colormaps]
-    raise ValueError(f"`colormap` must be one of {', '.join(COLORMAPS)}{more}; got {name!r}{did_you_mean(name, known)}")
+        return Colormap(catalog.resolve(name))  # by its full name: of two of one short name, cmap logs that there is another
+    except KeyError:
+        registered = getattr(sys.modules.get("matplotlib"), "colormaps", {})
+        if name in registered:
+            return registered[name]
+    known = {each.lower(): each for each in (*catalog.short_keys(), *registered, *COLORMAPS)}
+    like = [known[each] for each in difflib.get_close_matches(name.lower(), known, LIKE)]
+    more = f"; did you mean {' or '.join(like)}?" if like else ""
+    raise ValueError(
+        f"`colormap` must be one of {', '.join(COLORMAPS)}, or a name of the package cmap, such as cmocean:thermal "
+        f"(cmap-docs.readthedocs.io shows them all); got {name!r}{more}"
+    )
 
 
 def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float]:
@@ -79,12 +101,12 @@ class ControlPoints(NamedTuple):
 
 def of_colormap(colors: Any, values: Any, extinction: Any) -> ControlPoints:
     """See `TransferFunction.from_colormap`."""
-    rows = colormap(colors) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
     values = np.asarray(numbers("values", values), np.float64)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"`values` must be two ends, or control values (K,), got shape {values.shape}")
     if len(values) == 2:
         values = np.linspace(values[0], values[1], POINTS)
+    rows = colormap(colors, len(values)) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
     return ControlPoints(values, _spread(rows, len(values)), _spread(extinction, len(values)))
 
 

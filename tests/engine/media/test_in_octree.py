@@ -12,6 +12,7 @@ import pytest
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.engine.media.octree_medium import OctreeParticles, OctreePoints
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -72,16 +73,16 @@ def test_particles_by_step_doubling_are_the_reference_of_many_samples():
 
 def test_parts_become_media_and_the_rest_stays():
     scene = js.Scene(**PARTICLES, points=(POINTS["points"],), mix="opacity")
-    found = js.in_octree(scene)
+    found = in_octree(scene)
     assert [type(medium) for medium in found.media] == [OctreeParticles, OctreePoints]
     assert found.particles is found.points is found.transfer is None and found.mix == "opacity"
-    assert js.in_octree(found).media == found.media  # nothing is left to do
+    assert in_octree(found).media == found.media  # nothing is left to do
 
 
 @pytest.mark.slow
 def test_the_same_samples_show_the_same():
     scene, settings = js.Scene(**PARTICLES), js.Settings(samples=32)
-    images = [js.render(shown, camera(), settings) for shown in (scene, js.in_octree(scene))]
+    images = [js.render(shown, camera(), settings) for shown in (scene, in_octree(scene))]
     assert off(*images).max() < 1e-4
 
 
@@ -94,19 +95,19 @@ def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
 
     for parts, name in ((PARTICLES, "particles"), (POINTS, "points")):
         shown = js.Scene(**parts)
-        with pytest.raises(ValueError, match=rf"`Scene\({name}=...\)` cannot answer; .*`jaxsph.in_octree`"):
+        with pytest.raises(ValueError, match=rf"`Scene\({name}=...\)` cannot answer; .*`jaxsph.engine.media.in_octree`"):
             jax.eval_shape(lambda view, shown=shown: color(view, shown), camera())
-    inside = jax.eval_shape(lambda scene: color(camera(), scene), js.in_octree(js.Scene(**PARTICLES)))
+    inside = jax.eval_shape(lambda scene: color(camera(), scene), in_octree(js.Scene(**PARTICLES)))
     assert inside.shape == (HEIGHT, WIDTH, 3)
 
 
 def test_under_a_trace_no_octree_is_built_and_it_says_where_to_build_it():
     scene = js.Scene(**PARTICLES)
     with pytest.raises(ValueError, match=r"`scene` must be of concrete arrays.*outside of `jax.jit` and `jax.grad`"):
-        jax.eval_shape(js.in_octree, scene)
+        jax.eval_shape(in_octree, scene)
     quantity = scene.particles.quantity
     with pytest.raises(ValueError, match=r"`scene` must be of concrete arrays.*give them the scene that it returns"):
-        jax.grad(lambda value: js.in_octree(js.Scene(**moved(quantity=value))).media[0].octree.side)(quantity)
+        jax.grad(lambda value: in_octree(js.Scene(**moved(quantity=value))).media[0].octree.side)(quantity)
 
 
 def moved(**columns):
@@ -118,7 +119,7 @@ def moved(**columns):
 def test_images_are_differentiated_by_what_the_octree_holds():
     """By particles and transfer function as without an octree, under `jit`."""
     settings, shown, slopes = js.Settings(samples=16), js.Scene(**PARTICLES), []
-    for scene in (js.in_octree(shown), shown):
+    for scene in (in_octree(shown), shown):
         plan = js.plan(scene, camera(), settings)
 
         def total(scene, plan=plan):
@@ -148,6 +149,6 @@ def test_float64_stays_float64(x64):
     })  # fmt: skip
     scene = js.Scene(particles=wide, transfer=PARTICLES["transfer"])
     image = js.render(scene, camera(), STEPS)
-    assert js.in_octree(scene).dtype == image.color.dtype == jnp.float64
+    assert in_octree(scene).dtype == image.color.dtype == jnp.float64
     fine = js.reference.render(scene, camera(), js.Settings(samples=1024))
     assert (off(image, fine) <= 3 * STEPS.step_tolerance).mean() > 0.98

@@ -12,6 +12,7 @@ import pytest
 import jaxsph as js
 from jaxsph.engine.access.slab_windows import whole_cells
 from jaxsph.engine.field.schedule import SlabSchedule, clipped
+from jaxsph.engine.media.in_octree import in_octree
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
@@ -118,7 +119,7 @@ def test_moving_a_face_compiles_nothing():
 def test_one_of_several_media_may_be_clipped_by_itself():
     """Wrapped, where the scene is not."""
     rng = np.random.default_rng(0)
-    ball = js.in_octree(js.Scene(points=js.Points.from_arrays(rng.uniform(-0.5, 0.5, (20, 3)), 0.3, (1, 1, 1), opacity=0.9)))
+    ball = in_octree(js.Scene(points=js.Points.from_arrays(rng.uniform(-0.5, 0.5, (20, 3)), 0.3, (1, 1, 1), opacity=0.9)))
     settings = js.Settings(samples=24, integrator="samples")
     alone = js.Scene(media=(js.Within(ball.media[0], BOX),))
     together = dataclasses.replace(ball, within=BOX)

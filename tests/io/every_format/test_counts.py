@@ -62,7 +62,12 @@ def test_counts_in_words(name, count, written, tmp_path, reader_holds):
 @pytest.mark.parametrize("word", WORDS)
 @pytest.mark.parametrize(
     ("name", "order", "stop", "step"),
-    [("plain.bgeo", "big", 110, 1), ("two.gadget", "little", 320, 4), ("one.gadget", "big", 320, 4)],
+    [
+        ("plain.bgeo", "big", 110, 1),
+        ("two.gadget", "little", 320, 4),
+        ("one.gadget", "big", 320, 4),
+        ("disc_00010", "little", 1700, 4),
+    ],
 )
 def test_counts_in_bytes(name, order, stop, step, word, written, tmp_path, reader_holds):
     for content in in_bytes((written / name).read_bytes(), word, order, stop, step):

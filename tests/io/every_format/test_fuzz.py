@@ -28,6 +28,7 @@ SECONDS_A_FILE = 5
 BYTES = [
     "polydata.vtk", "ascii.vtk", "five.vtk", "ascii.vtu", "plain.vtu", "a.vtu", "big.ply", "ascii.ply", "plain.bgeo",
     "zipped.bgeo", "two.gadget", "one.gadget", "a.npz", "a.csv", "a.xyz", "extended.xyz",
+    "disc_00010", "sphere_00020",
 ]  # fmt: skip
 HDF5 = ["gadget.hdf5", "swift.hdf5", "phantom.h5", "points.hdf5"]
 

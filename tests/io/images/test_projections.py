@@ -45,7 +45,7 @@ def test_numpy_files_hold_values_in_their_precision(tmp_path, x64):
 
 
 def test_pictures_have_the_colours_of_a_map_black_where_no_mean_is(tmp_path):
-    made(mean=True).save(tmp_path / "a.png", colormap="heat", norm="log", value_span=(1e-3, 10))
+    made(mean=True).save(tmp_path / "a.png", colormap="heat", norm="log", range=(1e-3, 10))
     with Pillow.open(tmp_path / "a.png") as opened:
         picture = np.asarray(opened)
         assert opened.text["jaxsph.colors"] == "log 0.001 to 10" and opened.text["jaxsph.unit"] == "Msun/kpc**2"

@@ -7,6 +7,7 @@ from PIL import Image as Pillow
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.analysis.slices import Slice
 from jaxsph.io.images import slices
 
 LOOK = js.TransferFunction.from_points([0, 1], [[0, 0, 0], [1, 0.5, 0]], [1, 1])
@@ -15,7 +16,7 @@ LOOK = js.TransferFunction.from_points([0, 1], [[0, 0, 0], [1, 0.5, 0]], [1, 1])
 def made(dtype=np.float32):
     values = np.array([[0.0, 0.5, 1.0], [2.0, np.nan, 0.25]], dtype)
     camera = js.Camera.orthographic((0, 0, 0), (0, 0, -1), view_height=2.0, width=3, height=2, near=-1, far=1)
-    return js.Slice(values, camera, (("jaxsph.slice", "point=[0, 0, 0] normal=[0, 0, 1]"),))
+    return Slice(values, camera, (("jaxsph.slice", "point=[0, 0, 0] normal=[0, 0, 1]"),))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

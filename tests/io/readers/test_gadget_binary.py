@@ -21,6 +21,13 @@ def test_both_formats_of_both_byte_orders_are_read(order, form, masses, samples,
     assert table.box_size == (16, 16, 16)
 
 
+def test_other_types_are_told(samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
+    for chosen, said in ((0, "3 of type 1 (dark matter)"), (1, "7 of type 0 (gas)")):
+        table = io.read_table(tmp_path / "a.gadget", part_type=chosen)
+        assert f"also holds {said}: `part_type=` or --part-type reads another" in table.conventions
+
+
 def test_another_type_has_no_gas_columns(samples, tmp_path):
     samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
     table = io.read_table(tmp_path / "a.gadget", part_type=1)

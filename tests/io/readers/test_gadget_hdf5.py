@@ -201,3 +201,48 @@ def test_a_box_that_is_none_is_said(size, samples, tmp_path):
 def test_of_no_box_nothing_is_said(size, samples, tmp_path):
     table = io.read_table(with_header(tmp_path / "a.hdf5", samples, BoxSize=size))
     assert table.box_size is None and not any("box" in sentence for sentence in table.conventions)
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        ({"NumPart_Total": [7, 32768, 0, 0, 12, 0]}, "32,768 of type 1 (dark matter), 12 of type 4 (stars)"),
+        ({"NumPart_Total": [7, 1, 0, 5, 0, 0], "NumPart_Total_HighWord": [0, 1, 0, 0, 0, 0]},
+         "4,294,967,297 of type 1 (dark matter), 5 of type 3"),
+        ({}, "type 1 (dark matter)"),
+    ],
+)  # fmt: skip
+def test_other_types_are_told_with_how_many_there_are(told, said, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["PartType1/Coordinates"] = np.zeros((3, 3))
+        file["Header"].attrs.update({name: np.array(value, np.uint32) for name, value in told.items()})
+    assert f"also holds {said}: `part_type=` or --part-type reads another" in io.read_table(tmp_path / "a.hdf5").conventions
+    assert any(
+        each.startswith("also holds") and "(gas)" in each for each in io.read_table(tmp_path / "a.hdf5", part_type=1).conventions
+    )
+
+
+def test_gas_alone_says_nothing_of_others(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    assert not any("also holds" in each for each in io.read_table(tmp_path / "a.hdf5").conventions)
+
+
+@pytest.mark.parametrize("mark", ["Config/VORONOI", "PartType0/CenterOfMass", "PartType0/GFM_Metallicity"])
+def test_cells_of_a_moving_mesh_say_what_is_made_of_them(mark, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), masses=np.arange(1.0, 8))
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        folder, name = mark.split("/")
+        if folder == "Config":
+            file.create_group(folder).attrs[name] = ""
+        else:
+            file[mark] = np.zeros(7)
+        assert not any(
+            "moving mesh (AREPO) are read" in each for each in io.readers.gadget_hdf5.from_hdf5(file, None).conventions
+        )
+        del file["PartType0/SmoothingLength"]
+    table = io.read_table(tmp_path / "a.hdf5")
+    assert any("moving mesh (AREPO) are read as SPH particles" in each for each in table.conventions)
+    particles, report = io.particles_from_table(table, box=None)
+    np.testing.assert_allclose(particles.volume[:7], table.columns["Masses"] / table.columns["Density"], rtol=1e-6)
+    assert "neighbour" in report.support

@@ -19,26 +19,26 @@ THERE = Bounds((-1, 2, 10), (3, 3, 16))
 
 @pytest.mark.parametrize(("axis", "right", "up", "ahead"), [("x", 1, 2, -1), ("y", 0, 2, 1), ("z", 0, 1, -1)])
 def test_axes_point_to_the_right_and_upwards(axis, right, up, ahead):
-    axes = np.asarray(js.along_axis(THERE, axis, 30, 20).axes)
+    axes = np.asarray(js.Camera.along_axis(THERE, axis, 30, 20).axes)
     np.testing.assert_allclose(axes, [np.eye(3)[right], np.eye(3)[up], ahead * np.eye(3)["xyz".index(axis)]], atol=1e-7)
 
 
 @pytest.mark.parametrize("axis", "xyz")
 @pytest.mark.parametrize("size", [(30, 20), (20, 30), (16, 16)])
 def test_all_of_it_is_in_the_image_and_between_the_depths(axis, size):
-    camera = js.along_axis(THERE, axis, *size)
+    camera = js.Camera.along_axis(THERE, axis, *size)
     corners = np.stack(np.meshgrid(*zip(THERE.lower, THERE.upper, strict=True)), -1).reshape(-1, 3)
     view = (corners - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     half = float(camera.half_height) * np.array([size[0] / size[1], 1])
     assert (np.abs(view[:, :2]) <= half * (1 + 1e-6)).all() and np.isclose((np.abs(view[:, :2]) / half).max(), 1)
     assert float(camera.near) < view[:, 2].min() and view[:, 2].max() < float(camera.far)
-    wider = js.along_axis(THERE, axis, *size, margin=1.25)
+    wider = js.Camera.along_axis(THERE, axis, *size, margin=1.25)
     np.testing.assert_allclose(wider.half_height, 1.25 * camera.half_height, rtol=1e-6)
 
 
 @pytest.mark.parametrize("axis", "xyz")
 def test_a_slab_is_between_two_coordinates(axis):
-    camera, k = js.along_axis(THERE, axis, slab=(2.25, 2.75)), "xyz".index(axis)
+    camera, k = js.Camera.along_axis(THERE, axis, depth_range=(2.25, 2.75)), "xyz".index(axis)
     ends = [camera.exact_eye()[k] + float(depth) * np.asarray(camera.axes)[2, k] for depth in (camera.near, camera.far)]
     np.testing.assert_allclose(sorted(ends), (2.25, 2.75), atol=1e-5)
 
@@ -46,7 +46,7 @@ def test_a_slab_is_between_two_coordinates(axis):
 def test_a_point_and_what_is_flat_have_cameras_too():
     for there in (Bounds((1, 1, 1), (1, 1, 1)), Bounds((0, 0, 5), (1, 1, 5)), Bounds((0, 2, 0), (0, 2, 3))):
         for axis in "xyz":
-            camera = js.along_axis(there, axis)
+            camera = js.Camera.along_axis(there, axis)
             assert float(camera.half_height) > 0 and float(camera.near) < float(camera.far)
 
 
@@ -54,10 +54,10 @@ def test_a_point_and_what_is_flat_have_cameras_too():
     ("given", "said"),
     [
         ({"axis": "w"}, "`axis` must be 'x', 'y' or 'z'"),
-        ({"slab": (2, 1)}, "`slab` must be"),
-        ({"slab": (0, np.inf)}, "`slab` must be"),
+        ({"depth_range": (2, 1)}, "`depth_range` must be"),
+        ({"depth_range": (0, np.inf)}, "`depth_range` must be"),
     ],
 )
 def test_bad_input_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match=said):
-        js.along_axis(THERE, **given)
+        js.Camera.along_axis(THERE, **given)

@@ -1,12 +1,15 @@
 """Transfer functions of colour maps: matplotlib's maps and norms, and rows of colours over a domain."""
 
 import builtins
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.model.transfer.domains import log_departure
+from jaxsph.model.transfer.maps import colormap
 
 colors = pytest.importorskip("matplotlib.colors")
 matplotlib = pytest.importorskip("matplotlib")
@@ -91,8 +94,56 @@ def test_without_matplotlib_a_name_says_how_to_install_it(monkeypatch):
         js.TransferFunction.from_matplotlib("magma", low=0, high=1)
 
 
+@pytest.mark.parametrize("name", ["viridis", "coolwarm", "plasma", "magma", "cividis", "turbo", "RdBu", "hot", "Spectral_r"])
+def test_names_of_matplotlib_have_its_colours_without_it(name):
+    np.testing.assert_allclose(colormap(name), matplotlib.colormaps[name](np.linspace(0, 1, 16))[:, :3], atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["cmocean:thermal", "thermal", "crameri:batlow", "batlow_r", "cmasher:rainforest", "Viridis"])
+def test_names_of_other_collections_work_with_any_number_of_points(name, caplog):
+    for points in (2, 16, 33):
+        rows = colormap(name, points)
+        assert rows.shape == (points, 3) and rows.min() >= 0 and rows.max() <= 1
+    assert not caplog.records
+
+
+def test_maps_of_this_package_hide_others_of_their_names_and_say_nothing(caplog):
+    for name, low in (("gray", 32 / 255), ("heat", 42 / 255), ("ice", 11 / 255), ("coolwarm", 59 / 255)):
+        assert colormap(name)[0, 0] == pytest.approx(low, abs=2e-3)
+    assert colormap("cmocean:ice")[0, 0] < 0.02 and not caplog.records
+
+
+def test_a_map_that_was_registered_with_matplotlib_is_known_by_its_name():
+    made = colors.LinearSegmentedColormap.from_list("of_the_house", [(0, 0, 0), (1, 0.5, 0)])
+    matplotlib.colormaps.register(made)
+    try:
+        np.testing.assert_allclose(colormap("of_the_house", 3)[:, 1], [0, 0.25, 0.5], atol=1e-2)
+    finally:
+        matplotlib.colormaps.unregister("of_the_house")
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"), [("virdis", "viridis"), ("coolwram_r", "coolwarm"), ("haet", "heat"), ("batlo", "batlow")]
+)
+def test_an_unknown_name_is_answered_with_those_like_it(given, meant):
+    with pytest.raises(ValueError, match=rf"did you mean .*\b{meant}\b"):
+        colormap(given)
+
+
+def test_maps_are_loaded_only_when_one_is_asked_for():
+    program = (
+        "import sys, jaxsph; assert 'cmap' not in sys.modules; jaxsph.scenes.colormap('viridis'); assert 'cmap' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_map_over_more_control_values_is_finer():
+    made = js.TransferFunction.from_colormap("viridis", np.linspace(0, 1, 65))
+    np.testing.assert_allclose(made.colors, matplotlib.colormaps["viridis"](np.linspace(0, 1, 65))[:, :3], atol=2e-3)
+
+
 def test_rows_of_colours_are_spread_over_control_values_of_a_domain():
-    values = js.control_values("log", low=1, high=100, points=5)
+    values = js.TransferFunction.control_values("log", low=1, high=100, points=5)
     made = js.TransferFunction.from_colormap([(0, 0, 0), (1, 0.5, 0)], values, extinction=[0, 4])
     np.testing.assert_allclose(made.values, np.geomspace(1, 100, 5), rtol=1e-6)
     np.testing.assert_allclose(made.colors[:, 0], np.linspace(0, 1, 5))

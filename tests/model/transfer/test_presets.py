@@ -46,7 +46,7 @@ def test_what_changes_its_sign_has_zero_in_the_middle_where_it_is_not_seen():
 def test_a_volume_and_two_ends_have_presets_too():
     volume = Volume.from_array(np.linspace(0, 1, 8**3, dtype=np.float32).reshape(8, 8, 8), (0, 0, 0), 1.0)
     assert float(preset("scan", volume).extinction.max()) > 0
-    made = preset("temperature", (10.0, 1e4), colormap_name="heat", points=5)
+    made = preset("temperature", (10.0, 1e4), colormap="heat", points=5)
     np.testing.assert_allclose(made.values, np.geomspace(10, 1e4, 5), rtol=1e-6)
     assert float(made.extinction.max()) == 1
 
@@ -70,10 +70,10 @@ def test_a_domain_changes_places_and_keeps_the_depth_of_columns():
     ("given", "said"),
     [
         ({"name": "liquid"}, "fluid, density"),
-        ({"name": "fluid", "domain": "lin"}, "linear, log"),
-        ({"name": "fluid", "colormap_name": "nope"}, "viridis"),
-        ({"name": "fluid", "values": (1.0, 2.0, 3.0)}, "two numbers"),
-        ({"name": "density", "domain": "log", "values": (-1.0, 2.0)}, "> 0"),
+        ({"name": "fluid", "norm": "lin"}, "linear, log"),
+        ({"name": "fluid", "colormap": "nope"}, "viridis"),
+        ({"name": "fluid", "range": (1.0, 2.0, 3.0)}, "two numbers"),
+        ({"name": "density", "norm": "log", "range": (-1.0, 2.0)}, "> 0"),
         ({"name": "fluid", "optical_depth": 0.0}, "`optical_depth`"),
     ],
 )

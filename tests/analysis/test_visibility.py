@@ -19,7 +19,7 @@ LOOK = js.TransferFunction.from_points([0, 1], [(1, 0.5, 0), (0, 0.5, 1)], [2.0,
 
 
 def test_a_uniform_slab_absorbs_and_emits_what_its_optical_depth_says():
-    found = js.met(js.Scene(volume=slab(0.25, 0.0), volume_transfer=LOOK), flat_camera(), bins=10)
+    found = js.visibility_histogram(js.Scene(volume=slab(0.25, 0.0), volume_transfer=LOOK), flat_camera(), bins=10)
     depth, color = 2.25, np.array([0.75, 0.5, 0.25])
     assert found.rays == 64 and found.edges[[0, -1]].tolist() == [0, 1]
     filled = np.flatnonzero(found.there)
@@ -31,7 +31,7 @@ def test_a_uniform_slab_absorbs_and_emits_what_its_optical_depth_says():
 
 def test_what_lies_behind_is_there_but_absorbs_only_what_gets_through():
     scene = js.Scene(volume=(slab(1.0, 0.0), slab(0.0, 1.5)), volume_transfer=(LOOK, LOOK))
-    front, back = (js.met(scene, flat_camera(), of=part) for part in (0, 1))
+    front, back = (js.visibility_histogram(scene, flat_camera(), part=part) for part in (0, 1))
     np.testing.assert_allclose(front.absorbed.sum(), 1 - np.exp(-3), rtol=1e-6)
     np.testing.assert_allclose(back.absorbed.sum(), np.exp(-3) * (1 - np.exp(-2)), rtol=1e-6)
     np.testing.assert_allclose(back.there.sum(), 1, rtol=1e-9)
@@ -48,7 +48,7 @@ def test_sums_over_all_values_are_the_mean_light_of_the_rays(perspective):
         camera = js.Camera.orthographic((0, 0, -6), (0, 0, 0), view_height=7, width=12, height=10, near=1, far=11)
     look = js.TransferFunction.from_points([0, 1], [(1, 0.5, 0), (0, 0.5, 1)], [0.5, 2.0])
     scene = js.Scene(particles=particles, transfer=look)
-    found, truth = js.met(scene, camera, rays=10_000), js.reference.integral(scene, camera)
+    found, truth = js.visibility_histogram(scene, camera, rays=10_000), js.reference.integral(scene, camera)
     assert found.rays == 120
     np.testing.assert_allclose(found.absorbed.sum(), np.mean(1 - truth.transmittance), atol=1e-4)
     np.testing.assert_allclose(found.emitted.sum(0), np.mean(truth.color, (0, 1)), atol=1e-4)
@@ -56,30 +56,30 @@ def test_sums_over_all_values_are_the_mean_light_of_the_rays(perspective):
 
 def test_values_beyond_the_control_points_have_bins_of_their_own():
     scene = js.Scene(volume=slab(1.5, 0.0), volume_transfer=LOOK)
-    found = js.met(scene, flat_camera(), bins=30)
+    found = js.visibility_histogram(scene, flat_camera(), bins=30)
     assert found.edges[-1] == pytest.approx(1.5) and found.absorbed[-1] > 0.9
 
 
 def test_bins_of_a_log_domain_have_even_logarithms():
-    look = js.TransferFunction.from_colormap("heat", js.control_values("log", low=1e-3, high=1e3))
-    found = js.met(js.Scene(volume=slab(12.0, 0.0), volume_transfer=look), flat_camera(), bins=12)
+    look = js.TransferFunction.from_colormap("heat", js.TransferFunction.control_values("log", low=1e-3, high=1e3))
+    found = js.visibility_histogram(js.Scene(volume=slab(12.0, 0.0), volume_transfer=look), flat_camera(), bins=12)
     np.testing.assert_allclose(np.log10(found.edges), np.linspace(-3, 3, 13), atol=1e-5)
     assert np.flatnonzero(found.there).tolist() == [8]
 
 
 def test_rays_that_meet_nothing_count_as_rays():
     camera = js.Camera.orthographic((9, 9, -2), (9, 9, 0), view_height=0.5, width=4, height=4, near=1.0, far=5.0)
-    found = js.met(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK), camera)
+    found = js.visibility_histogram(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK), camera)
     assert found.rays == 16 and not found.there.any() and np.isfinite(found.edges).all()
 
 
-@pytest.mark.parametrize("more", [{"rays": 0}, {"rays": 2.5}, {"bins": 0}, {"of": 1}, {"of": -1}])
+@pytest.mark.parametrize("more", [{"rays": 0}, {"rays": 2.5}, {"bins": 0}, {"part": 1}, {"part": -1}])
 def test_numbers_out_of_range_are_refused_by_name(more):
     with pytest.raises(ValueError, match=f"`{next(iter(more))}`"):
-        js.met(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK), flat_camera(), **more)
+        js.visibility_histogram(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK), flat_camera(), **more)
 
 
 def test_media_it_does_not_know_are_refused():
     surface = js.IsoSurface.from_volume(slab(0.5, 0.0), 0.2)
     with pytest.raises(ValueError, match="media"):
-        js.met(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK, media=(surface,)), flat_camera())
+        js.visibility_histogram(js.Scene(volume=slab(0.5, 0.0), volume_transfer=LOOK, media=(surface,)), flat_camera())

@@ -77,3 +77,23 @@ def test_lengths_and_types_of_another_shape_are_refused_by_name(name, shape, sam
     samples.write_phantom(tmp_path / "a.h5", samples.particles(), **{name: np.ones(shape)})
     with pytest.raises(ValueError, match=rf"a\.h5: has 7 positions, but `{name}` has the shape \("):
         io.read_table(tmp_path / "a.h5")
+
+
+def test_sinks_are_read_as_a_type_of_their_own_and_counted_where_they_are_not(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        sinks = file["sinks"]
+        sinks["xyz"], sinks["m"], sinks["h"] = np.array([[0.0, 0, 0], [1, 2, 3]]), [1.0, 0.5], [0.25, 0.125]
+    assert "2 sink particles are left out: they are part_type -1" in io.read_table(tmp_path / "a.h5").conventions
+    table = io.read_table(tmp_path / "a.h5", part_type=-1)
+    np.testing.assert_array_equal(table.position, [[0, 0, 0], [1, 2, 3]])
+    np.testing.assert_array_equal(table.columns["mass"], [1, 0.5])
+    assert table.support is None and table.part_type == -1
+    points = io.read_points(tmp_path / "a.h5", part_type=-1)
+    np.testing.assert_array_equal(np.asarray(points.radius)[:2], [0.25, 0.125])
+
+
+def test_a_dump_without_sinks_is_not_asked_for_them(samples, tmp_path):
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with pytest.raises(ValueError, match=r"a\.h5: has no sink particles"):
+        io.read_table(tmp_path / "a.h5", part_type=-1)

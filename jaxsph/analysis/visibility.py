@@ -1,6 +1,6 @@
 r"""What rays really meet: how much light each value of a quantity emits and absorbs, as the camera sees it.
 
-Flow: scene, camera -> some rays -> portions -> quantity at nodes, light in front of it -> [met] -> histogram, figure.
+Flow: scene, camera -> some rays -> portions -> quantity at nodes, light in front of it -> [visibility] -> histogram, figure.
 
 A value may be that of most particles and never be seen, as it lies behind others. Along rays of random pixels the quantity is
 taken at the nodes of portions of the float64 reference, and what is there is weighted by the transmittance in front:
@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.names import renamed
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
 from jaxsph.reference.media import AllOfVolume, AllParticles, Part, Whole, parts_of
@@ -31,7 +33,7 @@ MAX_BINS = 4096
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Met:
+class VisibilityHistogram:
     """What rays meet, by value of the quantity; all are means over the pixels of the image.
 
     Attributes:
@@ -54,7 +56,10 @@ class Met:
         return (self.edges[1:] + self.edges[:-1]) / 2
 
 
-def met(scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, of: int = 0, seed: int = 0) -> Met:
+@renamed(of="part")
+def visibility_histogram(
+    scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, part: int = 0, seed: int = 0
+) -> VisibilityHistogram:
     """The histogram of what rays meet, over the quantity of one part of a scene (host side, float64).
 
     An estimate: of random pixels, and of the field at nodes of portions that are not split any further, as
@@ -65,20 +70,24 @@ def met(scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, of: i
         camera: where from.
         rays: random pixels, all different; all pixels where there are fewer.
         bins: of the histogram, from the least to the greatest of control values and of what is met.
-        of: which part that has a transfer function: particles come first, then volumes, in their order.
+        part: which part that has a transfer function: particles come first, then volumes, in their order.
         seed: of the choice of pixels.
 
     Raises:
         ValueError: a scene of nothing or with `media`, no such part, a number of rays or bins out of range.
+
+    References:
+        Correa & Ma 2011, *Visibility histograms and visibility-driven transfer functions*.
     """
     scene.check()
     if scene.media:
-        raise ValueError("`media` are unknown to `met`, which has particles, volumes and points; give `media=()`")
+        raise ValueError("`media` must be `()` for `visibility_histogram`, which knows particles, volumes and points")
     for name, number, most in (("rays", rays, 1 << 24), ("bins", bins, MAX_BINS)):
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= most:
             raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
-    parts, (transfer, record) = parts_of(scene, camera), _recording(scene, of)
-    looked = [part for part in parts if isinstance(part, AllParticles | AllOfVolume)][of]
+    camera = with_depths(camera, scene)
+    parts, (transfer, record) = parts_of(scene, camera), _recording(scene, part)
+    looked = [one for one in parts if isinstance(one, AllParticles | AllOfVolume)][part]
     looked.look = record
     chosen = _pixels(camera, rays, seed)
     for some in blocks(chosen, BLOCK):
@@ -86,12 +95,12 @@ def met(scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, of: i
     return _histogram(record, transfer, bins, len(chosen.u))
 
 
-def _recording(scene: Scene, of: int) -> tuple[TransferFunction, Recording]:
+def _recording(scene: Scene, part: int) -> tuple[TransferFunction, Recording]:
     looks = scene.looks
-    if not 0 <= of < len(looks):
+    if not 0 <= part < len(looks):
         there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
-        raise ValueError(f"`of` must be the number of a part with a transfer function, got {of}; there are {there}")
-    return looks[of], Recording(looks[of])
+        raise ValueError(f"`part` must be the number of a part with a transfer function, got {part}; there are {there}")
+    return looks[part], Recording(looks[part])
 
 
 def _pixels(camera: Camera, rays: int, seed: int) -> Rays:
@@ -149,7 +158,7 @@ def _in_front(ray: np.ndarray, thickness: np.ndarray) -> np.ndarray:
     return before - before[first] if len(ray) else before
 
 
-def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: int) -> Met:
+def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:
     columns = [np.concatenate(column) for column in zip(*record.found, strict=True)] if record.found else None
     quantity, path, absorbed, emitted = columns or [np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3))]
     scale = Scale.of(np.asarray(transfer.values, np.float64))
@@ -162,4 +171,6 @@ def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: i
         return np.bincount(at, weight, bins) / rays
 
     edges = scale.value(low + (high - low) * np.arange(bins + 1) / bins)
-    return Met(edges, summed(path), summed(absorbed), np.stack([summed(channel) for channel in emitted.T], 1), rays)
+    return VisibilityHistogram(
+        edges, summed(path), summed(absorbed), np.stack([summed(channel) for channel in emitted.T], 1), rays
+    )

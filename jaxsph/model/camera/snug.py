@@ -1,0 +1,97 @@
+"""Near and far, snug to what there is: of cameras that were given none, and of those that are to lose what they waste.
+
+Flow: camera, particles or scene -> [snug] -> Camera with depths -> access.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.checks import is_traced
+
+NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
+ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
+OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet nothing between any
+
+
+def with_depths(camera: Camera, shown: Any) -> Camera:
+    """A camera whose near and far, as far as they are None, are those of what is shown (host side).
+
+    Args:
+        camera: as `Camera.look_at` makes it.
+        shown: a scene, particles, a volume or points.
+
+    Raises:
+        ValueError: without depths under a trace, with media, which do not say how large they are, or where the depth that is
+            given leaves none of what is shown.
+    """
+    if camera.near is not None and camera.far is not None:
+        return camera
+    if is_traced(camera, shown):  # type: ignore[unreachable]
+        raise ValueError(
+            "`near` and `far` must be given under jit, vmap or grad, where the scene cannot be measured; give them to the camera"
+        )
+    if getattr(shown, "media", ()):
+        raise ValueError(
+            "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
+        )
+    found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *getattr(shown, "parts", (shown,)))
+    near, far = (jnp.asarray(own if given is None else given, camera.dtype) for given, own in _ends(camera, found))
+    if not near < far:
+        raise ValueError(
+            f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
+        )
+    return dataclasses.replace(camera, near=near, far=far)
+
+
+def snug(camera: Camera, *parts: Any) -> Camera:
+    """`camera` with near and far moved to supports, radii and boxes of parts; unchanged where none lies in front of the eye."""
+    spans = [span for part in parts if (span := _span(camera, part)) is not None]
+    return _between(camera, min(near for near, _ in spans), max(far for _, far in spans)) if spans else camera
+
+
+def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
+    """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
+    return _between(camera, *_span_of_box(camera, lower, upper))
+
+
+def _ends(camera: Camera, found: Camera) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    return (camera.near, found.near), (camera.far, found.far)
+
+
+def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
+    """From the least to the greatest depth of a part; None of an empty one."""
+    if not hasattr(part, "valid") or getattr(part, "box", None) is not None:
+        return _span_of_box(camera, *part.bounds())
+    valid = np.asarray(part.valid)
+    if not valid.any():
+        return None
+    depth = _depth(camera, part.exact_position()[valid])
+    reach = np.asarray(part.support if hasattr(part, "support") else part.radius, np.float64)[valid]
+    return float((depth - reach).min()), float((depth + reach).max())
+
+
+def _span_of_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
+    depth = _depth(camera, np.array(list(itertools.product(*zip(lower, upper, strict=True)))))
+    return float(depth.min()), float(depth.max())
+
+
+def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
+    return np.asarray((position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
+
+
+def _between(camera: Camera, near: float, far: float) -> Camera:
+    if camera.is_perspective:
+        if far <= 0:
+            return camera
+        near = max(near, NEAREST * far)
+    margin = ROUNDING * max(abs(near), abs(far))
+    near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
+    dtype = camera.dtype
+    return dataclasses.replace(camera, near=jnp.asarray(near, dtype), far=jnp.asarray(far + margin, dtype))

@@ -1,0 +1,206 @@
+"""Dumps in Phantom's own format, written by the writer of conftest, which knows the format and not the reader."""
+
+import numpy as np
+import pytest
+
+import jaxsph.io as io
+from jaxsph.io.formats import find_format
+from jaxsph.io.readers.phantom import native
+
+NOTHING = (0, {})
+SINKS = {
+    "x": [0.0, 1.0, 5.0], "y": [0.0, 2.0, 5.0], "z": [0.0, 3.0, 5.0], "m": [1.0, 0.5, -0.25], "h": [0.25, 0.125, 0.5],
+    "vx": [1.0, 0, 0], "vy": [0.0, 1, 0], "vz": [0.0, 0, 1], "spinx": [1.0, 2, 3], "spiny": [1.0, 2, 3], "spinz": [1.0, 2, 3],
+}  # fmt: skip
+
+
+@pytest.fixture
+def dump(samples, tmp_path):
+    """`dump(blocks, **how)` is the path of a dump; blocks by default are 7 particles of gas."""
+
+    def write(*blocks, **how):
+        blocks = list(blocks) or [samples.phantom_particles(samples.particles()), NOTHING, NOTHING, NOTHING]
+        (tmp_path / "disc_00010").write_bytes(b"".join(samples.phantom_records(blocks, **how)))
+        return tmp_path / "disc_00010"
+
+    return write
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("int_bytes", [4, 8])
+@pytest.mark.parametrize("real_bytes", [4, 8])
+@pytest.mark.parametrize("name", ["FT:Phantom:2025.0.0:abc (hydro)", "ST:Phantom:1.1.0:abc (mhd)"])
+def test_full_and_small_dumps_of_any_kinds_are_read(name, real_bytes, int_bytes, order, samples, dump):
+    p = samples.particles()
+    path = dump(name=name, real_bytes=real_bytes, int_bytes=int_bytes, order=order)
+    assert find_format(path).name == "Phantom dump"
+    table = io.read_table(path)
+    np.testing.assert_array_equal(table.position, p.position)
+    np.testing.assert_array_equal(table.columns["vxyz"], p.velocity)
+    np.testing.assert_array_equal(table.support, np.full(7, 1.0))
+    np.testing.assert_array_equal(table.columns["mass"], np.full(7, 2.0))
+    np.testing.assert_allclose(table.columns["density"], np.full(7, 2 * 2.5**3))
+    np.testing.assert_allclose(table.volume, np.full(7, 0.4**3))
+    assert (table.kernel, table.part_type, table.time) == ("cubic_spline", 1, 3.0)
+    assert table.position.dtype == np.dtype(f"f{real_bytes}") and all(each.dtype.isnative for each in table.columns.values())
+    assert "support = 2 x smoothing length h (Phantom convention)" in table.conventions
+
+
+def test_a_dump_says_what_its_conversion_to_hdf5_says(samples, dump, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    samples.write_phantom(tmp_path / "a.h5", samples.particles())
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        for name, value in {"udist": 1e16, "umass": 2e33, "utime": 1e10, "umagfd": 1.0, "time": 3.0}.items():
+            file["header"][name] = value
+    one, other = io.read_table(dump()), io.read_table(tmp_path / "a.h5")
+    assert one.conventions == other.conventions and one.units == other.units and one.time == other.time
+    assert one.columns.keys() == other.columns.keys()
+    for name, column in one.columns.items():
+        np.testing.assert_array_equal(column, other.columns[name])
+
+
+def test_one_type_is_read_with_its_own_mass_and_the_dead_are_left_out(samples, dump):
+    h = np.array([0.5, -1, 0.5, 0.5, 0, 0.25, 0.5])
+    block = samples.phantom_particles(samples.particles(), h, [1, 1, 3, -3, 3, 1, 1])
+    path = dump(block, NOTHING)
+    gas, other = io.read_table(path), io.read_table(path, part_type=3)
+    assert len(gas) == 3 and len(other) == 2 and set(gas.columns["mass"]) == {2.0} and set(other.columns["mass"]) == {3.0}
+    np.testing.assert_array_equal(gas.support, [1, 0.5, 1])
+    assert {"dropped 2 dead or accreted particles (h <= 0)", "particles of itype 1; left out 2 of other types"} <= set(
+        gas.conventions
+    )
+    with pytest.raises(ValueError, match="no particles of type 2; `part_type` can be 1, 3"):
+        io.read_table(path, part_type=2)
+
+
+def test_without_types_the_header_says_how_many_there_are_of_each(samples, dump):
+    rows, arrays = samples.phantom_particles(samples.particles())
+    header = samples.PHANTOM_HEADER | {"i8": {"npartoftype": [5, 0, 2]}, "i0": {"nblocks": [1]}}
+    path = dump((rows, arrays | {"i1": {}}), header=header)
+    assert len(io.read_table(path)) == 5 and len(io.read_table(path, part_type=3)) == 2
+    assert len(io.read_table(dump((rows, arrays | {"i1": {}}), header=header | {"i8": {"npartoftype": [5, 0, 9]}}))) == 7
+
+
+def test_refined_particles_have_less_mass(samples, dump):
+    rows, arrays = samples.phantom_particles(samples.particles())
+    table = io.read_table(dump((rows, arrays | {"i1": {"itype": np.ones(7), "apr_level": [1, 1, 2, 2, 3, 3, 1]}})))
+    np.testing.assert_array_equal(table.columns["mass"], [2, 2, 1, 1, 0.5, 0.5, 2])
+    np.testing.assert_allclose(table.columns["mass"] / table.columns["density"], table.volume)
+
+
+def test_sinks_are_counted_and_read_as_a_type_of_their_own(samples, dump):
+    path = dump(samples.phantom_particles(samples.particles()), (3, {"f0": SINKS}), NOTHING, NOTHING)
+    assert "3 sink particles are left out: they are part_type -1" in io.read_table(path).conventions
+    with pytest.raises(ValueError, match=r"no particles of type 2; `part_type` can be 1, -1 \(sinks\)"):
+        io.read_table(path, part_type=2)
+    table = io.read_table(path, part_type=-1)
+    np.testing.assert_array_equal(table.position, [[0, 0, 0], [1, 2, 3]])
+    np.testing.assert_array_equal(table.columns["spinxyz"], [[1, 1, 1], [2, 2, 2]])
+    assert table.columns["mass"].tolist() == [1, 0.5] and table.support is None and table.kernel is None
+    assert "dropped 1 sinks that were merged with others (mass < 0)" in table.conventions
+    points = io.read_points(path, part_type=-1)
+    np.testing.assert_array_equal(np.asarray(points.radius)[:2], [0.25, 0.125])
+
+
+def test_without_sinks_there_are_none_to_ask_for(dump):
+    with pytest.raises(ValueError, match=r"disc_00010: has no sink particles \(type -1\)"):
+        io.read_table(dump(), part_type=-1)
+
+
+def test_the_field_of_the_fourth_block_and_arrays_of_one_name_are_columns(samples, dump):
+    rows, arrays = samples.phantom_particles(samples.particles(), divv=np.arange(7.0))
+    field = {"Bx": np.ones(7), "By": np.zeros(7), "Bz": np.full(7, 2.0), "psi": np.arange(7.0)}
+    table = io.read_table(dump((rows, arrays), NOTHING, NOTHING, (7, {"f4": field})))
+    np.testing.assert_array_equal(table.columns["Bxyz"], np.tile([1, 0, 2], (7, 1)))
+    assert table.columns["psi"].tolist() == table.columns["divv"].tolist() == list(range(7))
+    assert table.units.columns["Bxyz"].cgs == 1.0 and table.units.length.cgs == 1e16
+
+
+def test_blocks_of_several_processes_are_joined(samples, dump):
+    p = samples.particles()
+    header = samples.PHANTOM_HEADER | {"i0": {"nblocks": [2]}}
+    block = samples.phantom_particles(p)
+    path = dump(block, (3, {"f0": SINKS}), block, NOTHING, header=header)
+    with pytest.raises(ValueError, match="other arrays"):
+        io.read_table(path)
+    path = dump(block, (3, {"f0": SINKS}), block, (3, {"f0": SINKS}), header=header)
+    np.testing.assert_array_equal(io.read_table(path).position, np.concatenate([p.position] * 2))
+    assert len(io.read_table(path, part_type=-1)) == 4
+
+
+def test_records_longer_than_a_length_can_say_are_several(samples, dump):
+    path, block = dump(), samples.phantom_particles(samples.particles())
+    pieces = samples.phantom_records([block], limit=13)
+    pieces[0] = samples.phantom_records([block])[0]  # by its length, byte order and kinds are known
+    assert len(b"".join(pieces)) > path.stat().st_size
+    path.write_bytes(b"".join(pieces))
+    np.testing.assert_array_equal(io.read_table(path).position, samples.particles().position)
+
+
+def test_a_dump_cut_behind_or_inside_any_record_is_refused(samples, tmp_path):
+    records = samples.phantom_records([samples.phantom_particles(samples.particles()), (3, {"f0": SINKS})])
+    for number in range(1, len(records)):
+        for cut in (b"", records[number][:2], records[number][:-4], records[number][:-1]):
+            (tmp_path / "x").write_bytes(b"".join(records[:number]) + cut)
+            with pytest.raises(ValueError, match=r"x: is cut short: .* is not complete; copy it again") as caught:
+                io.read_table(tmp_path / "x")
+            assert "\n" not in str(caught.value)
+
+
+def test_lengths_that_differ_are_refused_and_so_is_what_is_left_over(samples, tmp_path):
+    records = samples.phantom_records([samples.phantom_particles(samples.particles()), NOTHING])
+    for number in range(len(records)):
+        changed = records[number][:-4] + np.array(np.frombuffer(records[number][-4:], "<i4") + 4, "<i4").tobytes()
+        (tmp_path / "x").write_bytes(b"".join([*records[:number], changed, *records[number + 1 :]]))
+        with pytest.raises(ValueError, match=r"x: is damaged: the record of .* begins with length .* and ends with"):
+            io.read_table(tmp_path / "x")
+    (tmp_path / "x").write_bytes(b"".join(records) + b"\0" * 8)
+    with pytest.raises(ValueError, match="x: has 8 more bytes than its arrays"):
+        io.read_table(tmp_path / "x")
+
+
+@pytest.mark.parametrize("rows", [-1, 6, 8, 2**31, 2**62])
+def test_rows_that_arrays_do_not_have_are_refused(rows, samples, dump):
+    _, arrays = samples.phantom_particles(samples.particles())
+    with pytest.raises(ValueError, match="is damaged: "):
+        io.read_table(dump((rows, arrays)))
+
+
+@pytest.mark.parametrize("number", [-1, 0, 2**31 - 1])
+def test_absurd_numbers_of_processes_and_blocks_are_refused(number, samples, dump):
+    path, made = dump(), samples.phantom_records([samples.phantom_particles(samples.particles())])
+    at = next(n for n, record in enumerate(made) if len(record) == 4 + 8 + 8 * 4 + 4) - 1
+    made[at] = samples.fortran(np.array(number, "<i4"))
+    path.write_bytes(b"".join(made))
+    with pytest.raises(ValueError, match=r"is damaged|is cut short"):
+        io.read_table(path)
+
+
+@pytest.mark.parametrize(("kind", "tag"), [("f0", "hfact"), ("f0", "massoftype")])
+def test_a_header_without_what_volumes_follow_from_is_refused(kind, tag, samples, dump):
+    header = {k: {t: v for t, v in each.items() if t != tag} for k, each in samples.PHANTOM_HEADER.items()}
+    with pytest.raises(ValueError, match=f"has no `{tag}`"):
+        io.read_table(dump(header=header))
+
+
+def test_arrays_without_positions_or_h_are_refused(samples, dump):
+    rows, arrays = samples.phantom_particles(samples.particles())
+    with pytest.raises(ValueError, match="has no `h`"):
+        io.read_table(dump((rows, arrays | {"f4": {}})))
+    with pytest.raises(ValueError, match="holds no positions"):
+        io.read_table(dump((rows, arrays | {"f0": {}})))
+    with pytest.raises(ValueError, match="has no `h`"):
+        io.read_table(dump(NOTHING))
+
+
+def test_dumps_without_tags_and_other_files_are_refused(dump, tmp_path):
+    with pytest.raises(ValueError, match="is a dump without tags, by 'F:Phantom"):
+        io.read_table(dump(name="F:Phantom"))
+    (tmp_path / "x").write_bytes(b"\x18\0\0\0" + bytes(100))
+    assert (
+        not native.looks_like((tmp_path / "x").read_bytes())
+        and not native.looks_like(b"")
+        and native.looks_like(dump().read_bytes())
+    )
+    with pytest.raises(ValueError, match="another format"):
+        native.read(tmp_path / "x")

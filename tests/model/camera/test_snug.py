@@ -1,0 +1,90 @@
+"""Promises of near and far that are not given: all that there is lies between them, and little else."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.engine.media.in_octree import in_octree
+from jaxsph.model.camera.snug import snug, with_depths
+
+RNG = np.random.default_rng(4)
+POSITION = RNG.uniform(-0.5, 0.5, (40, 3))
+PARTICLES = js.Particles.from_arrays(POSITION, 0.3, POSITION[:, 2])
+LOOK = js.TransferFunction.from_points([-1.0, 1.0], [[1, 0, 0], [0, 0, 1]], [1.0, 2.0])
+SCENE = js.Scene(PARTICLES, LOOK)
+VIEW = {"eye": (0, 0, 4), "target": (0, 0, 0), "width": 8, "height": 6}
+OPEN = js.Camera.look_at(**VIEW)
+SETTINGS = js.Settings(samples=8)
+
+
+def between(near, far, camera):
+    assert float(camera.near) == pytest.approx(near, rel=3e-4, abs=3e-4)
+    assert float(camera.far) == pytest.approx(far, rel=3e-4, abs=3e-4)
+
+
+def test_depths_are_those_of_supports_radii_and_grids():
+    depth = 4 - POSITION[:, 2]
+    between((depth - 0.3).min(), (depth + 0.3).max(), with_depths(OPEN, SCENE))
+    between((depth - 0.3).min(), (depth + 0.3).max(), with_depths(OPEN, PARTICLES))
+    points = js.Points.from_arrays([[0, 0, 1.0]], 0.5, opacity=0.5)
+    volume = js.Volume.from_array(np.zeros((2, 2, 2)), lower=(0, 0, -3), spacing=1.0)
+    between(2.5, 3.5, with_depths(OPEN, points))
+    between(2.5, 7.0, with_depths(OPEN, js.Scene(points=points, volume=volume, volume_transfer=LOOK)))
+    between(
+        3.5, 4.5, with_depths(OPEN, js.Particles.from_arrays(np.zeros((1, 3)), 0.1, 1.0, box=js.Box((-1, -1, -0.5), (1, 1, 0.5))))
+    )
+
+
+def test_what_is_given_stays():
+    given = js.Camera.look_at(**VIEW, near=1, far=9)
+    assert with_depths(given, SCENE) is given
+    one = with_depths(js.Camera.look_at(**VIEW, near=1.5), SCENE)
+    assert float(one.near) == 1.5 and 4.5 < float(one.far) < 5
+    flat = with_depths(js.Camera.orthographic(**VIEW, view_height=2.0), SCENE)
+    assert 3 < float(flat.near) < float(flat.far) < 5
+
+
+def test_the_eye_may_be_inside_and_a_scene_empty_or_behind():
+    inside = with_depths(js.Camera.look_at(**VIEW | {"eye": (0, 0, 0.1)}), SCENE)
+    assert 0 < float(inside.near) < float(inside.far) < 1
+    behind = with_depths(js.Camera.look_at(**VIEW | {"target": (0, 0, 8)}), SCENE)
+    empty = with_depths(OPEN, dataclasses.replace(SCENE, particles=js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)))
+    for camera in (behind, empty):
+        assert 0 < float(camera.near) < float(camera.far)
+    assert snug(behind, PARTICLES) is behind
+
+
+def test_verbs_take_depths_from_the_scene():
+    closed = with_depths(OPEN, SCENE)
+    image = js.render(SCENE, OPEN, SETTINGS)
+    np.testing.assert_array_equal(image.color, js.render(SCENE, closed, SETTINGS).color)
+    assert dict(image.metadata) == dict(js.render(SCENE, closed, SETTINGS).metadata)
+    assert js.plan(SCENE, OPEN, SETTINGS) == js.plan(SCENE, closed, SETTINGS)
+    truth = js.reference.render(SCENE, OPEN, SETTINGS)
+    np.testing.assert_array_equal(truth.color, js.reference.render(SCENE, closed, SETTINGS).color)
+    assert np.abs(np.asarray(image.color) - truth.color).max() < 1e-5
+    np.testing.assert_array_equal(js.reference.project(PARTICLES, OPEN).values, js.reference.project(PARTICLES, closed).values)
+
+
+def test_under_a_trace_depths_are_asked_for():
+    plan = js.plan(SCENE, OPEN, SETTINGS)
+    for render in (lambda camera: js.render(SCENE, camera, SETTINGS, plan=plan).color,):
+        with pytest.raises(ValueError, match="`near` and `far` must be given under jit"):
+            jax.eval_shape(render, OPEN)
+
+
+def test_what_cannot_tell_depths_is_refused():
+    with pytest.raises(ValueError, match="`near` and `far` must be given with `media`"):
+        js.render(in_octree(SCENE), OPEN, SETTINGS)
+    with pytest.raises(ValueError, match="hold nothing of the scene"):
+        js.render(SCENE, js.Camera.look_at(**VIEW, near=8.0), SETTINGS)
+    for call in (OPEN.near_and_far, OPEN.describe, lambda: js.CameraPath.from_keys([(0, OPEN), (1, OPEN)]).at(0.5)):
+        with pytest.raises(ValueError, match="`near` and `far` must be numbers here"):
+            call()
+    for wrong in ({"near": -1.0}, {"near": np.nan}, {"far": np.inf}):
+        with pytest.raises(ValueError, match="`near` must be"):
+            js.Camera.look_at(**VIEW, **wrong)
+    assert "near of the scene, far of the scene" in repr(OPEN)

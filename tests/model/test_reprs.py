@@ -1,0 +1,60 @@
+"""Promises of `repr`: one line with counts and ranges, of whatever is in the leaves."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+
+POSITION = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+PARTICLES = js.Particles.from_arrays(POSITION, [0.5, 0.5, 1.0], [1.0, 2.0, 4.0])
+LOOK = js.TransferFunction.from_points([0.0, 1.0, 5.0], np.ones((3, 3)), [0.0, 1.0, 2.0])
+POINTS = js.Points.from_arrays(POSITION, 0.25, extinction=2.0, spread="feet")
+VOLUME = js.Volume.from_array(np.arange(24.0).reshape(2, 3, 4), spacing=0.5)
+CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=8, height=6, near=2, far=6)
+PLANE = np.zeros((6, 8), np.float32)
+IMAGE = js.Image(np.zeros((6, 8, 3), np.float32), PLANE + 1, PLANE, PLANE + 0.25, PLANE, True, 0, {})
+
+LINES = {
+    "Particles(3, poly6, float32, quantity 1 to 4, support 0.5 to 1)": PARTICLES,
+    "Particles(3, poly6, float32, quantity 1 to 4, extinction by 2, support 1, periodic)": js.Particles.from_arrays(
+        POSITION, 1.0, ([1.0, 2.0, 4.0], 2.0), box=(8, 8, 8)
+    ),
+    "TransferFunction(3 points, values 0 to 5, extinction 0 to 2)": LOOK,
+    "Points(3, float32, radius 0.25, extinction 2, spread at feet)": POINTS,
+    "Volume(float32[2,3,4], values 0 to 23, from (0, 0, 0), spacing (0.5, 0.5, 0.5))": VOLUME,
+    "Camera(perspective, 8 x 6, eye (0, 0, 4), forward (0, 0, -1), fov 45 degrees, near 2, far 6)": CAMERA,
+    "Image(8 x 6, transmittance 1, error 0.25, certified, faults 0)": IMAGE,
+    f"Scene(particles={PARTICLES!r}, transfer={LOOK!r})": js.Scene(PARTICLES, LOOK),
+    f"Scene(volume={VOLUME!r}, volume_transfer={LOOK!r}, mix='opacity')": js.Scene(
+        volume=VOLUME, volume_transfer=LOOK, mix="opacity"
+    ),
+}
+
+
+@pytest.mark.parametrize(("told", "of"), LINES.items(), ids=[type(of).__name__ for of in LINES.values()])
+def test_what_users_hold_is_told_in_a_line(told, of):
+    assert repr(of).replace("-0,", "0,") == told
+
+
+@pytest.mark.parametrize("of", LINES.values(), ids=[type(of).__name__ for of in LINES.values()])
+def test_whatever_is_in_the_leaves_there_is_a_line(of):
+    name, told = type(of).__name__, []
+    jax.make_jaxpr(lambda one: told.append(repr(one)) or jax.tree.leaves(one))(of)
+    batched = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), of)
+    others = [jax.tree.map(lambda _: other, of) for other in (object(), None, "a", 0)]  # noqa: B023
+    for line in (*told, repr(batched), *map(repr, others), repr(jax.eval_shape(lambda: of))):
+        assert line.startswith(f"{name}(") and line.endswith(")") and "\n" not in line and len(line) < 400
+
+
+def test_a_plan_is_told_in_a_line():
+    plan = js.plan(js.Scene(PARTICLES, LOOK), CAMERA, js.Settings(samples=8))
+    assert repr(plan).startswith("Plan(8 x 6 of 8 samples, 3 particles, ") and repr(plan).endswith(" MB)")
+
+
+def test_particles_have_a_length():
+    assert len(PARTICLES) == 3 and len(PARTICLES.padded(9)) == 3
+    assert len(js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)) == 0
+    assert len(dataclasses.replace(PARTICLES, valid=np.array([True, False, False, False]))) == 1

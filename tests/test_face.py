@@ -1,0 +1,90 @@
+"""The names that `jaxsph` has for its users: few, found when they are used, and former ones for one version."""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxsph as js
+from jaxsph.model import registry
+
+PACKAGES = ("jaxsph", "jaxsph.model", "jaxsph.scale", "jaxsph.sequence")
+HEAVY = ("jax", "numpy", "scipy", "matplotlib", "h5py", "jaxsph.io", "jaxsph.engine.render", "jaxsph.reference")
+
+
+def loaded(code):
+    """Modules that a process has loaded after some code."""
+    told = subprocess.run([sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"], capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+    return set(told.stdout.split())
+
+
+def test_importing_jaxsph_imports_nothing_that_takes_time():
+    assert not loaded("import jaxsph, jaxsph.model, jaxsph.scale, jaxsph.sequence\ndir(jaxsph)") & set(HEAVY)
+
+
+def test_things_are_made_without_files_figures_and_the_engine():
+    code = "from jaxsph.model import Image, Settings\nSettings(integrator='segments', screen='quadtree')"
+    assert not loaded(code) & {"jaxsph.io", "jaxsph.engine.render", "matplotlib", "scipy"}
+
+
+def test_methods_are_there_whatever_is_imported_first(tmp_path):
+    code = f"""
+import numpy as np
+from jaxsph.model import Image
+one = np.ones((2, 2), np.float32)
+Image(np.zeros((2, 2, 3), np.float32), one, one, one, one, True, 0, {{}}).save({str(tmp_path / "a.png")!r})
+"""
+    assert "jaxsph.io" in loaded(code)
+    assert (tmp_path / "a.png").exists()
+
+
+@pytest.mark.parametrize("name", sorted(registry.METHODS))
+def test_every_method_that_is_entered_is_an_attribute_that_finds_it(name):
+    kind, attribute = name.split(".")
+    owner = getattr(js, kind)
+    assert isinstance(vars(owner)[attribute], registry.Method) and callable(getattr(owner, attribute))
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_all_names_are_found_and_known_to_editors(package):
+    module = importlib.import_module(package)
+    assert [name for name in module.__all__ if getattr(module, name, None) is None] == []
+    assert set(dir(module)) == set(module.__all__)
+    tree = ast.parse(Path(module.__file__).read_text(encoding="utf-8"))
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    entries = {}
+    for node in typed.body:
+        for alias in node.names:
+            told = f"{node.module}.{alias.name}" if node.module == "jaxsph" else f"{node.module}:{alias.name}"
+            entries[alias.name] = told
+    assert entries.keys() == set(module.__all__)
+    for name, entry in entries.items():
+        assert getattr(module, name) is registry.found(entry)
+
+
+def test_there_are_few_names():
+    assert len(js.__all__) <= 40
+    assert js.__version__
+
+
+@pytest.mark.parametrize("old", sorted(js.FORMER))
+def test_former_names_warn_once_and_are_what_they_are_called_now(old):
+    entry, now = js.FORMER[old]
+    vars(js).pop(old, None)
+    with pytest.warns(FutureWarning, match=f"`jaxsph.{old}` is now `{now}`") as told:
+        assert getattr(js, old) == registry.found(entry) == getattr(js, old)
+    assert len(told) == 1 and old not in js.__all__
+    module, *path = now.removeprefix("jaxsph.").split(".")
+    if hasattr(js, module):  # the new word is one that users can write
+        assert registry.found(f"jaxsph:{'.'.join([module, *path])}") == registry.found(entry)
+    else:
+        assert registry.found(":".join(now.rsplit(".", 1))) == registry.found(entry)
+
+
+def test_jaxsph_has_no_other_names():
+    with pytest.raises(AttributeError, match="has no attribute 'octree_plans'"):
+        js.octree_plans
