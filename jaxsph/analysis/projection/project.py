@@ -91,17 +91,22 @@ def project(
     """
     camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
     held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
-    traced = is_traced(particles, camera, held.amounts)
-    planned, plan = plan is None, plan or _planned(particles, camera, pixel, traced)
+    traced, planned = is_traced(particles, camera, held.amounts), plan is None
+    plan = plan or _planned(particles, camera, pixel, traced)
     plan.check(particles, camera, pixel)
     if traced:
         sums, word = _sums(particles, held.amounts, camera, plan=plan)
     else:
         sums, word = (clock or Clock()).one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
         _raise_for(int(word), planned)
-    described: tuple[Any, ...] = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    described += () if traced else (("jaxsph.camera", camera.describe()),)
+    described = _described(particles, camera, pixel, traced)
     return dataclasses.replace(_image(sums, held, camera), faults=word, name=name or held.name, unit=unit, metadata=described)
+
+
+def _described(particles: Particles, camera: Camera, pixel: str, traced: bool) -> tuple[tuple[str, Any], ...]:
+    """Metadata of an image."""
+    told = ("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)
+    return told if traced else (*told, ("jaxsph.camera", camera.describe()))
 
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
