@@ -32,7 +32,7 @@ class Projection:
     Attributes:
         values: amounts a unit of area; or means, NaN where there is nothing.
         weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without.
-        pixel_area: of a pixel, length units squared; with perspective, at depth 1.
+        pixel_area: of a pixel, length units squared; with perspective, at depth 1. In float64 where float32 might not hold it.
         perspective: whether rays spread with depth.
         faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
         name: of the values.
@@ -42,7 +42,7 @@ class Projection:
 
     values: Float[Array, "height width"]
     weight: Float[Array, "height width"] | None
-    pixel_area: Float[Array, ""]
+    pixel_area: Float[Array, ""] | np.floating
     perspective: bool
     faults: Int[Array, ""] | int = 0
     name: str = "values"
@@ -57,7 +57,7 @@ class Projection:
         """(height, width)."""
         return int(self.values.shape[0]), int(self.values.shape[1])
 
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Float[Array, ""] | np.floating:
         """The amount in the image, such as its mass: the sum of values times the area of a pixel.
 
         Raises:
@@ -66,6 +66,8 @@ class Projection:
         if self.weight is not None or self.perspective:
             what = "means are not added up" if self.weight is not None else "pixels of a perspective camera have no area"
             raise ValueError(f"{what}: project amounts without `weight`, by an orthographic camera")
+        if isinstance(self.pixel_area, np.floating):  # beyond what the dtype of the values holds
+            return np.asarray(self.values, np.float64).sum() * self.pixel_area
         return self.values.sum() * self.pixel_area
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:

@@ -77,7 +77,7 @@ def plan(
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    measures = measured(see(asked.scene, camera, shape, Clock()), asked, shape)
+    measures = measured(see(asked.scene, asked.camera, shape, Clock()), asked, shape)
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     if headroom > 1 and (like is None or not like.serves(made)):
