@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
+from jaxsph.model.labelled import PLANE, dataset, places
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.trees import tree
@@ -25,7 +26,7 @@ SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels t
 EMPTY = 0  # of a picture, where there is no value
 
 
-@tree(static=("perspective", "name", "unit", "metadata"))
+@tree(static=("perspective", "name", "unit", "metadata", "length_unit"))
 class Projection:
     """Integrals along rays. Row 0 is the top, column 0 the left.
 
@@ -38,6 +39,7 @@ class Projection:
         name: of the values.
         unit: of the values; empty where it is not known.
         metadata: strings and numbers for the file header.
+        length_unit: what the unit of lengths is called; empty where it is not known.
     """
 
     values: Float[Array, "height width"]
@@ -48,6 +50,7 @@ class Projection:
     name: str = "values"
     unit: str = ""
     metadata: tuple[tuple[str, Any], ...] = ()
+    length_unit: str = ""
 
     writer: ClassVar[Callable[..., None]]
     """How projections become files: given by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
@@ -71,8 +74,24 @@ class Projection:
         return self.values.sum() * self.pixel_area
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
-        """Write to `path`: `.exr` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
+        """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
         type(self).writer(path, self, **look)
+
+    def to_xarray(self) -> Any:
+        """Values, and weights where there are any, as an `xarray.Dataset` over `row` and `column`; metadata are its attributes.
+
+        With parallel rays there are coordinates `x` and `y`, length units from the middle of the picture.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        told = {"long_name": self.name} | ({"units": self.unit} if self.unit else {})
+        layers: dict[str, Any] = {"values": (PLANE, np.asarray(self.values), told)}
+        if self.weight is not None:
+            layers["weight"] = PLANE, np.asarray(self.weight), {"long_name": "weight"}
+        side = math.sqrt(float(self.pixel_area))
+        coordinates = {} if self.perspective else places(self.shape, side, (0.0, 0.0), self.length_unit)
+        return dataset(layers, coordinates, self.metadata, pixel_area=float(self.pixel_area), faults=int(self.faults))
 
     def to_uint8(
         self, colormap: str = "viridis", norm: str | None = None, value_span: tuple[float, float] | None = None

@@ -99,7 +99,8 @@ def project(
     if not traced:
         _raise_for(int(word), planned)
     image, told = _image(sums, held, given[2], digits), _told(particles, camera, pixel, traced)
-    return dataclasses.replace(image, faults=word, name=name or held.name, unit=unit, metadata=told)
+    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
+    return dataclasses.replace(image, faults=word, metadata=told, **named)
 
 
 def _told(particles: Particles, camera: Camera, pixel: str, traced: bool) -> tuple[tuple[str, Any], ...]:
