@@ -109,7 +109,7 @@ def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "a.jpg"], "a projection must be .exr, .npy, .png"),
+        (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
         (["--support", 0], "--support must be > 0"),
         (["--axis", "w"], "invalid choice"),
         (["--axis", "x", "--eye", 0, 0, 9], "--axis and --eye exclude each other"),
