@@ -21,7 +21,7 @@ def test_type_checkers_are_told_that_there_are_types():
     assert (ROOT / "jaxsph" / "py.typed").exists()
 
 
-@pytest.mark.parametrize("extra", ["io", "color", "units", "xarray", "movie", "cluster"])
+@pytest.mark.parametrize("extra", ["io", "color", "units", "xarray", "fits", "movie", "cluster"])
 def test_an_extra_brings_only_what_the_package_imports(extra):
     code = "\n".join(file.read_text(encoding="utf-8") for file in (ROOT / "jaxsph").rglob("*.py"))
     for project in named(extra):

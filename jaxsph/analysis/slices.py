@@ -19,10 +19,12 @@ from jaxtyping import Float
 
 from jaxsph.engine.render import render
 from jaxsph.io.images import slices as files
+from jaxsph.io.images.fits import PlaneAxes
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
 from jaxsph.model.image import Image
+from jaxsph.model.labelled import PLANE, dataset, places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -43,11 +45,13 @@ class Slice:
         values: the quantity Q, float32 or float64; NaN outside of every support.
         camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
         metadata: strings and numbers for the file header.
+        length_unit: what the unit of lengths is called; empty where it is not known.
     """
 
     values: Float[np.ndarray, "height width"]
     camera: Camera
     metadata: tuple[tuple[str, Any], ...] = ()
+    length_unit: str = ""
 
     @property
     def pixel_size(self) -> float:
@@ -74,12 +78,30 @@ class Slice:
         return Image(color, transmittance, depth, nothing, nothing, True, 0, {}, self.metadata)  # type: ignore[arg-type]
 
     def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
-        """Write to `path`: `.npy` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).
+        """Write `.npy` or `.fits` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).
 
         Raises:
             ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
         """
-        files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata)
+        axes = PlaneAxes(self.pixel_size, self._middle, self.length_unit)
+        files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
+
+    def to_xarray(self) -> Any:
+        """Values as an `xarray.Dataset` over `row` and `column`, with coordinates `x` and `y`; metadata are its attributes.
+
+        These are coordinates along the directions that are to the right and upwards: of a plane along z the x and y of positions.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        where = places(self.values.shape, self.pixel_size, self._middle, self.length_unit)
+        return dataset({"values": (PLANE, self.values)}, where, self.metadata)
+
+    @property
+    def _middle(self) -> tuple[float, float]:
+        """Coordinates of the middle, along what is to the right and upwards."""
+        x, y = (np.asarray(self.camera.axes, np.float64) @ self.camera.exact_eye()).tolist()[:2]
+        return x, y
 
 
 def slice(
@@ -126,7 +148,7 @@ def slice(
     camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
     said = ("jaxsph.slice", f"point={_point(plane).tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
-    return Slice(_field(particles, camera, within, deep), camera, metadata)
+    return Slice(_field(particles, camera, within, deep), camera, metadata, unit or "")
 
 
 def _point(plane: Plane) -> np.ndarray:

@@ -88,7 +88,8 @@ def render(
         return _traced_image(scene, camera, settings, plan, devices)
     clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
     made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
-    return Work(seen, asked.camera, settings, made, asked.scene.formulas).image(clock, progress, planned=plan is None)
+    work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
+    return asked.in_given_unit(work.image(clock, progress, planned=plan is None))
 
 
 def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:

@@ -9,10 +9,12 @@ import dataclasses
 from typing import NamedTuple
 
 from jaxsph.engine.asked import require_asked
+from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
@@ -27,12 +29,16 @@ class Request(NamedTuple):
         camera: in whose view, with depths.
         settings: as they were given.
         along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
+        digits: binary digits by which lengths of scene and camera are scaled, see `lengths`.
+        given: the camera as it was given.
     """
 
     scene: Scene
     camera: Camera
     settings: Settings
     along: Settings
+    digits: int
+    given: Camera
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
@@ -42,8 +48,17 @@ class Request(NamedTuple):
             ValueError: arguments of other kinds, or a combination that nothing can render.
         """
         require_asked(scene, camera, settings)
-        camera, scene = with_depths(camera, scene), reachable(scene, settings)
-        return cls(scene, camera, settings, along_rays(scene, settings))
+        camera = with_depths(camera, scene)
+        digits = digits_to_scale(scene, camera)
+        scene = reachable(scaled(scene, digits), settings)
+        return cls(scene, scaled_camera(camera, digits), settings, along_rays(scene, settings), digits, camera)
+
+    def in_given_unit(self, image: Image) -> Image:
+        """The image of this request with depths, and a camera to tell of, in the unit of length of what was given."""
+        if self.digits == 0:
+            return image
+        metadata = tuple((name, self.given.describe() if name == "jaxsph.camera" else value) for name, value in image.metadata)
+        return dataclasses.replace(image, depth=times(image.depth, -self.digits), metadata=metadata)
 
 
 def first_samples(settings: Settings) -> int:

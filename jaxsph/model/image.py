@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.model.labelled import PLANE, dataset
 from jaxsph.model.registry import Method
 from jaxsph.numerics import faults, short
 from jaxsph.numerics.checks import is_traced
@@ -140,17 +141,11 @@ class Image:
         Raises:
             ImportError: xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError('`to_xarray` needs the library `xarray`: pip install "jaxsph[xarray]"') from error
-        plane = "row", "column"
-        layers: dict[str, Any] = {"color": ((*plane, "channel"), np.asarray(self.color), {"long_name": "premultiplied colour"})}
+        layers: dict[str, Any] = {"color": ((*PLANE, "channel"), np.asarray(self.color), {"long_name": "premultiplied colour"})}
         for name in ("transmittance", "depth", "error_bound", "evaluations"):
-            layers[name] = plane, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
-        noted = {str(name): value if isinstance(value, int | float | str) else str(value) for name, value in self.metadata}
-        attributes = {**noted, "certified": str(bool(self.certified)).lower(), "faults": int(self.faults)}
-        return xarray.Dataset(layers, coords={"channel": ["red", "green", "blue"]}, attrs=attributes)
+            layers[name] = PLANE, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
+        told = {"certified": str(bool(self.certified)).lower(), "faults": int(self.faults)}
+        return dataset(layers, {"channel": ["red", "green", "blue"]}, self.metadata, **told)
 
     def _repr_html_(self) -> str:
         """The picture, and below it a line with size, time and error."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
+from jaxsph.model.labelled import PLANE, dataset, places
 from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
@@ -26,29 +27,31 @@ SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels t
 EMPTY = 0  # of a picture, where there is no value
 
 
-@tree(static=("perspective", "name", "unit", "metadata"))
+@tree(static=("perspective", "name", "unit", "metadata", "length_unit"))
 class Projection:
     """Integrals along rays. Row 0 is the top, column 0 the left.
 
     Attributes:
         values: amounts a unit of area; or means, NaN where there is nothing.
         weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without.
-        pixel_area: of a pixel, length units squared; with perspective, at depth 1.
+        pixel_area: of a pixel, length units squared; with perspective, at depth 1. In float64 where float32 might not hold it.
         perspective: whether rays spread with depth.
         faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
         name: of the values.
         unit: of the values; empty where it is not known.
         metadata: strings and numbers for the file header.
+        length_unit: what the unit of lengths is called; empty where it is not known.
     """
 
     values: Float[Array, "height width"]
     weight: Float[Array, "height width"] | None
-    pixel_area: Float[Array, ""]
+    pixel_area: Float[Array, ""] | np.floating
     perspective: bool
     faults: Int[Array, ""] | int = 0
     name: str = "values"
     unit: str = ""
     metadata: tuple[tuple[str, Any], ...] = ()
+    length_unit: str = ""
 
     writer = Method()
     """How projections become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
@@ -58,7 +61,7 @@ class Projection:
         """(height, width)."""
         return int(self.values.shape[0]), int(self.values.shape[1])
 
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Float[Array, ""] | np.floating:
         """The amount in the image, such as its mass: the sum of values times the area of a pixel.
 
         Raises:
@@ -67,12 +70,30 @@ class Projection:
         if self.weight is not None or self.perspective:
             what = "means are not added up" if self.weight is not None else "pixels of a perspective camera have no area"
             raise ValueError(f"{what}: project amounts without `weight`, by an orthographic camera")
+        if isinstance(self.pixel_area, np.floating):  # beyond what the dtype of the values holds
+            return np.asarray(self.values, np.float64).sum() * self.pixel_area
         return self.values.sum() * self.pixel_area
 
     @renamed(value_span="range")
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
-        """Write to `path`: `.exr` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
+        """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
         type(self).writer(path, self, **look)
+
+    def to_xarray(self) -> Any:
+        """Values, and weights where there are any, as an `xarray.Dataset` over `row` and `column`; metadata are its attributes.
+
+        With parallel rays there are coordinates `x` and `y`, length units from the middle of the picture.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        told = {"long_name": self.name} | ({"units": self.unit} if self.unit else {})
+        layers: dict[str, Any] = {"values": (PLANE, np.asarray(self.values), told)}
+        if self.weight is not None:
+            layers["weight"] = PLANE, np.asarray(self.weight), {"long_name": "weight"}
+        side = math.sqrt(float(self.pixel_area))
+        coordinates = {} if self.perspective else places(self.shape, side, (0.0, 0.0), self.length_unit)
+        return dataset(layers, coordinates, self.metadata, pixel_area=float(self.pixel_area), faults=int(self.faults))
 
     @renamed(value_span="range")
     def to_uint8(

@@ -257,15 +257,15 @@ class _Renderer:
         particles = self.on_disk.particles(columns, capacity)
         asked, clock = Request.of(Scene(particles=particles, transfer=self.transfer), self.camera, self.settings), Clock()
         shape = self._shape_of(shape_of(asked), self.camera.height, capacity)
-        seen = _within(see(asked.scene, self.camera, shape, clock), pane)
+        seen = _within(see(asked.scene, asked.camera, shape, clock), pane)
         seen, measures = sorted_and_measured(seen, asked, shape)
         rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
         plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows)
         clock.mark("plan")
         if plan is None:
             return None
-        image = Work(seen, self.camera, self.settings, plan, asked.scene.formulas, pane.top).image(clock)
-        return of_columns(image, pane.left, pane.right)
+        image = Work(seen, asked.camera, self.settings, plan, asked.scene.formulas, pane.top).image(clock)
+        return of_columns(asked.in_given_unit(image), pane.left, pane.right)
 
     def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:
         """The plan there is, if it serves; else with room for more like this if memory allows; None where it allows none."""
@@ -309,7 +309,7 @@ class _Renderer:
 
     @functools.cached_property
     def _sample(self) -> Seen:
-        return see(self._asked.scene, self.camera, self._shape, Clock())
+        return see(self._asked.scene, self._asked.camera, self._shape, Clock())
 
     @functools.cached_property
     def _choices(self) -> Choices:

@@ -67,7 +67,7 @@ def render_tile(
     mark = picture_of(scene, camera, settings)
     clock, asked = Clock(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)
-    seen, measures = sorted_and_measured(see(scene, camera, shape, clock), asked, shape)
+    seen, measures = sorted_and_measured(see(scene, asked.camera, shape, clock), asked, shape)
     rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
@@ -76,7 +76,7 @@ def render_tile(
     if plan is None:  # no room for more than this part needs
         plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
     clock.mark("plan")
-    image = Work(seen, camera, settings, plan, scene.formulas, first).image(clock, progress)
+    image = asked.in_given_unit(Work(seen, asked.camera, settings, plan, scene.formulas, first).image(clock, progress))
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

@@ -14,6 +14,7 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.lengths import scaled, scaled_camera
 from jaxsph.model.particles import kernels
 from jaxsph.numerics import faults
 
@@ -379,3 +380,41 @@ def test_bad_particles_and_missing_plans_are_refused():
         js.project(particles, camera_of(width=21), plan=plan_projection(particles, camera))
     with pytest.raises(ValueError, match="memory_limit"):
         plan_projection(particles, camera, memory_limit=100)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_a_projection_in_any_unit_of_length_has_the_same_digits(projection):
+    rng = np.random.default_rng(5)
+    mass = rng.uniform(1, 2, 24)
+    particles = js.Particles.from_arrays(rng.uniform(-1, 1, (24, 3)), rng.uniform(0.2, 0.5, 24), mass, kernel="cubic_spline")
+    camera = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=32, height=24, near=1, far=5)
+    if projection == "orthographic":
+        camera = js.Camera.orthographic((0, 0, -3), (0, 0, 0), view_height=3.0, width=32, height=24, near=1, far=5)
+    for weight in (None, mass):
+        image = js.project(particles, camera, of=mass, weight=weight)
+        for digits in (-80, 45, 80):
+            unit = 2.0 ** (2 * digits)  # of the amounts, such that those over an area are numbers of float32
+            moved, seen = scaled(particles, digits), scaled_camera(camera, digits)
+            other = js.project(
+                moved, seen, of=mass * (unit if weight is None else 1), weight=None if weight is None else mass * unit
+            )
+            np.testing.assert_array_equal(other.values, image.values)
+            assert dict(other.metadata)["jaxsph.camera"] == seen.describe()
+            if projection == "orthographic":
+                assert float(other.pixel_area) == float(image.pixel_area) * unit
+                if weight is None:
+                    assert float(other.total()) == pytest.approx(float(image.total()) * unit, rel=1e-6)
+                else:
+                    np.testing.assert_array_equal(other.weight, image.weight)
+
+
+def test_amounts_over_an_area_that_float32_cannot_hold_are_refused(tmp_path):
+    particles = js.Particles.from_arrays([[0, 0, 0.0]], 1e24, 1.0, kernel="cubic_spline")
+    camera = js.Camera.orthographic((0, 0, -3e24), (0, 0, 0), view_height=3e24, width=32, height=24, near=1e24, far=5e24)
+    for more in ({"of": np.ones(1)}, {"weight": np.ones(1)}):
+        with pytest.raises(ValueError, match="underflow float32: give the amounts in another unit"):
+            js.project(particles, camera, **more)
+    image = js.project(particles, camera, of=np.full(1, 1e43))
+    image.save(tmp_path / "a.exr")
+    found = js.io.read_projection(tmp_path / "a.exr")
+    assert float(found.pixel_area) == float(image.pixel_area) > 1e45 and float(found.total()) == pytest.approx(1e43, rel=1e-4)

@@ -109,7 +109,7 @@ def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "a.jpg"], "a projection must be .exr, .npy, .png"),
+        (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
         (["--support", 0], "--support must be > 0"),
         (["--axis", "w"], "--view must be one of x, y, z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),

@@ -17,6 +17,7 @@ from jaxsph.analysis.projection.column_sums import BLOCK, subrays_of
 from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import MAX_CAPACITY
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
@@ -129,7 +130,9 @@ def plan_projection(
     """
     if is_traced(particles, camera):
         raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
-    made = _measured(particles, with_depths(camera, particles), pixel, memory_limit or memory_for(particles.support))
+    camera = with_depths(camera, particles)
+    digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
+    made = _measured(scaled(particles, digits), scaled_camera(camera, digits), pixel, memory)
     return made if like is None else like.grown(made)
 
 

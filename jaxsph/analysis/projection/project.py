@@ -26,6 +26,7 @@ from jaxsph.analysis.projection.columns import depth_share
 from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
 from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, beside, plan_projection
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
+from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -83,7 +84,7 @@ def project(
         and by which rule is held fixed; there are no second derivatives.
 
     Raises:
-        ValueError: bad data, a column or rule that does not exist, depths that do not ascend, a plan for other shapes.
+        ValueError: bad data, no such column or rule, depths that do not ascend, a plan for other shapes, values beyond the dtype.
         CapacityError: eager, when a given `plan` is too small.
 
     References:
@@ -91,17 +92,23 @@ def project(
     """
     camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
     held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
-    traced = is_traced(particles, camera, held.amounts)
-    planned, plan = plan is None, plan or _planned(particles, camera, pixel, traced)
+    traced, planned = is_traced(particles, camera, held.amounts), plan is None
+    digits = 0 if traced else digits_to_scale(particles, camera)
+    given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
+    plan = plan or _planned(given[0], given[2], pixel, traced)
     plan.check(particles, camera, pixel)
-    if traced:
-        sums, word = _sums(particles, held.amounts, camera, plan=plan)
-    else:
-        sums, word = (clock or Clock()).one("cast", _sums_at_once, (particles, held.amounts, camera), plan=plan)
+    sums, word = _sums(*given, plan=plan) if traced else (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
+    if not traced:
         _raise_for(int(word), planned)
-    described: tuple[Any, ...] = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    described += () if traced else (("jaxsph.camera", camera.describe()),)
-    return dataclasses.replace(_image(sums, held, camera), faults=word, name=name or held.name, unit=unit, metadata=described)
+    image, told = _image(sums, held, given[2], digits), _described(particles, camera, pixel, traced)
+    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
+    return dataclasses.replace(image, faults=word, metadata=told, **named)
+
+
+def _described(particles: Particles, camera: Camera, pixel: str, traced: bool) -> tuple[tuple[str, Any], ...]:
+    """Metadata of an image."""
+    told = ("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)
+    return told if traced else (*told, ("jaxsph.camera", camera.describe()))
 
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
@@ -128,23 +135,35 @@ def _raise_for(word: int, planned: bool) -> None:
         raise ValueError(f"these particles cannot be projected: {faults.describe(word)}")
 
 
-def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera) -> Projection:
-    """Amounts, or means of values."""
-    area = (2 * camera.half_height / camera.height) ** 2
+def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera, digits: int) -> Projection:
+    """Amounts, or means of values, where lengths of the camera are in a unit that is `2 ** -digits` of what is meant."""
+    area: Any = (2 * camera.half_height / camera.height) ** 2
+    if digits and not camera.is_perspective:
+        area = np.float64(area) * 4.0**-digits  # float32 may not hold it
     values, weight = sums[..., 0], None
     if held.is_mean:
         weight = sums[..., 1]
         there = weight > 0
         values = jnp.where(there, values / jnp.where(there, weight, 1), jnp.nan)
-        weight = _times(weight, held.exponents[1])
-    first = held.exponents[0] - (held.exponents[1] if held.is_mean else 0)
-    return Projection(_times(values, first), weight, area, camera.is_perspective)
+        weight = times(weight, held.exponents[1] + 2 * digits)
+    first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
+    image = Projection(times(values, first), weight, area, camera.is_perspective)
+    if digits:
+        _require_held(image, sums)
+    return image
 
 
-def _times(values: Array, exponent: int) -> Array:
-    """Values times a power of two that may be beyond what their dtype holds."""
-    half = exponent // 2
-    return values * 2.0**half * 2.0 ** (exponent - half)
+def _require_held(image: Projection, sums: Array) -> None:
+    """Raise where amounts over a length squared are no numbers of the dtype, though there are some."""
+    amounts = {"values": image.values} if image.weight is None else {"weight": image.weight}
+    for name, found in amounts.items():
+        largest = float(jnp.max(jnp.abs(found)))
+        if bool((sums[..., -1] != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
+            what = "overflow" if largest else "underflow"
+            raise ValueError(
+                f"`{name}` of the projection, amounts over a length squared, {what} {found.dtype}: give the amounts in "
+                "another unit, or positions, supports and camera in a larger or smaller one"
+            )
 
 
 class _Rule(NamedTuple):

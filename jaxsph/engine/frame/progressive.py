@@ -103,6 +103,7 @@ class Progressive:
     def _begun(self) -> _Stage:
         """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
         self._clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
+        self._asked = asked
         plan, self._seen = PLANS.for_frame(asked, self._clock)
 
         def frame_by(run: Executor) -> Frame:
@@ -152,7 +153,9 @@ class Progressive:
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        return image_of(drawn, self._frame.camera, self._settings, self._frame.plan, self._clock, **told)
+        return self._asked.in_given_unit(
+            image_of(drawn, self._frame.camera, self._settings, self._frame.plan, self._clock, **told)
+        )
 
 
 class _Stage(NamedTuple):

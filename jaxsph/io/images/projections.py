@@ -4,6 +4,7 @@
 |---|---|
 | `.exr` | values as a float32 channel called as they are, such as `mass` or `column.density`; the channel `weight` of means |
 | `.npy` | values alone, in their own dtype |
+| `.fits` | values in their own dtype, and weights as an extension, with coordinates in lengths; see `fits` |
 | `.png` | 8 bit colours of a colour map |
 
 The EXR header holds `jaxsph.of`, `jaxsph.unit`, `jaxsph.pixel_area` (length units squared; at depth 1 with perspective) and the
@@ -12,6 +13,7 @@ metadata of the projection. Row 0 is the top.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -20,13 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.images import fits
 from jaxsph.io.images.exr import read_layers, write_layers
 from jaxsph.io.images.png import write_pixels
 from jaxsph.io.replace import written_whole
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.names import renamed
 
-SUFFIXES = (".exr", ".npy", ".png")
+SUFFIXES = (".exr", ".npy", ".fits", ".png")
 WEIGHT = "weight"
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
@@ -37,7 +40,7 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
 
     Raises:
         ValueError: another suffix, a place that cannot be written to, values that float32 cannot hold (EXR).
-        ImportError: OpenEXR is not installed.
+        ImportError: OpenEXR is not installed, or astropy, for `.fits`.
     """
     file = Path(path)
     if file.suffix.lower() not in SUFFIXES:
@@ -49,6 +52,8 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
     elif file.suffix.lower() == ".npy":
         with written_whole(file) as temporary, temporary.open("wb") as stream:
             np.save(stream, np.asarray(projection.values), allow_pickle=False)
+    elif file.suffix.lower() == ".fits":
+        _write_fits(file, projection)
     else:
         log, (low, high) = projection.span(look.get("norm"), look.get("range"))
         shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
@@ -75,7 +80,7 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
         return Projection(
             jnp.asarray(layers[_channel(header[NAME])]),
             None if weight is None else jnp.asarray(weight),
-            jnp.float32(header[AREA]),
+            np.float64(header[AREA]) if isinstance(header[AREA], str) else jnp.float32(header[AREA]),
             header[PERSPECTIVE] == "true",
             name=header[NAME],
             unit=header[UNIT],
@@ -91,9 +96,24 @@ def _write_exr(path: Path, projection: Projection) -> None:
         with np.errstate(over="ignore"):
             if np.isinf(np.asarray(layer, np.float32)).any():
                 raise ValueError(f"`{name}` has values that float32 cannot hold, as EXR needs it; rescale them, or write .npy")
-    own = {NAME: projection.name, UNIT: projection.unit, AREA: float(projection.pixel_area)}
+    own = {NAME: projection.name, UNIT: projection.unit, AREA: _area(float(projection.pixel_area))}
     own[PERSPECTIVE] = str(bool(projection.perspective)).lower()
     write_layers(path, layers, dict(projection.metadata) | own)
+
+
+def _write_fits(path: Path, projection: Projection) -> None:
+    layers = {projection.name: np.asarray(projection.values)}
+    if projection.weight is not None:
+        layers[WEIGHT] = np.asarray(projection.weight)
+    side = math.sqrt(float(projection.pixel_area))
+    axes = fits.PlaneAxes(side, unit=projection.length_unit, perspective=bool(projection.perspective))
+    fits.write(path, layers, axes, projection.unit, projection.metadata)
+
+
+def _area(area: float) -> float | str:
+    """As numbers of EXR hold it, in float32, or else as text."""
+    limits = np.finfo(np.float32)
+    return area if float(limits.tiny) <= area <= float(limits.max) else repr(area)
 
 
 def _channel(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Slices as files: values as `.npy`, values with colours as OpenEXR, colours alone as `.png`.
+"""Slices as files: values as `.npy` or FITS, values with colours as OpenEXR, colours alone as `.png`.
 
 | channel of `.exr` | meaning |
 |---|---|
@@ -13,16 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.images import exr, png
+from jaxsph.io.images import exr, fits, png
+from jaxsph.io.images.fits import PlaneAxes
 from jaxsph.io.images.scene_linear import header_of, light_of
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
 
-SUFFIXES = (".npy", ".exr", ".png")
+SUFFIXES = (".npy", ".fits", ".exr", ".png")
 
 
-def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...]) -> None:
-    """Write a slice, whole or not at all.
+def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...], axes: PlaneAxes) -> None:
+    """Write a slice, whole or not at all; `axes` say where its pixels are.
 
     Raises:
         ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
@@ -34,6 +35,8 @@ def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple
     if suffix == ".npy":
         with written_whole(path) as temporary, open(temporary, "wb") as file:
             np.save(file, values)
+    elif suffix == ".fits":
+        fits.write(path, {"value": values}, axes, metadata=metadata)
     elif suffix == ".exr":
         layers, header = {"value": values}, dict(metadata)
         if picture is not None:
@@ -42,6 +45,6 @@ def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple
             header |= header_of(displayed=False)
         exr.write_layers(path, layers, header)
     elif picture is None:
-        raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy or .exr")
+        raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy, .fits or .exr")
     else:
         png.write(path, picture)

@@ -24,7 +24,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Sphere
-from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug
+from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 
 OBLIQUE = (-0.45, -0.35, -1.0)
@@ -107,6 +107,16 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
         said.append(("clip", f"what is farther than {reach:.4g} from the middle is left out; --clip none shows it"))
     camera = direction.camera(center, height, scene, reach)
     return camera, clip, said
+
+
+def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **view: Any) -> Camera:
+    """See `Camera.fitted`: the camera of `camera_and_clip`, which leaves nothing of the scene out."""
+    known = {"center", "view", "up", "fov_degrees", "frame_all"}
+    if not known >= set(view):
+        raise ValueError(
+            f"`Camera.fitted` has no option {min(set(view) - known)!r}; there are across, {', '.join(sorted(known))}"
+        )
+    return camera_and_clip(scene, View(size=size, width=across, clips=(), **view))[0]
 
 
 def direction_of(view: View, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
@@ -205,7 +215,7 @@ def _from_eye(scene: Scene, view: View) -> Camera:
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
     up = UP if view.up is None else view.up
     made = Camera.look_at(view.eye, target, up, fov, width, height, near=1e-3, far=1.0)
-    return snug(made, scene)
+    return snug_in_picture(made, scene)
 
 
 def _all_of(scene: Scene, direction: Direction, center: np.ndarray | None) -> Camera:

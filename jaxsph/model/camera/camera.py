@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
+from jaxsph.model.registry import Method
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
@@ -86,6 +87,8 @@ class Camera:
     projection: str = "perspective"
     eye_rest: Float[Array, "3"] | None = None
     stride: int = 1
+
+    fitter = Method()
 
     def __repr__(self) -> str:
         half = short.known(self.half_height)
@@ -228,6 +231,22 @@ class Camera:
         """
         view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range)
         return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
+
+    @classmethod
+    def fitted(cls, scene: Any, *, width: int = 512, height: int = 512, **view: Any) -> Camera:
+        """A camera that shows a scene, by default the central 99 % of what is lit in most of the picture (host side).
+
+        Args:
+            scene: with its looks.
+            width, height: size in pixels.
+            view: as for `jaxsph.io.opening.options.View`: `center=` a place or `"densest"`; `across=` the width of the picture, a
+                length; `view=` `"x"`, `"y"`, `"z"` or `"iso"`; `up=`, `fov_degrees=`, `frame_all=`.
+
+        Raises:
+            ValueError: an option that there is not, or that does not suit the scene.
+        """
+        found: Camera = cls.fitter(scene, (width, height), **view)
+        return found
 
     @property
     def is_perspective(self) -> bool:

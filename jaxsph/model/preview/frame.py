@@ -77,7 +77,7 @@ class Direction:
             made = Camera.orthographic(eye, middle, up, height, width_pixels, height_pixels, near=near, far=far)
         else:
             made = Camera.look_at(eye, middle, up, self.fov_degrees, width_pixels, height_pixels, near=near, far=far)
-        return snug(made, scene, (distance - reach, distance + reach))
+        return snug_in_picture(made, scene, (distance - reach, distance + reach))
 
 
 def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None) -> Camera:
@@ -132,7 +132,7 @@ def num_outside(scene: Scene, camera: Camera) -> int:
     return int((np.abs(view[:, :2]) > reach).any(1).sum())
 
 
-def snug(camera: Camera, scene: Scene, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
+def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
     """`camera` with near and far moved to what is in its picture, between two depths; unchanged where nothing is (host side)."""
     half = float(camera.half_height)
     sides = np.array([half * camera.width / camera.height, half])

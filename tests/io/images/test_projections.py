@@ -73,7 +73,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, suffix, monkeypatch):
 
 
 def test_what_cannot_be_written_is_said(tmp_path, x64):
-    with pytest.raises(ValueError, match=r"written as \.exr, \.npy, \.png, not as '\.jpg'"):
+    with pytest.raises(ValueError, match=r"written as \.exr, \.npy, \.fits, \.png, not as '\.jpg'"):
         made().save(tmp_path / "a.jpg")
     with pytest.raises(ValueError, match="`colormap` is for pictures"):
         made().save(tmp_path / "a.exr", colormap="heat")

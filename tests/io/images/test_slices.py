@@ -59,6 +59,8 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, suffix, monkeypatch):
     def fails(*given, **more):
         raise OSError(28, "No space left on device")
 
+    if suffix == ".fits":
+        monkeypatch.setattr(pytest.importorskip("astropy.io.fits").HDUList, "writeto", lambda *given: fails())
     monkeypatch.setattr(np, "save", fails)
     monkeypatch.setattr(Pillow.Image, "save", fails)
     monkeypatch.setattr(OpenEXR.File, "write", lambda *given: fails())
@@ -70,7 +72,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, suffix, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "transfer", "said"),
     [
-        ("a.jpg", LOOK, r"a\.jpg: slices are written as \.npy, \.exr, \.png, not as '\.jpg'"),
+        ("a.jpg", LOOK, r"a\.jpg: slices are written as \.npy, \.fits, \.exr, \.png, not as '\.jpg'"),
         ("a.png", None, "a picture needs colours"),
         ("none/a.npy", None, "the folder .*none does not exist"),
         ("none/a.exr", None, "the folder .*none does not exist"),

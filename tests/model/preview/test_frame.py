@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.model.preview.exposure import exposure
-from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug
+from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
 from jaxsph.model.preview.glimpse import glimpse
 
 OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
@@ -79,9 +79,9 @@ def test_few_particles_and_none_have_a_camera(count):
 def test_depths_are_those_of_what_is_in_the_picture():
     position = np.array([[0.0, 0, 0], [0, 0, 4], [90, 0, 30]])
     camera = js.Camera.look_at((0, 0, -2), (0, 0, 0), fov_degrees=30, near=1e-3, far=1.0, width=8, height=8)
-    made = snug(camera, scene_of(position, 0.5))
+    made = snug_in_picture(camera, scene_of(position, 0.5))
     assert float(made.near) == pytest.approx(1.5, rel=3e-3) and float(made.far) == pytest.approx(6.5, rel=3e-3)
-    near, far = (float(end) for end in (snug(camera, scene_of(position, 0.5), (1.8, 3.0)).near, made.far))
+    near, far = (float(end) for end in (snug_in_picture(camera, scene_of(position, 0.5), (1.8, 3.0)).near, made.far))
     assert near >= 1.79 and far <= 6.6
 
 

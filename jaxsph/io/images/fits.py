@@ -1,0 +1,98 @@
+"""FITS files of values on a plane, with a linear coordinate system in lengths, by astropy.
+
+Flow: Projection, Slice -> [fits] -> file.
+
+| card | holds |
+|---|---|
+| `CTYPE1`, `CTYPE2` | `X` to the right, `Y` upwards: linear, in lengths; with perspective `X/Z` and `Y/Z`, which are tangents |
+| `CRVAL`, `CRPIX`, `CDELT` | coordinates of the middle of the picture, and the side of a pixel |
+| `CUNIT`, `BUNIT` | units of lengths and of values, where they are known; as the standard spells them, if it knows them |
+| `BTYPE` | what the values are |
+| `COMMENT` | how they were made |
+
+The first row of a FITS file is the lowest, so rows are turned round. The values come first, others are extensions.
+Source: Pence et al. 2010, A&A 524, A42; Greisen & Calabretta 2002, A&A 395, 1061.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsph.io.libraries import require
+from jaxsph.io.replace import written_whole
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneAxes:
+    """Where the pixels of a picture are.
+
+    Attributes:
+        pixel: side of a pixel, length units; with perspective at depth 1.
+        middle: coordinates of the middle of the picture, to the right and upwards, length units.
+        unit: of lengths; empty where it is not known.
+        perspective: whether rays spread with depth.
+    """
+
+    pixel: float
+    middle: tuple[float, float] = (0.0, 0.0)
+    unit: str = ""
+    perspective: bool = False
+
+
+def write(
+    path: Path, layers: dict[str, np.ndarray], axes: PlaneAxes, unit: str = "", metadata: Iterable[tuple[str, Any]] = ()
+) -> None:
+    """Write layers (height, width) by name, the values first, whole or not at all; `unit` is that of the values.
+
+    Raises:
+        ImportError: astropy is not installed.
+    """
+    fits = require("astropy.io.fits", "FITS files", "fits")
+    parts = []
+    for number, (name, values) in enumerate(layers.items()):
+        kind = fits.ImageHDU if number else fits.PrimaryHDU
+        part = kind(np.ascontiguousarray(np.asarray(values)[::-1]))
+        part.header.update(_cards(part.header, name, np.shape(values), axes))
+        if number:
+            part.header["EXTNAME"] = _letters(name).upper()
+        elif unit:
+            part.header["BUNIT"] = _spelled(unit) or _letters(unit)
+        parts.append(part)
+    for name, value in metadata:
+        parts[0].header.add_comment(_letters(f"{name} = {value}"))
+    with written_whole(path) as temporary, temporary.open("wb") as file:
+        fits.HDUList(parts).writeto(file)
+
+
+def _cards(header: Any, name: str, shape: tuple[int, ...], axes: PlaneAxes) -> dict[str, Any]:
+    """The coordinate system of a picture, and what its values are."""
+    cards: dict[str, Any] = {"BTYPE": _letters(name), "WCSAXES": 2}
+    for nth, (label, size, place) in enumerate(zip("XY", (shape[1], shape[0]), axes.middle, strict=True), 1):
+        cards |= {f"CTYPE{nth}": f"{label}/Z" if axes.perspective else label, f"CRPIX{nth}": (size + 1) / 2}
+        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else place, f"CDELT{nth}": axes.pixel}
+        spelled = None if axes.perspective else _spelled(axes.unit)
+        if spelled:
+            cards[f"CUNIT{nth}"] = spelled
+    return cards
+
+
+def _spelled(unit: str) -> str | None:
+    """A unit as FITS spells it; None where it has no word for it."""
+    if not unit:
+        return None
+    units = require("astropy.units", "FITS files", "fits")
+    try:
+        spelled: str = units.Unit(unit).to_string("fits")
+    except (ValueError, TypeError):
+        return None
+    return spelled
+
+
+def _letters(text: str) -> str:
+    """What of a text FITS can hold: the letters of ASCII that are printed, others as question marks."""
+    return "".join(c if " " <= c <= "~" else "?" for c in text)

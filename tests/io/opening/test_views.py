@@ -1,0 +1,51 @@
+"""Cameras of scenes that were made by hand, and what cannot be seen."""
+
+import numpy as np
+import pytest
+
+import jaxsph as js
+
+
+def scene():
+    position = np.random.default_rng(0).random((500, 3))
+    look = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [3.0, 3.0])
+    return js.Scene(particles=js.Particles.from_arrays(position, 0.2, position[:, 0], 1.0), transfer=look)
+
+
+def test_a_scene_is_framed_by_what_is_lit():
+    camera = js.Camera.fitted(scene(), width=32, height=24)
+    assert (camera.width, camera.height) == (32, 24)
+    alpha = np.asarray(js.reference.render(scene(), camera, js.Settings(samples=16)).alpha)
+    rows, columns = np.nonzero(alpha > 0.1)
+    assert max(np.ptp(rows) / 24, np.ptp(columns) / 32) > 0.7 and not alpha[0].any()
+
+
+@pytest.mark.parametrize("view", ["x", "y", "z", "iso"])
+def test_a_center_and_the_width_across_are_kept(view):
+    camera = js.Camera.fitted(scene(), view=view, center=(0.5, 0.5, 0.5), across=0.5, width=32, height=32)
+    away = (np.full(3, 0.5) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    assert np.abs(away[:2]).max() < 1e-5
+    assert 2 * float(camera.half_height) * (away[2] if camera.is_perspective else 1) == pytest.approx(0.5, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("view", "told"),
+    [
+        ({"center": "mass"}, "needs the masses"),
+        ({"view": "face-on"}, "needs velocities"),
+        ({"width_across": 3}, "no option 'width_across'"),
+        ({"fov_degrees": 190}, "must lie in"),
+        ({"up": (0, 0, 0)}, "`up` ="),
+        ({"across": -1}, "`width` must be > 0"),
+    ],
+)
+def test_what_a_scene_cannot_give_is_refused_by_name(view, told):
+    with pytest.raises(ValueError, match=told):
+        js.Camera.fitted(scene(), **view)
+
+
+def test_points_alone_and_nothing_have_a_camera():
+    points = js.Points.from_arrays(np.random.default_rng(0).random((9, 3)), 0.1, [[1, 1, 1]] * 9, 1.0)
+    for shown in (js.Scene(points=points), js.Scene()):
+        camera = js.Camera.fitted(shown, width=8, height=8)
+        assert 0 < float(camera.near) < float(camera.far)
