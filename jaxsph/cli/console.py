@@ -155,7 +155,7 @@ def attributes(table: ParticleTable) -> None:
 def camera_line(camera: Camera, options: Any = None) -> str:
     """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
     if not camera.is_perspective:
-        return camera.describe()
+        return _parallel(camera, options)
     eye, axes = camera.exact_eye(), np.asarray(camera.axes, np.float64)
     fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
     near, far = float(camera.near), float(camera.far)
@@ -167,6 +167,17 @@ def camera_line(camera: Camera, options: Any = None) -> str:
     ]
     place = " --target ".join(texts)
     return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
+
+
+def _parallel(camera: Camera, options: Any) -> str:
+    """The options that give a camera with parallel rays again, and its depths."""
+    near, far, tall = float(camera.near), float(camera.far), 2 * float(camera.half_height)
+    given = getattr(options, "center", None)
+    middle = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (near + far) / 2
+    center = given if isinstance(given, tuple) else middle
+    place = ",".join(f"{value:.6g}" for value in center)
+    view = getattr(options, "view", None) or "z"
+    return f"--view {view} --center {place} --width {tall * camera.width / camera.height:.6g}, depths {near:.5g} to {far:.5g}"
 
 
 def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:

@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import functools
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -33,6 +34,7 @@ AGAIN_SECONDS = 0.02
 HELP, SHORT_HELP, VERSION = "--help", "-h", "--version"
 ALOUD = ("info", "demo", "doctor", "cache")
 """Commands whose result is what they say."""
+WIDTH, MIN_WIDTH = 110, 95
 FIRST_STEPS = "Examples:\n  jaxsph render snap_042.hdf5\n  jaxsph info snap_042.hdf5\n"
 
 
@@ -173,14 +175,21 @@ def _helped(command: str, words: list[str]) -> bool:
         print(f"{FIRST_STEPS}\n`jaxsph --help` lists all commands, `jaxsph COMMAND -h` has more examples.")
     elif command in (HELP, SHORT_HELP):
         print(FIRST_STEPS)
-        app().help_print([])
+        app().help_print([], console=_wide())
     elif command in COMMANDS and HELP in words:
-        app().help_print([command])
+        app().help_print([command], console=_wide())
     elif command in COMMANDS and SHORT_HELP in words:
         _print_short(command)
     else:
         return False
     return True
+
+
+def _wide() -> Any:
+    """Where help goes: lines as long as the terminal's, at least such that examples are not broken."""
+    from rich.console import Console
+
+    return Console(width=max(shutil.get_terminal_size((WIDTH, 24)).columns, MIN_WIDTH), highlight=False)
 
 
 def _print_short(command: str) -> None:

@@ -148,8 +148,8 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     return opened, [(options.source, loaded.shown)]
 
 
-def loaded_of(options: Any) -> Loaded:
-    """What the file gives to a picture, and what was chosen of it, said."""
+def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
+    """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
     if io.is_volume(options.source):
         refuse(options, options.of_particles, "is for particles, and this is a volume")
         volume, name = cli_parts.volume_of_file(options.source, options.color_by)
@@ -157,6 +157,9 @@ def loaded_of(options: Any) -> Loaded:
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, options)
+    if not opacity:
+        shown: Any = loaded.shown
+        loaded = dataclasses.replace(loaded, shown=dataclasses.replace(shown, extinction_quantity=None), opacity_by=None)
     table, taken = loaded.table, loaded.report
     assert table is not None and taken is not None
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")

@@ -157,8 +157,8 @@ class Projection:
         made = Figure(figsize=(6.4, 5.2), layout="constrained")
         axes = made.subplots()
         colors = colors_of(colormap, COLORS)
-        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors)), COLORS)
-        map_of.set_bad("black" if self.weight is not None else tuple(colors[0]))
+        unknown = "black" if self.weight is not None else tuple(colors[0])
+        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors)), COLORS).with_extremes(bad=unknown)
         height, width = self.shape
         side = math.sqrt(float(self.pixel_area))
         reach = (-width / 2 * side, width / 2 * side, -height / 2 * side, height / 2 * side)

@@ -106,9 +106,26 @@ def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys
     assert np.asarray(io.read_image("out.png").color).max() > 0.3
 
 
+def test_a_picture_has_a_colour_bar_where_that_is_asked_for(file, capsys):
+    pytest.importorskip("matplotlib")
+    code, _, err = run(capsys, file, *TINY, "-o", "out.png", "--annotate")
+    assert (code, err) == (0, []) and np.asarray(io.read_image("out.png").color).shape[0] > 100
+
+
+def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, capsys):
+    found, _ = values(capsys, file, "--center", "0.4,0.5,0.5", "--width", 0.6, "--pixel", "ray")
+    particles, given, _ = gas()
+    camera = js.Camera.orthographic((0.4, 0.5, 4), (0.4, 0.5, 0.5), view_height=0.4, width=18, height=12, near=2, far=6)
+    truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
+    np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
+    code, _, err = run(capsys, file, *TINY, "--center", "9,9,9")
+    assert code == 2 and len(err) == 1 and "--center 9,9,9 is outside of everything: that lies from" in err[0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--annotate"], "--annotate is for a picture"),
         (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
         (["--support", 0], "--support must be > 0"),
         (["--axis", "w"], "--view must be one of x, y, z, got 'w'"),

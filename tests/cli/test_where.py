@@ -199,7 +199,7 @@ def test_slices_that_cannot_be_are_told_in_one_line(file, capsys, arguments, cod
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--where", "temperature > 10 and pressure > 2"], "80 left out by pressure > 2"),
+        (["--where", "temperature > 10 and pressure > 2"], "80 left out by pressure > 2; --where must leave some"),
         (["--box-size", "0.2,1,1"], "no side shorter than the largest support, but 0.2 < 0.25"),
     ],
 )
@@ -215,6 +215,15 @@ def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monk
     for source in ("scene:radial", "a.npy"):
         code, _, err = run(capsys, "render", source, *TINY, *option)
         assert code == 2 and len(err) == 1 and option[0] in err[0]
+
+
+def test_a_slice_of_particles_with_a_density_has_colours_of_one_quantity(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    generator = np.random.default_rng(0)
+    density = generator.lognormal(0, 3, 80).astype(np.float32)
+    np.savez("a.npz", position=generator.uniform(0, 1, (80, 3)), density=density, heat=density**0.5, support=np.full(80, 0.25))
+    code, out, err = run(capsys, "slice", "a.npz", "--color-by", "heat", *TINY[:2], "-o", "a.png")
+    assert (code, err) == (0, []) and "heat" in out and "opacity" not in out
 
 
 def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, capsys):

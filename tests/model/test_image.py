@@ -23,6 +23,54 @@ def test_uint8_clips_and_rounds_to_nearest():
     assert image(color).to_uint8().tolist() == [[[0, 128, 255], [0, 255, 0], [0, 1, 255]]]
 
 
+def seen(color, transmittance):
+    layer = np.full((1, 2), transmittance)
+    return js.Image(np.full((1, 2, 3), color), layer, layer, layer, layer, True, 0, {})
+
+
+@pytest.mark.parametrize("background", ["white", "#fff", "#FFFFFF", (1, 1, 1), "1,1,1", np.ones(3)], ids=str)
+def test_over_a_background_its_light_comes_through(background):
+    np.testing.assert_allclose(seen(0.25, 0.5).over(background), 0.75)
+    assert seen(0.25, 0.5).over(background).shape == (1, 2, 3)
+
+
+def test_over_black_it_is_the_picture_itself_and_opaque_it_hides_what_is_behind():
+    np.testing.assert_array_equal(seen(0.25, 0.5).over("black"), seen(0.25, 0.5).color)
+    np.testing.assert_array_equal(seen(0.25, 0.0).over("red"), seen(0.25, 0.0).color)
+    np.testing.assert_allclose(seen(0.0, 1.0).over("#ff8000")[0, 0], (1, 128 / 255, 0))
+
+
+@pytest.mark.parametrize("color", ["whiet", "#12", "1,2,3", (0.5, 0.5), "", None, (0, 0, 2)], ids=str)
+def test_what_is_no_colour_is_refused_by_name(color):
+    with pytest.raises(ValueError, match="`color` must be a name such as white, #rrggbb, or R,G,B from 0 to 1"):
+        seen(0.25, 0.5).over(color)
+    with pytest.raises(ValueError, match="did you mean white"):
+        seen(0.25, 0.5).over("whiet")
+
+
+def test_a_png_has_no_transmittance_to_show_a_background_through(tmp_path):
+    seen(0.25, 0.5).save(tmp_path / "a.png")
+    with pytest.raises(ValueError, match="write EXR to keep it"):
+        js.io.read_image(tmp_path / "a.png").over("white")
+
+
+def test_files_have_a_background_or_alpha(tmp_path):
+    made = seen(0.25, 0.5)
+    made.save(tmp_path / "w.png", background="white")
+    np.testing.assert_allclose(js.io.read_image(tmp_path / "w.png").color, 0.75, atol=0.51 / 255)
+    made.save(tmp_path / "t.png", background="transparent")
+    with Pillow.open(tmp_path / "t.png") as opened:
+        assert opened.mode == "RGBA"
+        color, alpha = (np.asarray(opened, np.float64)[0, 0] / 255)[[0, 3]]
+    assert color * alpha == pytest.approx(0.25, abs=1 / 255) and alpha == pytest.approx(0.5, abs=0.51 / 255)
+    seen(0.0, 1.0).save(tmp_path / "none.png", background="transparent")
+    with Pillow.open(tmp_path / "none.png") as opened:
+        assert opened.getpixel((0, 0)) == (0, 0, 0, 0)
+    made.save(tmp_path / "a.exr", background="transparent")
+    with pytest.raises(ValueError, match=r"is for \.png: .*b\.exr holds alpha"):
+        made.save(tmp_path / "b.exr", background="white")
+
+
 def test_a_notebook_shows_it_as_png_of_its_size():
     shown = Pillow.open(io.BytesIO(image(np.full((3, 5, 3), 0.5))._repr_png_()))
     assert shown.size == (5, 3)

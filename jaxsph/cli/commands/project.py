@@ -21,12 +21,13 @@ from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, progress, refuse, say_notes, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, LOOK, OWN, option, output
+from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
+from jaxsph.io.replace import written_whole
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
@@ -71,6 +72,7 @@ class Project(groups.Options, groups.Selection, groups.View):
         str,
         option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"),
     ] = PIXELS[0]
+    annotate: Annotated[bool, flag("--annotate", OUTPUT, "of a .png: with a colour bar, and the name of what it shows")] = False
     depth_range: Annotated[
         Any,
         option(
@@ -92,6 +94,15 @@ class Project(groups.Options, groups.Selection, groups.View):
 
 
 PROJECT = Project()
+
+
+def _save(image: Projection, options: Any, output: Path) -> None:
+    """Write the values or the picture, with a colour bar where that is asked for."""
+    if options.annotate:
+        with written_whole(output) as temporary:
+            image.figure(**_look(options)).savefig(temporary)
+    else:
+        image.save(output, **_look(options))
 
 
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = PROJECT) -> None:
@@ -118,7 +129,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     say("camera", camera.describe())
     image, seconds = _projected(particles, camera, (of, weight), options.pixel, name)
     found = np.asarray(image.values)
-    image.save(output, **_look(options))
+    _save(image, options, output)
     said = found[np.isfinite(found)]
     say("image", f"{output}, {name} {span(said)}")
     if weight is None and not camera.is_perspective:
@@ -160,6 +171,8 @@ def _checked(options: Any) -> Any:
     if options.depth_range is not None and not options.depth_range[0] < options.depth_range[1]:
         raise UsageError(f"--depth-range must ascend, got {options.depth_range[0]:g} {options.depth_range[1]:g}")
     png = options.output is not None and options.output.suffix.lower() == ".png"
+    if options.annotate and not png:
+        raise UsageError("--annotate is for a picture: name one with -o OUT.png")
     if not png and any(getattr(options, name) is not None for name in ("colormap", "norm", "range")):
         raise UsageError("--colormap, --norm and --range are for a picture: name one with -o OUT.png")
     return options

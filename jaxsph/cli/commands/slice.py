@@ -118,7 +118,7 @@ def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
             return particles, scene.looks[0], None
         with wrong_usage():
             return particles, look_of(particles, "concentration", options)[0], None
-    loaded = cli_scene.loaded_of(options)
+    loaded = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded

@@ -77,7 +77,7 @@ def select(
         kept, told = _met(table, where, density)
         notes.append(f"where {where}: {kept.sum():,} of {len(table):,} particles; {told}")
         if len(table) and not kept.any():
-            raise DataError(f"no particle is left of {len(table):,} where {where}: {told}")
+            raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
     if share is not None:
         if not 0 < share <= 1:
             raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
