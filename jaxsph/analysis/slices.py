@@ -24,13 +24,13 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
 from jaxsph.model.image import Image
-from jaxsph.model.labelled import PLANE, dataset, places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import require_shape
 from jaxsph.numerics.given import in_unit
+from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.version import __version__
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0

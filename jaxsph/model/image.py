@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.labelled import PLANE, dataset
 from jaxsph.model.registry import Method
 from jaxsph.numerics import faults, short
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.colors import rgb
+from jaxsph.numerics.labelled import PLANE, dataset
 from jaxsph.numerics.trees import tree
 
 

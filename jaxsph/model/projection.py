@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
-from jaxsph.model.labelled import PLANE, dataset, places
 from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
+from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 

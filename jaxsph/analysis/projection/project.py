@@ -97,12 +97,17 @@ def project(
     given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
     plan = plan or _planned(given[0], given[2], pixel, traced)
     plan.check(particles, camera, pixel)
-    sums, word = _sums(*given, plan=plan) if traced else (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
-    if not traced:
-        _raise_for(int(word), planned)
+    sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
     image, told = _image(sums, held, given[2], digits), _described(particles, camera, pixel, traced)
     named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
     return dataclasses.replace(image, faults=word, metadata=told, **named)
+
+
+def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock: Clock | None) -> tuple[Any, Any]:
+    """Sums by programs that are kept, and no fault that was left unsaid."""
+    sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
+    _raise_for(int(word), planned)
+    return sums, word
 
 
 def _described(particles: Particles, camera: Camera, pixel: str, traced: bool) -> tuple[tuple[str, Any], ...]:
