@@ -106,9 +106,9 @@ def warn(command: str, text: str) -> None:
 
 
 def notice(text: str) -> None:
-    """A line on stderr at once, for a person who waits."""
+    """A line on stderr, at once where a person waits."""
     if not _VOICE[0].quiet:
-        print(text, file=sys.stderr, flush=True)
+        _prose(text)
 
 
 def release() -> None:
