@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import re
 import sys
@@ -105,9 +106,9 @@ def warn(command: str, text: str) -> None:
 
 
 def notice(text: str) -> None:
-    """A line on stderr at once, for a person who waits."""
+    """A line on stderr, at once where a person waits."""
     if not _VOICE[0].quiet:
-        print(text, file=sys.stderr, flush=True)
+        _prose(text)
 
 
 def release() -> None:
@@ -143,14 +144,23 @@ def end(command: str) -> None:
     voice = _VOICE[0]
     if voice.as_json:
         chosen = [{"what": what, "text": text} for what, text in voice.said]
-        print(json.dumps({"command": command, **voice.results, "said": chosen}, default=plain))
+        print(json.dumps(_finite({"command": command, **voice.results, "said": chosen}), default=plain, allow_nan=False))
 
 
 def plain(value: Any) -> Any:
     """What JSON has for arrays, paths, and numbers of NumPy."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    return _finite(value.tolist()) if hasattr(value, "tolist") else str(value)
+
+
+def _finite(value: Any) -> Any:
+    """The same with null for numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {str(key): _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def tell(command: str, text: str) -> None:

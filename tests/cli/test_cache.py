@@ -42,7 +42,7 @@ def test_a_second_process_loads_what_the_first_compiled(command, tmp_path):
     kept = sorted((tmp_path / "cache").rglob("*-cache"))
     assert len(kept) >= 5
     _, said = command(*RENDER)
-    assert said == "", "nothing was missing from the cache"
+    assert COMPILING not in said, "nothing was missing from the cache"
     assert (tmp_path / "out.png").read_bytes() == first
     assert sorted((tmp_path / "cache").rglob("*-cache")) == kept
     told, _ = command("info", "--cache")

@@ -71,17 +71,22 @@ def framed(camera, *parts):
 
 
 @pytest.mark.slow
-def test_a_volume_and_points_share_a_picture_that_is_the_references(files, capsys):
+def test_a_volume_and_points_share_a_picture_that_is_the_references(files, capsys, monkeypatch):
+    given, render = [], js.render
+
+    def recorded(scene, camera, settings, **more):
+        given.append((scene, camera, settings))
+        return render(scene, camera, settings, **more)
+
+    monkeypatch.setattr(js, "render", recorded)
     code, out, err = run(capsys, "render", "gas.vti", "--points", "stars.csv", "-o", "out.exr", *TINY)
     assert (code, err) == (0, [])
     for said in ("stars.csv", "2 points", "columns `r`, `g`, `b`", "column `radius`", "column `opacity`", "9 x 9 x 9 points"):
         assert said in out
     image = io.read_image("out.exr")
-    gas, points = io.read_volume("gas.vti"), io.read_points("stars.csv")
-    look = js.scenes.default_volume_transfer(gas)
-    scene = js.Scene(volume=gas, volume_transfer=look, points=points)
-    camera = js.Camera.framing(scene, width=24, height=16)
-    truth = js.reference.render(scene, camera, js.Settings(samples=16))
+    ((scene, camera, settings),) = given
+    assert len(scene.volumes) == len(scene.point_sets) == 1 and framed(camera, scene.volumes[0][0], scene.point_sets[0])
+    truth = js.reference.render(scene, camera, settings)
     assert np.abs(layers(image) - layers(truth)).max() < 1e-4
     assert truth.alpha.max() > 0.5 and truth.color[..., 0].max() > 0.3
 

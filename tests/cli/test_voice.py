@@ -1,6 +1,7 @@
 """What goes where: results on stdout, prose on stderr, all of it as JSON, and one line where a command fails."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from commanded import apart, run
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli import voice
 from jaxsph.cli.voice import by_option
 
 TINY = ["--size", "12x8", "--samples", "8"]
@@ -70,6 +72,14 @@ def test_json_of_projections_and_slices(capsys):
     told = json.loads(apart(capsys, "slice", "a.npz", "--size", "12x8", "--json", "-o", "s.npy")[1])
     values = np.load("s.npy")
     assert told["file"] == "s.npy" and told["highest"] == pytest.approx(float(np.nanmax(values)))
+
+
+def test_json_has_null_for_what_is_no_number(capsys):
+    voice.begin(as_json=True)
+    voice.report(error=float("nan"), layer=np.array([1, np.inf]), path=Path("a"))
+    voice.end("render")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["error"], told["layer"], told["path"]) == (None, [1.0, None], "a")
 
 
 def test_doctor_says_versions_devices_and_the_cache(capsys):

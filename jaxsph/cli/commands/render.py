@@ -140,6 +140,7 @@ def _render(options: Any) -> None:
     _check_background(options, output)
     if options.from_disk is not None:
         image, camera = disk.render_options(options, settings)
+        image = dataclasses.replace(image, metadata=(*image.metadata, words.header("render", options.words, part=False)))
         _save(image, options, output)
         _say_written(output, image, camera, settings, options)
         return

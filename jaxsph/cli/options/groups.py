@@ -14,6 +14,7 @@ from cyclopts import Group, Parameter, Token
 
 from jaxsph.cli.options import values
 from jaxsph.io.opening import options as opening
+from jaxsph.io.opening.views import MEASURE, length_of
 from jaxsph.model import Settings, registry
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.scene import MIXES
@@ -186,6 +187,12 @@ class Mixed(Beside):
     ] = None
 
 
+def require_length(text: str) -> None:
+    """Know before a file is read that a width is a length, whatever its unit."""
+    found = MEASURE.fullmatch(text)
+    length_of(text if found is None else float(found[1]), "width", None)
+
+
 _SIZE = option("--size", "WxH", values.size, CAMERA, "pixels (default 512x512)")
 _UP = option("--up", "X,Y,Z", values.place, CAMERA, "upward direction (default 0,1,0)")
 _CENTER = option("--center", "X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass")
@@ -226,6 +233,8 @@ class View(opening.View):
         if self.width == "all":
             object.__setattr__(self, "width", None)
             object.__setattr__(self, "frame_all", True)
+        if isinstance(self.width, str):
+            require_length(self.width)
         if self.clip and self.clips is None:
             if any(one.clip is None for one in self.clip) and len(self.clip) > 1:
                 raise ValueError("--clip none stands alone: it shows everything")

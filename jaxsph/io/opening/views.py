@@ -61,7 +61,10 @@ def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str 
         return number, None
     if unit is None:
         raise ValueError(f"`{name}` = {value!r} has a unit, but the file does not state that of its lengths: give a number")
-    factor, called = named(unit, 1.0, wanted)
+    try:
+        factor, called = named(unit, 1.0, wanted)
+    except ValueError as error:
+        raise ValueError(f"`{name}` = {value!r} is no length: {error}") from error
     return number / factor, f"{number:g} {called}"
 
 
