@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commanded import run
+from PIL import Image as Picture
 
 import jaxsph as js
 from jaxsph import io
@@ -142,6 +143,14 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
     expected = js.slice(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
     np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)
     assert np.asarray(io.read_image("a.png").color).max() > 0.3
+
+
+def test_a_slice_has_its_key_where_that_is_asked_for(file, capsys):
+    pytest.importorskip("matplotlib")
+    code, _, err = run(capsys, "slice", file, "-o", "key.png", "--color-by", "pressure", "--size", "24x16", "--annotate")
+    assert (code, err) == (0, []) and np.asarray(Picture.open("key.png")).shape[1] > 24
+    code, _, err = run(capsys, "slice", file, "-o", "key.npy", "--size", "24x16", "--annotate")
+    assert code == 2 and "a figure is written as .png" in err[-1]
 
 
 def test_info_says_what_would_be_left(file, capsys):

@@ -20,9 +20,10 @@ from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, require_writable, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OWN, option, output
+from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io import Labels
 from jaxsph.io.images.slices import SUFFIXES
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
@@ -34,7 +35,7 @@ from jaxsph.model.clips.shapes import Plane
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Slice(groups.Options, groups.Look, groups.View, groups.Source):
+class Slice(groups.Options, groups.Key, groups.Look, groups.View, groups.Source):
     """Options of the command."""
 
     opacity_by: Annotated[str | None, NOT_HERE] = None
@@ -56,6 +57,7 @@ class Slice(groups.Options, groups.Look, groups.View, groups.Source):
             "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
         ),
     ] = None
+    annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar and axes (a .png)")] = False
     output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")] = None
 
 
@@ -71,6 +73,8 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         )
     output = options.output or Path(f"{stem_of(options.source)}.png")
     require_writable(output, "an image must be", SUFFIXES)
+    if cli_look.has_key(options):
+        cli_look.require_figure(output, (".png",))
     particles, transfer, loaded = _shown(options)
     center, plane = _place(particles, transfer, loaded, options)
     width, height = options.size
@@ -92,7 +96,11 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
     made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options)))
-    made.save(output, transfer)
+    if cli_look.has_key(options):
+        shown = Scene(particles=particles, transfer=transfer)
+        cli_look.save_with_key(made.image(transfer), shown, made.camera, _labels(loaded, options), options, output)
+    else:
+        made.save(output, transfer)
     say("slice", f"{span(made.values[there])}, {there.mean():.1%} of the pixels inside of supports")
     say("image", f"{output}, {width} x {height}, {made.pixel_size:.6g} a pixel")
     seconds = time.perf_counter() - started
@@ -122,6 +130,13 @@ def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded
+
+
+def _labels(loaded: Loaded | None, options: Any) -> Labels:
+    """What the key says, in units as far as the file states them."""
+    if loaded is None or loaded.table is None:
+        return cli_look.label("concentration", options, "a built-in scene")
+    return cli_look.label_file(loaded.table, loaded.quantity, cli_look.values_of(loaded.shown), options)
 
 
 def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane]:
