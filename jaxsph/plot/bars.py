@@ -47,7 +47,7 @@ class Axis:
     def title(self) -> str:
         """Label and unit, with powers as matplotlib writes them."""
         name = self.label[len(LOG_PREFIX) :] if self.is_logarithm else self.label
-        return f"{name} ({raised(self.unit)})"
+        return f"{name} ({raised(self.unit)})" if self.unit else name
 
     @property
     def scale(self) -> Scale:

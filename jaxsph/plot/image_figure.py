@@ -31,6 +31,8 @@ LONGEST_BAR = 0.25  # of the image's width
 TALLEST = 0.55  # of a letter: its mean width
 AXES_COLORS = "#ff7b72", "#7ee787", "#79b8ff"
 LIGHT, DARK = "#ffffff", "#000000"
+BRIGHT = 127.5  # mean of the edge of a picture, of 255, from which letters on it are dark
+ALONG = 0.3  # of a letter: an axis that seems shorter points along the line of sight
 PIECES = 128  # of an edge, each of which is hidden or not
 AHEAD = 1e-3  # of the far depth, before which nothing is drawn
 
@@ -128,7 +130,10 @@ class _Page:
         self._places = [(self.axes, 0.0, float(self.width))]
         self._fit(self.width)
         extent = (0, self.width, self.height, 0)
-        self.axes.imshow(image.to_uint8(), extent=extent, interpolation="nearest", aspect="auto")
+        picture = image.to_uint8()
+        around = np.concatenate([picture[[0, -1]].reshape(-1, 3), picture[:, [0, -1]].reshape(-1, 3)])
+        self.ink, self.halo = (DARK, LIGHT) if around.mean() > BRIGHT else (LIGHT, DARK)
+        self.axes.imshow(picture, extent=extent, interpolation="nearest", aspect="auto")
         self.axes.set(xlim=(0, self.width), ylim=(self.height, 0))
         self.axes.axis("off")
 
@@ -146,20 +151,20 @@ class _Page:
         return self.letter * 72 / DOTS_AN_INCH
 
     def text(self, x: float, y: float, line: str, size: float = 1.0, **style: Any) -> None:
-        """In light letters with a dark border, such that they are read on any picture."""
+        """In letters that stand out from the edge of the picture, with a border, such that they are read anywhere on it."""
         from matplotlib import patheffects
 
-        border = [patheffects.withStroke(linewidth=0.22 * self.points, foreground=DARK)]
-        whole: dict[str, Any] = {"color": LIGHT, "fontsize": size * self.points, "path_effects": border}
+        border = [patheffects.withStroke(linewidth=0.22 * self.points, foreground=self.halo)]
+        whole: dict[str, Any] = {"color": self.ink, "fontsize": size * self.points, "path_effects": border}
         self.axes.text(x, y, line, **whole | style)
 
-    def line(self, ends: np.ndarray, width: float, color: str = LIGHT) -> None:
-        """A light line with a dark border; a width in letters."""
+    def line(self, ends: np.ndarray, width: float, color: str | None = None) -> None:
+        """A line with a border; a width in letters."""
         from matplotlib import patheffects
 
         wide = width * self.points
-        border = [patheffects.Stroke(linewidth=wide + 0.16 * self.points, foreground=DARK), patheffects.Normal()]
-        self.axes.plot(*ends.T, color=color, linewidth=wide, path_effects=border, solid_capstyle="butt")
+        border = [patheffects.Stroke(linewidth=wide + 0.16 * self.points, foreground=self.halo), patheffects.Normal()]
+        self.axes.plot(*ends.T, color=color or self.ink, linewidth=wide, path_effects=border, solid_capstyle="butt")
 
     def draw_outline(self, camera: Camera, lower: np.ndarray, upper: np.ndarray) -> None:
         """Edges of the box; faint and dotted where they lie behind half of the light."""
@@ -168,7 +173,7 @@ class _Page:
         lines = box_lines(camera, lower, upper)
         hidden = lines.hidden(np.nan_to_num(np.asarray(self.image.depth, np.float64), nan=np.inf))
         for which, alpha in ((hidden, 0.22), (~hidden, 0.75)):
-            style: dict[str, Any] = {"colors": LIGHT, "alpha": alpha, "linewidths": 0.09 * self.points, "capstyle": "butt"}
+            style: dict[str, Any] = {"colors": self.ink, "alpha": alpha, "linewidths": 0.09 * self.points, "capstyle": "butt"}
             self.axes.add_collection(LineCollection(list(lines.ends[which]), **style), autolim=False)
 
     def draw_axes(self, camera: Camera) -> None:
@@ -177,8 +182,10 @@ class _Page:
         start = np.array([3.8 * self.letter, self.height - 3.8 * self.letter])
         for i in np.argsort(-axes[2]):
             along = np.array([axes[0, i], -axes[1, i]]) * 2.2 * self.letter
+            if np.hypot(*along) < ALONG * self.letter:
+                continue
             self.line(np.stack([start, start + along]), 0.17, AXES_COLORS[i])
-            length = max(float(np.hypot(*along)), 1e-9)
+            length = float(np.hypot(*along))
             place = start + along + along / length * 0.7 * self.letter
             self.text(float(place[0]), float(place[1]), "xyz"[i], 0.95, ha="center", va="center", color=AXES_COLORS[i])
 

@@ -6,6 +6,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli.commands import project as command
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -44,6 +45,25 @@ def gas():
     position = given["position"].astype(np.float32)
     particles = js.Particles.from_arrays(position, np.float32(0.3), position[:, 0], volume.astype(np.float32), "poly6")
     return particles, given, volume
+
+
+def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    velocity = np.stack([np.ones(COUNT), np.full(COUNT, 2.0), np.full(COUNT, 9.0)], 1)
+    np.savez("moving.npz", support=np.full(COUNT, 0.3), velocity=velocity, **columns())
+    drawn = []
+    monkeypatch.setattr(command, "draw_arrows", lambda axes, *arrows: drawn.append(arrows))
+    picture = [*TINY, "-o", "out.png", "--annotate"]
+    code, _, err = run(capsys, "moving.npz", *picture, "--arrows", "v")
+    assert (code, err) == (0, [])
+    right, up, name, _ = drawn[0]
+    assert right.shape == (13, 20) and name == "velocity"
+    np.testing.assert_allclose(right[np.isfinite(right)], 1, rtol=1e-4)
+    np.testing.assert_allclose(up[np.isfinite(up)], 2, rtol=1e-4)
+    code, _, err = run(capsys, "moving.npz", *picture, "--arrows", "mass")
+    assert code == 2 and "there is no such vector; there are velocity" in err[-1]
+    code, _, err = run(capsys, "moving.npz", *TINY, "-o", "out.png", "--arrows", "velocity")
+    assert code == 2 and "--arrows are drawn with a key: add --annotate" in err[-1]
 
 
 def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):

@@ -38,7 +38,7 @@ def test_with_perspective_pixels_have_no_place():
 
 def test_a_slice_is_a_dataset_over_its_plane():
     pytest.importorskip("xarray")
-    found = js.slice_of(PARTICLES, js.Plane((0, 0, 0.05), (0, 0, 1)), center=(0.1, 0.2, 0), view_height=1.0, width=6, height=4)
+    found = js.slice(PARTICLES, js.Plane((0, 0, 0.05), (0, 0, 1)), center=(0.1, 0.2, 0), view_height=1.0, width=6, height=4)
     table = found.to_xarray()
     np.testing.assert_array_equal(table["values"], found.values)
     np.testing.assert_allclose(table["x"], found.positions()[0, :, 0], rtol=1e-6)

@@ -1,5 +1,6 @@
 """Pictures with a key: the picture's own pixels, colours of the bar that are those of the picture, lengths that are right."""
 
+import dataclasses
 import io
 import subprocess
 import sys
@@ -104,6 +105,21 @@ def test_the_scale_bar_is_as_long_as_it_says():
     (line,) = figure.axes[0].lines
     assert np.ptp(line.get_xdata()) == pytest.approx(0.5 * 100 / 1.5, rel=1e-6)
     assert texts(figure) == ["0.5 code units"]
+
+
+@pytest.mark.parametrize("background", ["white", "black"])
+def test_letters_stand_out_from_what_is_behind_the_picture(background):
+    scene, image = ramp()
+    bare = dataclasses.replace(image, color=np.zeros_like(image.color), transmittance=np.ones_like(image.transmittance))
+    shown = dataclasses.replace(bare, color=bare.over(background))
+    text = shown.figure(scene, CAMERA, outline=False).axes[0].texts[-1]
+    assert text.get_color() == ("#000000" if background == "white" else "#ffffff")
+
+
+def test_an_axis_along_the_line_of_sight_is_not_drawn_and_nothing_has_no_empty_unit():
+    scene, image = ramp()
+    assert {"x", "y"} == set(texts(image.figure(scene, CAMERA, outline=False))) & set("xyz")
+    assert Axis(LOOK, "Temperature", "").title == "Temperature"
 
 
 def test_a_perspective_scale_bar_says_where_it_holds():

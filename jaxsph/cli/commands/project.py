@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from cyclopts import Parameter
@@ -28,14 +28,16 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import written_whole
-from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.quantities import ROLES, choose_quantity, velocity_name
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
+from jaxsph.io.table import plain
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.projection import NORMS, Projection
 from jaxsph.model.transfer.looks import default_transfer
+from jaxsph.plot.arrows import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -73,6 +75,10 @@ class Project(groups.Options, groups.Selection, groups.View):
         option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"),
     ] = PIXELS[0]
     annotate: Annotated[bool, flag("--annotate", OUTPUT, "of a .png: with a colour bar, and the name of what it shows")] = False
+    arrows: Annotated[
+        str | None,
+        option("--arrows", "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"),
+    ] = None
     depth_range: Annotated[
         Any,
         option(
@@ -96,11 +102,18 @@ class Project(groups.Options, groups.Selection, groups.View):
 PROJECT = Project()
 
 
-def _save(image: Projection, options: Any, output: Path) -> None:
+ARROWS = 20
+"""Across a picture."""
+
+
+def _save(image: Projection, arrows: _Arrows | None, options: Any, output: Path) -> None:
     """Write the values or the picture, with a colour bar where that is asked for."""
     if options.annotate:
+        figure = image.figure(**_look(options))
+        if arrows is not None:
+            draw_arrows(figure.axes[0], *arrows)
         with written_whole(output) as temporary:
-            image.figure(**_look(options)).savefig(temporary)
+            figure.savefig(temporary)
     else:
         image.save(output, **_look(options))
 
@@ -129,7 +142,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     say("camera", camera.describe())
     image, seconds = _projected(particles, camera, (of, weight), options.pixel, name)
     found = np.asarray(image.values)
-    _save(image, options, output)
+    _save(image, _arrows(columns, particles, camera, options), options, output)
     said = found[np.isfinite(found)]
     say("image", f"{output}, {name} {span(said)}")
     if weight is None and not camera.is_perspective:
@@ -139,6 +152,33 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     say("time", f"{sum(seconds.values()):.2f} s: " + ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items()))
     lowest, highest = (float(said.min()), float(said.max())) if said.size else (None, None)
     voice.written(output, name=name, lowest=lowest, highest=highest, camera=camera.describe(), seconds=seconds)
+
+
+class _Arrows(NamedTuple):
+    """Components of a vector to the right and upwards, means along rays, and what it is called."""
+
+    right: np.ndarray
+    up: np.ndarray
+    name: str
+    unit: str
+
+
+def _arrows(columns: _Columns, particles: Particles, camera: Camera, options: Any) -> _Arrows | None:
+    """Of the vector that is asked for, by mass where there are masses, else by volume."""
+    if options.arrows is None:
+        return None
+    table = columns.table
+    role = velocity_name(table) if plain(options.arrows) in map(plain, ROLES["velocity"]) else None
+    name = table.named(options.arrows) or role
+    if name is None or table.columns[name].ndim != 2 or table.columns[name].shape[1] != 3:
+        vectors = [vector for vector in table.vectors if table.columns[vector].shape[1] == 3]
+        raise UsageError(f"--arrows {options.arrows}: there is no such vector; there are {', '.join(vectors) or 'none'}")
+    weight = columns.amounts(VOLUME if columns.mass_name is None else MASS)
+    coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
+    parts = table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
+    right, up = (np.asarray(projected(particles, coarse, part, weight).values) for part in parts.T)
+    labels = io.labels_of(table, name, float(np.abs(parts).max(initial=0)))
+    return _Arrows(right * labels.factor, up * labels.factor, name, labels.unit)
 
 
 def _projected(particles: Particles, camera: Camera, held: Any, pixel: str, name: str) -> tuple[Projection, dict[str, float]]:
@@ -171,6 +211,8 @@ def _checked(options: Any) -> Any:
     if options.depth_range is not None and not options.depth_range[0] < options.depth_range[1]:
         raise UsageError(f"--depth-range must ascend, got {options.depth_range[0]:g} {options.depth_range[1]:g}")
     png = options.output is not None and options.output.suffix.lower() == ".png"
+    if options.arrows is not None and not options.annotate:
+        raise UsageError("--arrows are drawn with a key: add --annotate")
     if options.annotate and not png:
         raise UsageError("--annotate is for a picture: name one with -o OUT.png")
     if not png and any(getattr(options, name) is not None for name in ("colormap", "norm", "range")):

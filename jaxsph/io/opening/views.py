@@ -119,6 +119,8 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
         raise ValueError(
             f"`Camera.fitted` has no option {min(set(view) - known)!r}; there are across, {', '.join(sorted(known))}"
         )
+    if scene.parts:
+        scene.check()
     return camera_and_clip(scene, View(size=size, width=across, clips=(), **view))[0]
 
 

@@ -139,7 +139,7 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     """Those of an open snapshot of GADGET, AREPO, GIZMO or SWIFT, and of the data sets of one type of particles."""
     read = _swift_unit if is_swift else _gadget_unit
     found = {name: read(dataset.attrs) for name, dataset in group.items() if hasattr(dataset, "shape")}
-    columns = {name: unit for name, unit in found.items() if unit is not None}
+    columns = {name: _of_temperature(name, unit) for name, unit in found.items() if unit is not None}
     parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
@@ -177,6 +177,12 @@ def _gadget_unit(attributes: Any) -> CodeUnit | None:
         return None
     length, mass, velocity, cgs, a, h = (float(value or 0) for value in scalings)
     return CodeUnit(cgs, (length + velocity, mass, -velocity, 0.0), a, h) if cgs > 0 else None
+
+
+def _of_temperature(name: str, unit: CodeUnit) -> CodeUnit:
+    """Of a temperature in kelvin: the attributes of GADGET-4 have no power of one."""
+    bare = plain(name) in TEMPERATURES and not any(unit.powers)
+    return CodeUnit(unit.cgs, TEMPERATURE, unit.a, unit.h) if bare else unit
 
 
 def _swift_unit(attributes: Any) -> CodeUnit | None:

@@ -187,10 +187,11 @@ def _looked_up(look: TransferFunction, by: np.ndarray, opaque_by: np.ndarray) ->
 
 def _volume(volume: Volume, look: TransferFunction, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of a volume at places."""
-    values = np.asarray(volume.values, np.float64)
+    values = np.asarray(volume.values)  # as they are: a copy in float64 of a large scan would not fit
     lattice = (place - np.asarray(volume.lower, np.float64)) / np.asarray(volume.spacing, np.float64)
     inside = ((lattice >= 0) & (lattice <= np.array(values.shape) - 1)).all(-1)
-    quantity = scipy.ndimage.map_coordinates(values, np.moveaxis(lattice, -1, 0), order=1, mode="nearest")
+    places = np.moveaxis(lattice, -1, 0)
+    quantity = scipy.ndimage.map_coordinates(values, places, np.float64, order=1, mode="nearest")
     extinction, color = _looked_up(look, quantity, quantity)
     return extinction * inside, color
 

@@ -13,6 +13,7 @@ h5py = pytest.importorskip("h5py")
 
 KPC = 3.0857e21
 SIZE = (48, 32)
+SEEN = js.Settings(samples=32)
 
 
 def disc(count=3000):
@@ -58,7 +59,7 @@ def middle(camera, scene):
 
 def test_with_no_options_the_disc_fills_the_picture(galaxy):
     scene, camera = js.io.read_scene(galaxy, size=SIZE)
-    image = js.render(scene, camera)
+    image = js.reference.render(scene, camera, SEEN)
     brightest = np.asarray(image.color).max(-1)
     rows, columns = np.nonzero(brightest > 24 / 255)
     assert max(np.ptp(rows) / SIZE[1], np.ptp(columns) / SIZE[0]) > 0.6
@@ -145,7 +146,7 @@ def test_a_periodic_box_is_centred_where_it_is_asked_for(tmp_path):
     for center in ((0.0, 0.0, 0.0), "mass", "densest"):
         scene, camera = js.io.read_scene(path, center=center, width=0.5, view="z", size=SIZE)
         assert np.abs((middle_of(scene) + 0.5) % 1 - 0.5).max() < 0.1
-        assert np.asarray(js.render(scene, camera).alpha)[16, 24] > 0.5
+        assert np.asarray(js.reference.render(scene, camera, SEEN).alpha)[16, 24] > 0.5
 
 
 def middle_of(scene):
@@ -158,7 +159,7 @@ def test_a_volume_is_framed_and_exposed(tmp_path):
     values[6:12, 6:12, 6:12] = np.random.default_rng(0).random((6, 6, 6)) + 0.5
     np.save(tmp_path / "scan.npy", values)
     scene, camera = js.io.read_scene(tmp_path / "scan.npy", size=SIZE)
-    alpha = np.asarray(js.render(scene, camera).alpha)
+    alpha = np.asarray(js.reference.render(scene, camera, SEEN).alpha)
     assert np.percentile(alpha, 99) > 0.8 and (alpha > 0.1).mean() > 0.2
 
 

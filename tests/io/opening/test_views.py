@@ -49,3 +49,8 @@ def test_points_alone_and_nothing_have_a_camera():
     for shown in (js.Scene(points=points), js.Scene()):
         camera = js.Camera.fitted(shown, width=8, height=8)
         assert 0 < float(camera.near) < float(camera.far)
+
+
+def test_particles_without_a_look_are_refused():
+    with pytest.raises(ValueError, match="`transfer` must be given with `particles`"):
+        js.Camera.fitted(js.Scene(particles=scene().particles))

@@ -10,7 +10,7 @@ from jaxsph import io
 from jaxsph.io.settle.labels import Labels, labels_of, moment_of
 from jaxsph.io.settle.unit_names import named, unit_of
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import LENGTH, TIME, VELOCITY, CodeUnit, FileUnits
+from jaxsph.io.units import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits
 
 h5py = pytest.importorskip("h5py")
 
@@ -42,6 +42,15 @@ STATED = {
     "a_scaling": -3.0,
     "h_scaling": 2.0,
 }
+
+
+def test_a_temperature_of_gadget_is_in_kelvin_as_its_attributes_have_no_power_of_one(tmp_path):
+    path = gadget(tmp_path / "x.hdf5", density=STATED)
+    with h5py.File(path, "a") as file:
+        file["PartType0/Temperature"] = np.arange(1.0, 4)
+        none = dict.fromkeys(("length_scaling", "mass_scaling", "velocity_scaling", "a_scaling", "h_scaling"), 0.0)
+        file["PartType0/Temperature"].attrs.update(none | {"to_cgs": 1.0})
+    assert io.read_table(path).units.columns["Temperature"] == CodeUnit(1.0, TEMPERATURE)
 
 
 def test_gadget_attributes_give_units_with_their_powers_of_a_and_h(tmp_path):
