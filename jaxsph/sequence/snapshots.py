@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
+from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.numerics.digest import digest_of, fingerprint
-from jaxsph.sequence.survey import Reading, Survey, Way, Who, surveyed, way_between
+from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
 
 ROUNDING = 1e-9
 """Share of the way between two snapshots by which a time may miss one of them, and mean it."""
@@ -66,7 +67,7 @@ class Snapshots:
         gaps: bool = False,
         strict: bool = True,
         progress: Progress | None = None,
-        **reading: Any,
+        **source: Any,
     ) -> Snapshots:
         """Read all files once, for their times and the range of the quantity over all of them.
 
@@ -82,8 +83,8 @@ class Snapshots:
             strict: whether files that cannot be read are refused. Else the sequence is that of all others, and times between
                 the two beside such a file have no scene.
             progress: called as `progress(done, total)` after every file.
-            reading: `support`, `kernel`, `part_type`, `box`, `where`, `share` and `opacity_by`, as for
-                `jaxsph.io.read_particles`; a share is of the same particles in all files that have ids, and opacity by `"auto"`
+            source: `support`, `kernel`, `part_type`, `box`, `where`, `share`, `opacity_by`, and `color_by` for `quantity`, as
+                for `jaxsph.read_scene`; a share is of the same particles in all files that have ids, and opacity by `"auto"`
                 is by the file in the middle.
 
         Raises:
@@ -91,7 +92,8 @@ class Snapshots:
             TypeError: an argument that there is not.
             ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        how = record_of(Reading, {"quantity": quantity, **reading}, "Snapshots.from_files")
+        how = record_of(Source, source, "Snapshots.from_files")
+        how = how if quantity is None else dataclasses.replace(how, color_by=quantity)
         survey = surveyed(paths, how, gaps=gaps, strict=strict, progress=progress)
         if transfer is None:
             ramp = None if survey.report.opacity_by is None else "steep"
@@ -154,7 +156,7 @@ class Snapshots:
         """A digest of all that the picture of a time depends on: files by their names, sizes and times of change."""
         before, share = self.place(time)
         files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
-        read = self.survey.reading, self.survey.quantity, self.center
+        read = self.survey.source, self.survey.quantity, self.center
         return fingerprint("s", files, share, *read, digest_of((self.transfer, self.within)))
 
     def _particles(self, before: int, share: float) -> Particles:
@@ -181,9 +183,9 @@ class Snapshots:
             while len(self._loaded) > 1:
                 del self._loaded[min(self._loaded)]
             file = self.survey.files[number]
-            table = self.survey.reading.table(file.path)
+            table = table_of(self.survey.source, file.path)
             quantity, by = self.survey.quantity, self.survey.report.opacity_by
-            particles, _ = io.particles_from_table(table, quantity, *self.survey.reading.how, opacity_by=by)
+            particles, _ = io.particles_from_table(table, quantity, *self.survey.source.how, opacity_by=by)
             exact = particles.exact_position()[np.asarray(particles.valid)]
             columns, who = {**particles.to_numpy(), "position": exact}, Who(ids_of(table), exact, velocity_of(table))
             self._loaded[number] = Loaded(columns, particles.kernel, who)

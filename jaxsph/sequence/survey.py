@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxsph import io
 from jaxsph.io.disk.sequence import Order, in_order, numbers_of, require_no_gap
+from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.selection import chosen
@@ -27,33 +28,6 @@ MAX_VALUES = 1 << 16
 """Values of a file that the range over all files is taken from, evenly spread over its particles."""
 FAR = 4.0
 """Supports that particles may move between snapshots before it is said that straight ways are a guess."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Reading:
-    """How files are read: as for `jaxsph.io.read_particles`."""
-
-    quantity: str | None = None
-    support: float | None = None
-    kernel: str | None = None
-    part_type: int | None = None
-    box: Any = "file"
-    where: str | None = None
-    share: float | None = None
-    opacity_by: str | None = None
-
-    @property
-    def how(self) -> tuple[float | None, str | None]:
-        """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
-        return self.support, self.kernel
-
-    def table(self, path: Path) -> io.ParticleTable:
-        """What a file holds of what is asked for."""
-        table, which = io.read_table(path, part_type=self.part_type), {"box": self.box, "where": self.where, "share": self.share}
-        try:
-            return chosen(table, self.quantity, *self.how, **which)
-        except io.DataError as error:
-            raise type(error)(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +91,7 @@ class Survey:
     Attributes:
         files: in the order of time.
         order: when they are.
-        reading: how they were read.
+        source: what of them was asked for.
         quantity: full name of what is shown, of all of them.
         middle: particles of the file in the middle.
         report: what was settled for those.
@@ -130,7 +104,7 @@ class Survey:
 
     files: tuple[SnapshotFile, ...]
     order: Order
-    reading: Reading
+    source: Source
     quantity: str
     middle: Particles
     report: io.Report
@@ -165,9 +139,18 @@ class Survey:
         return said
 
 
+def table_of(source: Source, path: Path) -> io.ParticleTable:
+    """What a file holds of what is asked for."""
+    table = io.read_table(path, part_type=source.part_type)
+    try:
+        return chosen(table, source.color_by, *source.how, **source.which)
+    except io.DataError as error:
+        raise type(error)(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
 def surveyed(
     paths: Iterable[str | os.PathLike[str]],
-    reading: Reading,
+    source: Source,
     *,
     gaps: bool = False,
     strict: bool = True,
@@ -185,8 +168,8 @@ def surveyed(
             raise FileNotFoundError(f"{path}: there is no such file")
     if not gaps:
         require_no_gap(named)
-    middle, report = _middle(named, reading)
-    looking = _Looking(reading, report.quantity, float(np.asarray(middle.support).max(initial=0)))
+    middle, report = _middle(named, source)
+    looking = _Looking(source, report.quantity, float(np.asarray(middle.support).max(initial=0)))
     for number, path in enumerate(named, 1):
         looking.look(path)
         if progress is not None:
@@ -199,7 +182,7 @@ def surveyed(
     return Survey(
         files=tuple(looking.files[place] for place in order.indices),
         order=order,
-        reading=reading,
+        source=source,
         quantity=report.quantity,
         middle=middle,
         report=report,
@@ -211,27 +194,27 @@ def surveyed(
     )
 
 
-def _middle(paths: list[Path], reading: Reading) -> tuple[Particles, io.Report]:
+def _middle(paths: list[Path], source: Source) -> tuple[Particles, io.Report]:
     """The file in the middle, or the next to it that can be read: those that cannot are told of later, all at once."""
     nearest = sorted(paths, key=lambda path: abs(paths.index(path) - len(paths) // 2))
     for path in nearest:
         try:
-            table = reading.table(path)
+            table = table_of(source, path)
         except io.ConditionError:
             raise
         except (ValueError, OSError) as error:
             if path == nearest[-1]:
                 raise ValueError(f"none of {len(paths)} snapshots can be read; the last: {error}") from error
             continue
-        return io.particles_from_table(table, reading.quantity, *reading.how, opacity_by=reading.opacity_by)
+        return io.particles_from_table(table, source.color_by, *source.how, opacity_by=source.opacity_by)
     raise AssertionError("there is a last path")
 
 
 class _Looking:
     """What is found in one file after the other, of which two at a time are in memory."""
 
-    def __init__(self, reading: Reading, quantity: str, support: float) -> None:
-        self._reading, self._quantity, self._support = reading, quantity, support
+    def __init__(self, source: Source, quantity: str, support: float) -> None:
+        self._source, self._quantity, self._support = source, quantity, support
         self._last: io.ParticleTable | None = None
         self.unread: list[tuple[Path, str, int]] = []  # with the number of those that were read before it
         self.files: list[SnapshotFile] = []
@@ -243,7 +226,7 @@ class _Looking:
     def look(self, path: Path) -> None:
         """Read a file; what cannot be read is kept in `unread`."""
         try:
-            table = self._reading.table(path)
+            table = table_of(self._source, path)
             values = self._values(table)
         except (ValueError, OSError) as error:
             why = str(error) if str(path) in str(error) else f"{path}: {error}"
@@ -267,11 +250,11 @@ class _Looking:
         try:
             return choose_quantity(table, self._quantity)[0]
         except io.DataError:  # a density that is summed over neighbours is not in the file
-            return io.particles_from_table(table, self._quantity, *self._reading.how)[0].to_numpy()["quantity"]
+            return io.particles_from_table(table, self._quantity, *self._source.how)[0].to_numpy()["quantity"]
 
     def _reach(self, table: io.ParticleTable) -> float:
-        if self._reading.support is not None:
-            return self._reading.support
+        if self._source.support is not None:
+            return self._source.support
         return self._support if table.support is None else float(table.support.max(initial=0))
 
 

@@ -191,6 +191,26 @@ def test_pixels_beyond_the_faces_hold_nothing_and_those_across_them_a_part():
     assert (np.asarray(nothing.values) == 0).all()
 
 
+def test_rays_from_face_to_face_need_no_images_along_themselves():
+    """The sum over periods of what lies between the faces is each particle's whole column; not of rays that end between."""
+    particles, _ = periodic()
+    camera = js.Camera.along_axis(particles, "y", 18, 12)
+    cut = dataclasses.replace(camera, near=camera.near + 0.3)
+    plan, of_part = (plan_projection(particles, view) for view in (camera, cut))
+    assert plan.through == 1 and of_part.through is None and plan.images < of_part.images and plan.rays is None
+    image = js.project(particles, camera, plan=plan)
+    scale = float(image.values.max())
+    middle = camera.near + 0.5 * (camera.far - camera.near)
+    first, rest = (
+        js.project(particles, camera, depth_range=ends).values for ends in ((camera.near, middle), (middle, camera.far))
+    )
+    np.testing.assert_allclose(image.values, first + rest, atol=3e-4 * scale)
+    with pytest.raises(js.CapacityError):
+        js.project(particles, cut, plan=plan)
+    under_jit = jax.jit(lambda view: js.project(particles, view, plan=plan))
+    assert int(under_jit(camera).faults) == 0 and int(under_jit(cut).faults) != 0
+
+
 def test_other_cameras_see_each_particle_of_a_periodic_set_once():
     particles, _ = periodic()
     aslant = js.Camera.orthographic((3, 2, 4), (0.75, 0.5, 0.4), view_height=3.5, near=0.5, far=9, **SIZE)

@@ -52,19 +52,10 @@ TABLE = [
 ]
 
 
-# Rows by number that take a minute or two each; of the others, which take longer, none has been run to its end yet.
-SLOW = {DERIVATIVES: {1, 6, 7, 10, 13, 14, 18, 24}, ALL_WAYS: {9}}
-
-
 def rows(promise):
-    """The table: quick where the row is the holder of a promise, else slow, or for who has a quarter of an hour."""
-
-    def marks(nth, row):
-        if promise in row.quick:
-            return []
-        return [pytest.mark.slow if nth in SLOW[promise] else pytest.mark.endurance]
-
-    return [pytest.param(row, id=row.name, marks=marks(nth, row)) for nth, row in enumerate(TABLE)]
+    """The table: quick where the row is the holder of a promise, else slow, as each takes up to two minutes."""
+    marks = {False: [pytest.mark.slow], True: []}
+    return [pytest.param(row, id=row.name, marks=marks[promise in row.quick]) for row in TABLE]
 
 
 def light(inputs, cotangent, settings, plan):

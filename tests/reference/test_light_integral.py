@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 
+import formulas
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,16 +67,7 @@ def plainly(scene, camera, pixel, number=FINE):
     quantity, total = np.zeros(number), np.zeros(number)
     for x, h, q, volume in zip(*(np.asarray(column, np.float64)[valid] for column in columns), strict=True):
         r = np.sqrt(((place - x + depth[:, None] * step) ** 2).sum(-1)) / h
-        r = np.minimum(r, 1)
-        weight = {
-            "poly6": (1 - r**2) ** 3,
-            "cubic_spline": 2 * (1 - r) ** 3 - 8 * np.maximum(0.5 - r, 0) ** 3,
-            "wendland_c2": (1 - r) ** 4 * (1 + 4 * r),
-            "wendland_c4": (1 - r) ** 6 * (1 + 6 * r + 35 / 3 * r**2),
-            "wendland_c6": (1 - r) ** 8 * (1 + 8 * r + 25 * r**2 + 32 * r**3),
-            "quartic_spline": (1 - r) ** 4 - 5 * np.maximum(0.6 - r, 0) ** 4 + 10 * np.maximum(0.2 - r, 0) ** 4,
-            "quintic_spline": (1 - r) ** 5 - 6 * np.maximum(2 / 3 - r, 0) ** 5 + 15 * np.maximum(1 / 3 - r, 0) ** 5,
-        }[particles.kernel] * (volume / h**3)  # fmt: skip
+        weight = formulas.KERNELS[particles.kernel](r) * (volume / h**3)
         quantity, total = quantity + q * weight, total + weight
     inside = total > 0
     quantity = np.where(inside, quantity / np.where(inside, total, 1), 0)

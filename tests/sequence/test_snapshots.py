@@ -128,7 +128,7 @@ def test_other_refusals_say_what_is_wrong(tmp_path):
         js.Snapshots.from_files([path], "entropy")
     with pytest.raises(ValueError, match=r"must lie in \[0, 0\]"):
         js.Snapshots.from_files([path]).at(1)
-    with pytest.raises(TypeError, match="no argument `suport`; others that it has are quantity, support"):
+    with pytest.raises(TypeError, match="no argument `suport`; others that it has are color_by, opacity_by, support"):
         js.Snapshots.from_files([path], suport=1.0)
 
 

@@ -5,14 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from formulas import KERNELS
 
 FINE = 12  # points of a Gauss-Legendre rule
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(FINE)
-WEIGHS = {
-    "poly6": lambda q: np.maximum(1 - q**2, 0) ** 3 * 315 / (64 * np.pi),
-    "cubic_spline": lambda q: 8 / np.pi * (2 * np.maximum(1 - q, 0) ** 3 - 8 * np.maximum(0.5 - q, 0) ** 3),
-    "wendland_c2": lambda q: 21 / (2 * np.pi) * np.maximum(1 - q, 0) ** 4 * (1 + 4 * q),
-}
 
 
 def up_to_points():
@@ -92,7 +88,7 @@ def light(rays, particles, transfer, pieces=16):
             depth = (first + piece * length)[:, None] + length[:, None] * (ABSCISSAE + 1) / 2
             place = rays.start[:, None] + depth[..., None] * rays.direction[:, None]
             away = np.linalg.norm(place[:, :, None] - center, axis=-1) / support
-            weight = volume / support**3 * WEIGHS[particles.kernel](away)
+            weight = volume / support**3 * KERNELS[particles.kernel](away)
             total = weight.sum(-1)
             found = (weight * quantity).sum(-1) / np.where(total > 0, total, 1)
             here = np.where(total > 0, np.interp(found, values, extinction), 0) * (rays.slant * length)[:, None] / 2

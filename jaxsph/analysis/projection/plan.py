@@ -24,7 +24,7 @@ from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
-from jaxsph.model.particles.periodic import between_faces, num_ghosts, sees_images, unfolded
+from jaxsph.model.particles.periodic import between_faces, num_ghosts, past_faces, runs_through, sees_images, unfolded
 from jaxsph.numerics.checks import is_traced
 
 PIXELS = ("mean", "ray")
@@ -46,6 +46,7 @@ class ProjectionPlan:
         rays, shares: lists of the particles of either rule in one band; None where there is none.
         tuning: for the machine.
         images: entries for images of a periodic set; None where each particle is taken once.
+        through: axis of the box that rays run along from outside through both faces, so that columns are whole; None where not.
     """
 
     width: int
@@ -57,6 +58,7 @@ class ProjectionPlan:
     shares: ListPlan | None
     tuning: Tuning = CPU
     images: int | None = None
+    through: int | None = None
 
     def __post_init__(self) -> None:
         if self.pixel not in PIXELS:
@@ -139,13 +141,15 @@ def plan_projection(
 def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> ProjectionPlan:
     """The plan with as few bands as the limit allows."""
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
-    images = None
+    images = through = None
     if particles.box is not None and sees_images(particles, camera):
+        axis = int(np.argmax(np.abs(np.asarray(camera.axes)[2])))
+        through = axis if bool(runs_through(camera, particles.box, axis)) else None
         beyond = BESIDE_FACES * float(particles.box.sides.min())
-        images = capacity_class(num_ghosts(particles, beyond))
-    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support), images)
+        images = capacity_class(num_ghosts(particles, beyond, through))
+    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support), images, through)
     if images is not None:
-        camera, particles = _of_box(particles, camera, beyond, room=images, pixel=pixel)
+        camera, particles = _of_box(particles, camera, beyond, room=images, pixel=pixel, through=through)
     else:
         particles = particles.wrapped()
     placed = placed_by(particles, camera)
@@ -190,11 +194,14 @@ DOUBT = 2  # so that what is counted is never less than what a program finds tha
 placed_by = jax.jit(functools.partial(place, doubt=DOUBT))
 
 
-@functools.partial(jax.jit, static_argnames=("room", "pixel"))
-def _of_box(particles: Particles, camera: Camera, beyond: float, *, room: int, pixel: str) -> tuple[Camera, Particles]:
+@functools.partial(jax.jit, static_argnames=("room", "pixel", "through"))
+def _of_box(
+    particles: Particles, camera: Camera, beyond: float, *, room: int, pixel: str, through: int | None
+) -> tuple[Camera, Particles]:
     """What of a periodic set is projected, and what might be."""
     assert particles.box is not None
-    return between_faces(camera, particles.box, pixel)[0], unfolded(particles, room, beyond)[0]
+    seen = between_faces(camera, particles.box, pixel)[0] if through is None else past_faces(camera, particles.box)
+    return seen, unfolded(particles, room, beyond, through)[0]
 
 
 @functools.partial(jax.jit, static_argnames="subrays")

@@ -32,7 +32,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, unit_held
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.periodic import between_faces, with_sources
+from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced
@@ -224,9 +224,12 @@ class _Shown(NamedTuple):
 def _shown(particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan) -> _Shown:
     if plan.images is None or particles.box is None:
         return _Shown(particles.wrapped(), amounts, camera, None, jnp.int32(faults.NONE))
-    camera, pixels = between_faces(camera, particles.box, plan.pixel)
-    particles, source, word = with_sources(particles, plan.images)
-    return _Shown(particles, amounts[source], camera, pixels, word)
+    seen, pixels = between_faces(camera, particles.box, plan.pixel)
+    found, source, word = with_sources(particles, plan.images, through=plan.through)
+    if plan.through is not None:
+        word |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, particles.box, plan.through))
+        seen = past_faces(camera, particles.box)
+    return _Shown(found, amounts[source], seen, pixels, word)
 
 
 def _in_bands(rules: list[_Rule], camera: Camera, plan: ProjectionPlan, channels: int) -> tuple[Array, Array]:

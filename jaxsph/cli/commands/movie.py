@@ -39,13 +39,14 @@ from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, 
 from jaxsph.cli.options.settings import SCENE, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.opening import options as opening
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.survey import Reading, Survey, surveyed
+from jaxsph.sequence.survey import Survey, surveyed
 from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
 
 SECONDS = 10.0
@@ -231,12 +232,12 @@ def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded]:
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
     refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
-    more = {"box": options.box, "where": options.where, "share": options.share}
-    more["opacity_by"] = options.opacity_by or (None if options.transfer is not None else AUTO)
-    reading = Reading(options.color_by, options.support, options.kernel, options.part_type, **more)
+    by = options.opacity_by or (None if options.transfer is not None else AUTO)
+    said = {field.name: getattr(options, field.name) for field in dataclasses.fields(opening.Source)}
+    source = opening.Source(**said | {"opacity_by": by})
     with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
         try:
-            survey = surveyed(options.source, reading, gaps=options.gaps, strict=options.strict, progress=show)
+            survey = surveyed(options.source, source, gaps=options.gaps, strict=options.strict, progress=show)
         except ValueError as error:
             if "missing" in str(error) and not options.gaps:
                 raise ValueError(f"{error}; --gaps goes on without") from error

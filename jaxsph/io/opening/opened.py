@@ -98,10 +98,7 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
         return Loaded(str(path), volume, name)
     table = read_with(find_format(file), file, source.part_type)
     opacity_by = source.opacity_by or (None if look.transfer is not None else AUTO)
-    which: dict[str, Any] = {"box": source.box, "where": source.where, "share": source.share}
-    particles, report = particles_from_table(
-        table, source.color_by, source.support, source.kernel, **which, opacity_by=opacity_by
-    )
+    particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
     said: Said = []
@@ -186,8 +183,7 @@ def _rows(loaded: Loaded, source: Source | None, view: View) -> ParticleTable | 
     if table is None or not (view.view in NEEDS_ROWS or view.center == "mass"):
         return table
     source = source or Source()
-    which: dict[str, Any] = {"box": source.box, "where": source.where, "share": source.share}
-    return chosen(table, "x", source.support, source.kernel, **which)
+    return chosen(table, "x", *source.how, **source.which)
 
 
 def _labels(loaded: Loaded) -> Labels:

@@ -57,6 +57,16 @@ class Source:
             raise ValueError(f"`support` must be > 0, got {self.support:g}")
 
     @property
+    def how(self) -> tuple[float | None, str | None]:
+        """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
+        return self.support, self.kernel
+
+    @property
+    def which(self) -> dict[str, Any]:
+        """The part of all particles that is shown, as the same takes it."""
+        return {"box": self.box, "where": self.where, "share": self.share}
+
+    @property
     def of_particles(self) -> tuple[str, ...]:
         """Names of what was said that only particles have."""
         own = {"box": "file"}

@@ -8,6 +8,8 @@ the particles; derivatives by a ghost are those by the particle that it is an im
 ends at the faces of the box (`field.within`).
 
 A projection along an axis of the box has what the box holds, with images that reach into it: rays and pixels end at its faces.
+Rays *through* the box, from face to face, need no images along themselves: what a support loses at one face its image brings in
+at the other, so that $\sum_n \int_0^L W(x + nL) dx = \int W dx$, the whole column of each particle.
 Along other directions faces cut rays at depths that differ from ray to ray, which column integrals do not know: there each
 particle is taken once, with all of its support.
 """
@@ -15,6 +17,7 @@ particle is taken once, with all of its support.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Any, NamedTuple
 
@@ -22,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.shapes import Box
@@ -44,22 +47,25 @@ class Gaps(NamedTuple):
     reach: Float[Array, " particles"]
 
 
-def unfolded(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Particles, Int[Array, ""]]:
+def unfolded(particles: Particles, room: int, margin: Any = 0.0, through: int | None = None) -> tuple[Particles, Int[Array, ""]]:
     """Particles of no period, with room for so many ghosts behind them; and a fault word.
 
     As `with_sources` says it.
     """
-    found, _, word = with_sources(particles, room, margin)
+    found, _, word = with_sources(particles, room, margin, through)
     return found, word
 
 
-def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Particles, Int[Array, " entries"], Int[Array, ""]]:
+def with_sources(
+    particles: Particles, room: int, margin: Any = 0.0, through: int | None = None
+) -> tuple[Particles, Int[Array, " entries"], Int[Array, ""]]:
     """Particles of no period, with room for so many ghosts behind them; which entry each is of; and a fault word.
 
     Args:
         particles: with a box.
         room: entries for ghosts, static; `num_ghosts` says how many are needed.
         margin: how far outside of the box the field is asked for, up to a period; length units.
+        through: axis across whose faces there are none, as `runs_through` has it.
 
     Differentiation:
         By all that particles are made of, and by the sides of the box. Which have ghosts is held fixed.
@@ -70,7 +76,7 @@ def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Pa
     usable = (sides > 0).all() & jnp.isfinite(sides).all()
     fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= sides.min()
     word = faults.raised(faults.BAD_BOX, ~(usable & fits))
-    near, gaps = _near(home, margin, ROUNDING)
+    near, gaps = _near(home, margin, ROUNDING, through)
     capacity = particles.capacity
     own = jnp.arange(capacity, dtype=jnp.int32)
     if room == 0:
@@ -90,9 +96,9 @@ def with_sources(particles: Particles, room: int, margin: Any = 0.0) -> tuple[Pa
     return together, jnp.concatenate([own, origin]), word
 
 
-def num_ghosts(particles: Particles, margin: Any = 0.0) -> int:
+def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = None) -> int:
     """How many ghosts particles have, or a few more (host side); 0 without a box."""
-    return 0 if particles.box is None else int(_counted(particles, jnp.asarray(margin, particles.dtype)))
+    return 0 if particles.box is None else int(_counted(particles, jnp.asarray(margin, particles.dtype), through=through))
 
 
 def with_ghosts(particles: Particles) -> Particles:
@@ -112,20 +118,21 @@ def with_ghosts(particles: Particles) -> Particles:
 _unfolded = jax.jit(unfolded, static_argnames="room")
 
 
-@jax.jit
-def _counted(particles: Particles, margin: Float[Array, ""]) -> Int[Array, ""]:
-    near, gaps = _near(particles.wrapped(), margin, COUNTED)
+@functools.partial(jax.jit, static_argnames="through")
+def _counted(particles: Particles, margin: Float[Array, ""], *, through: int | None) -> Int[Array, ""]:
+    near, gaps = _near(particles.wrapped(), margin, COUNTED, through)
     return sum(((near & _reaches(gaps, image)).sum(dtype=jnp.int32) for image in IMAGES), jnp.int32(0))
 
 
-def _near(particles: Particles, margin: Any, rounding: int) -> tuple[Array, Gaps]:
-    """Particles that reach over a face or so near to it, and how far all are from faces."""
+def _near(particles: Particles, margin: Any, rounding: int, through: int | None) -> tuple[Array, Gaps]:
+    """Particles that reach over a face or so near to it, and how far all are from faces: infinitely from those not asked for."""
     assert particles.box is not None
     particles = lax.stop_gradient(particles)
     box, eps = particles.box, rounding * jnp.finfo(particles.dtype).eps
     assert box is not None
     size = jnp.maximum(jnp.abs(box.lower), jnp.abs(box.upper)).max() + margin
-    below, above = particles.position - box.lower, box.upper - particles.position
+    asked = jnp.arange(3) != (-1 if through is None else through)
+    below, above = (jnp.where(asked, gap, jnp.inf) for gap in (particles.position - box.lower, box.upper - particles.position))
     reach = (particles.support + margin) * (1 + eps) + eps * size
     near = particles.valid & (jnp.minimum(below, above) < reach[:, None]).any(1)
     return near, Gaps(below, above, reach)
@@ -144,6 +151,25 @@ def sees_images(particles: Particles, camera: Camera) -> bool:
     return bool((np.abs(np.asarray(camera.axes, np.float64)).max(1) > 1 - ALIGNED).all())
 
 
+def runs_through(camera: Camera, box: Box, axis: int) -> Bool[Array, ""]:
+    """Whether rays run along this axis of a box from outside of it through both faces; strictly, so that no depth matters."""
+    low, high = _faces(camera, box)
+    return (jnp.abs(camera.axes[2, axis]) > 1 - ALIGNED) & (camera.near < low[2]) & (camera.far > high[2])
+
+
+def past_faces(camera: Camera, box: Box) -> Camera:
+    """The camera with depths that cut no support, as none is larger than the shortest side."""
+    low, high = _faces(camera, box)
+    beyond = 2 * box.sides.min()
+    return dataclasses.replace(camera, near=low[2] - beyond, far=high[2] + beyond)
+
+
+def _faces(camera: Camera, box: Box) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Lower and upper view coordinates of a box along the axes of a camera."""
+    ends = jnp.stack([camera.to_view(corner, rest) for corner, rest in zip((box.lower, box.upper), box.rest, strict=True)])
+    return ends.min(0), ends.max(0)
+
+
 def between_faces(camera: Camera, box: Box, pixel: str) -> tuple[Camera, Float[Array, "height width"]]:
     """The camera with its depths cut off at the faces of a box, and what share of each pixel lies between the others.
 
@@ -152,8 +178,7 @@ def between_faces(camera: Camera, box: Box, pixel: str) -> tuple[Camera, Float[A
         box: a period.
         pixel: `"mean"`, or `"ray"`, of which the middle counts.
     """
-    ends = jnp.stack([camera.to_view(corner, rest) for corner, rest in zip((box.lower, box.upper), box.rest, strict=True)])
-    low, high = ends.min(0), ends.max(0)
+    low, high = _faces(camera, box)
     near, far = jnp.maximum(camera.near, low[2]), jnp.minimum(camera.far, high[2])
     meets = near < far
     inside = dataclasses.replace(camera, near=jnp.where(meets, near, camera.near), far=jnp.where(meets, far, camera.far))

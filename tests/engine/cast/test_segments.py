@@ -113,10 +113,15 @@ FIRST = "poly6", "cubic_spline", "wendland_c2"
     "kernel", [name if name in FIRST else pytest.param(name, marks=pytest.mark.slow) for name in kernels.KERNELS]
 )
 def test_an_image_is_the_integral_of_its_light(kernel):
-    """Supports of all sizes, and colours that change from one to the next: but for where that is within a segment or two."""
+    """Supports of all sizes, and colours that change from one to the next: but for where that is within a segment or two.
+
+    Where balls of two quantities overlap the colour turns over a length that shrinks with the kernel's width: the higher
+    Wendland kernels and the quintic spline are off by half as much again at the same samples.
+    """
     particles, view = several(np.random.default_rng(0), kernel), camera()
+    most = 6e-2 if kernel in FIRST else 9e-2
     color, transmittance = off(shown(js.Scene(particles, RAINBOW), view), view, particles, RAINBOW)
-    assert max(color.max(), transmittance.max()) < 6e-2 and color.mean() < 2e-3 and transmittance.mean() < 1e-3
+    assert max(color.max(), transmittance.max()) < most and color.mean() < 2e-3 and transmittance.mean() < 1e-3
 
 
 def off(image, view, particles, looks):
