@@ -84,7 +84,7 @@ class Snapshots:
                 the two beside such a file have no scene.
             progress: called as `progress(done, total)` after every file.
             source: `support`, `kernel`, `part_type`, `box`, `where`, `share`, `opacity_by`, and `color_by` for `quantity`, as
-                for `jaxsph.read_scene`; a share is of the same particles in all files that have ids, and opacity by `"auto"`
+                for `jaxsph.io.read_scene`; a share is of the same particles in all files that have ids, and opacity by `"auto"`
                 is by the file in the middle.
 
         Raises:
