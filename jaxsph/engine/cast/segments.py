@@ -35,6 +35,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
 
 EXTINCTION = slice(3, 4)
+PAIRS = slice(0, 2), slice(2, 4)  # of channels, found together
 SMOOTH = 0.25  # of a sum over two segments, that the long one may differ by where the error is taken to be quadratic
 
 
@@ -72,14 +73,12 @@ class Segments(Integrator):
         always, every_other = task.slab[0] >= 0, task.every_other()
         short = medium.intervals(gathered, task), task
         long = medium.intervals(medium.every_other(gathered), every_other), every_other
-        own, double = (fusion_barrier(always, functools.partial(_amounts, channel=3), medium, *one) for one in (short, long))
-        thickness = fusion_barrier(always, carried, own, double)
-        left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, double))
-        channels = []
-        for channel in range(3):
-            parts = [fusion_barrier(always, functools.partial(_amounts, channel=channel), medium, *one) for one in (short, long)]
-            given = *parts, thickness, double, left, left_by_long
-            channels.append(apart_of(fusion_barrier(always, _colors_compared, *given)))
+        *own, extinction = _amounts_of(always, medium, *short)
+        *double, extinction_of_long = _amounts_of(always, medium, *long)
+        thickness = fusion_barrier(always, carried, extinction, extinction_of_long)
+        left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, extinction_of_long))
+        given = thickness, extinction_of_long, left, left_by_long
+        channels = [apart_of(fusion_barrier(always, _colors_compared, *both, *given)) for both in zip(own, double, strict=True)]
         through = left[:, -1] - left_by_long[:, -1]
         error = jnp.abs(through)
         for color, by_long in channels:
@@ -90,10 +89,16 @@ class Segments(Integrator):
         return Segment((red, green, blue), left[:, -1], thickness, error)
 
 
-def _amounts(medium: Medium, intervals: Any, task: SlabTask, channel: int) -> Array:
-    """Emission of one colour, or extinction, of segments in all."""
-    (mean,) = medium.means(intervals, task, slice(channel, channel + 1))
-    return mean * task.path()
+def _amounts_of(always: Array, medium: Medium, intervals: Any, task: SlabTask) -> list[Array]:
+    """Emission of red, green and blue, and extinction, of segments in all."""
+    pairs = [fusion_barrier(always, functools.partial(_amounts, channels=two), medium, intervals, task) for two in PAIRS]
+    return [one for pair in pairs for one in apart_of(pair)]
+
+
+def _amounts(medium: Medium, intervals: Any, task: SlabTask, channels: slice) -> Any:
+    """Two of them."""
+    first, second = medium.means(intervals, task, channels)
+    return together_of(first * task.path(), second * task.path())
 
 
 def carried(short: Array, long: Array) -> Array:

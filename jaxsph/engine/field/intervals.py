@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.cover import Cover
 from jaxsph.engine.field.tasks import Part
-from jaxsph.engine.lookups.means import MeanTables, mean_emission, mean_extinction
+from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import slope_in_middle
 
 LIGHT, EXTINCTION = range(4), 3  # channels: red, green, blue, extinction
@@ -108,7 +108,7 @@ def looked_up(tables: tuple[MeanTables, ...], intervals: list[Intervals]) -> Int
 def extinction_over(tables: MeanTables, intervals: Intervals) -> tuple[Array, Array]:
     """`Paired.extinction` and `Paired.rise`, by the second quantity."""
     near, far, _ = intervals
-    mean = mean_extinction(tables, near, far)
+    (mean,) = mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))
     rise = slope_in_middle(tables.segments, near, far, EXTINCTION) * (far - near)
     return mean, jnp.clip(rise, -2 * mean, 2 * mean)
 
@@ -124,7 +124,7 @@ def means_by(
     for channel in range(*channels.indices(len(LIGHT))):
         mean = extinction
         if channel != EXTINCTION:
-            (color,) = mean_emission(tables[0], near, far, slice(channel, channel + 1))  # whose extinction is 1
+            (color,) = mean_light(tables[0], near, far, slice(channel, channel + 1))  # whose extinction is 1
             most = 2 * jnp.clip(jnp.minimum(color, 1 - color), 0)
             change = jnp.clip(slope_in_middle(tables[0].segments, near, far, channel) * (far - near), -most, most)
             mean = color * extinction + change * rise / 12
@@ -135,7 +135,4 @@ def means_by(
 def means_of(tables: MeanTables, intervals: Intervals, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
     """Means of emission in red, green and blue and of extinction, a unit length, of those that `channels` selects."""
     near, far, share = intervals
-    begin, end, _ = channels.indices(len(LIGHT))
-    found = mean_emission(tables, near, far, slice(begin, min(end, EXTINCTION))) if begin < EXTINCTION else []
-    found += [mean_extinction(tables, near, far)] if end > EXTINCTION else []
-    return [jnp.where(share > 0, share * mean, 0) for mean in found]
+    return [jnp.where(share > 0, share * mean, 0) for mean in mean_light(tables, near, far, channels)]

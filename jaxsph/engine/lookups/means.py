@@ -8,7 +8,7 @@ $f = c s$ over a width $w$ is $c_m s_m + c' s' w^2 / 12$ with the values $c_m$, 
 widths, which are differences of exact positions: no difference of large integrals is taken, however short the range is.
 
 Accuracy: as if the ends were off by a few roundings of the largest control point or of themselves, and then a few eps of the
-largest value in the pieces that are met. For few control points (`SELECT_ALL`) and up to `ALL_PAIRS`, integrals over whole
+largest value in the pieces that are met. For few control points (`FEW`) and up to `ALL_PAIRS`, integrals over whole
 pieces have eps; for more, eps and eps squared of the integral over all. A range is widened at its upper end by `WIDENED`
 roundings: none is empty, and one that is nothing but a jump has the later point. What lies beyond the control points counts
 with its true length and the value at the end.
@@ -35,6 +35,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.engine.lookups.tables import (
     EXTINCTION,
     FARTHEST,
+    FEW,
     MeanTables,
     beyond,
     ends,
@@ -47,26 +48,26 @@ from jaxsph.engine.lookups.tables import (
 )
 from jaxsph.model.transfer.function import SELECT_ALL, at, locate
 
-__all__ = ["MeanTables", "mean_emission", "mean_extinction"]
+__all__ = ["MeanTables", "mean_light"]
 
 
-def mean_extinction(tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """Mean of extinction over the quantities between `near` and `far`, in any order; at one quantity, its value."""
-    return _means(range(EXTINCTION, EXTINCTION + 1), tables, near, far)[0]
-
-
-def mean_emission(
+def mean_light(
     tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"], channels: slice
 ) -> list[Float[Array, "*any"]]:
-    """Means of colour times extinction over the quantities between `near` and `far`, of some of red, green and blue."""
-    return _means(range(*channels.indices(EXTINCTION)), tables, near, far)
+    """Means over the quantities between `near` and `far`, in any order; at one quantity, its value.
+
+    Of colour times extinction in red, green and blue, and of extinction: those of the four that `channels` selects.
+    """
+    return _means(range(*channels.indices(EXTINCTION + 1)), tables, near, far)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
-    if tables.points.shape[0] <= SELECT_ALL:
+    count = tables.points.shape[0]
+    if count <= FEW:
         return _over_all_pieces(rows, tables, near, far)
-    even, uneven = (functools.partial(_packed, means, rows) for means in (_over_even_pieces, _over_uneven_pieces))
+    others = _over_all_pieces if count <= SELECT_ALL else _over_uneven_pieces
+    even, uneven = (functools.partial(_packed, means, rows) for means in (_over_even_pieces, others))
     packed = lax.cond(tables.segments.even, even, uneven, tables, near, far)
     return [packed.real, packed.imag] if len(rows) == 2 else packed
 

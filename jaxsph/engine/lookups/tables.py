@@ -9,12 +9,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsph.model.transfer.function import SELECT_ALL, Segments, at
+from jaxsph.model.transfer.function import Segments, at
 from jaxsph.numerics.trees import tree
 
 WIDENED = 1  # eps of a range's upper end and of the control points' that it is widened by: at least its next number
 FARTHEST = 2.0**120  # times the largest control point: where quantities are clamped, such that nothing overflows
 MAX_EXPONENT = 120  # of the power of two that makes positions of quantities
+FEW = 8  # control points up to which a sum over all pieces beats finding the two outer ones of evenly spaced
 ALL_PAIRS = 128  # up to this many control points, integrals between any two are kept: one gather for four
 EXTINCTION = 3  # the row of extinction; those before are emission of red, green and blue
 
@@ -65,7 +66,7 @@ class MeanTables:
         change = jnp.where(wide, segments.change, 0)
         slope = change * inverse
         sums = lost = between = jnp.zeros_like(base[:, :0])
-        if points.shape[0] > SELECT_ALL:
+        if points.shape[0] > FEW:
             whole = _whole(base, change)
             sums, lost = _sums_before(whole * width)
             between = lax.stop_gradient(_between(*_sums_before(whole * jnp.where(segments.even, 1, width))))

@@ -18,11 +18,11 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.cover import Cover, Ends, Lines, ends_of, over_groups
 from jaxsph.engine.field.fetch import particle_at
-from jaxsph.engine.field.intervals import BESIDE, Intervals, intervals_of, looked_up, means_by
+from jaxsph.engine.field.intervals import BESIDE, EXTINCTION, Intervals, intervals_of, looked_up, means_by
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH
-from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import Segments, TransferFunction
 
 GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives
@@ -33,6 +33,12 @@ class SumsBetween(NamedTuple):
 
     sums: Sums
     cover: Cover
+
+    def at(self, items: Int[Array, " some"]) -> SumsBetween:
+        """Those of some tasks."""
+        by_task = self.cover._replace(pivot=self.cover.pivot[None])
+        cover = jax.tree.map(lambda value: value[:, items], by_task)
+        return SumsBetween(jax.tree.map(lambda value: value[items], self.sums), cover._replace(pivot=cover.pivot[0]))
 
 
 class MeanCotangents(NamedTuple):
@@ -68,6 +74,16 @@ def missed_length(gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks 
         return over
     apart = (cover.length <= (1 + BESIDE) * hull).all(0)
     return over + jnp.where(known & apart, jnp.maximum(covered - taken, 0), 0)
+
+
+def missed_thickness(gathered: SumsBetween, task: SlabTask, tables: MeanTables) -> Float[Array, "tasks rays"]:
+    """The same, as optical thickness: of the larger mean extinction between the ends of the two pieces."""
+    cover, reference = gathered.cover, task.entry.references[-1][:, None]
+    near, far = (reference + end for end in cover.others or (cover.of_front, cover.of_back))
+    (extinction,) = mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))
+    length = task.border[:, -1:] - task.border[:, :1]
+    slant = task.path().sum(1) / jnp.where(length > 0, length, 1)
+    return jnp.where(cover.front < cover.back, extinction, 0).max(0) * slant * missed_length(gathered, task)
 
 
 def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) -> list[Intervals]:

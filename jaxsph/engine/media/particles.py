@@ -21,15 +21,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.field.cover import cover_of
+from jaxsph.engine.field.cover import cover_of, over_groups
 from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.methods import methods_of
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH, pull_gather
-from jaxsph.engine.lookups.means import MeanTables, mean_extinction
-from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_length, pull_cover, pull_means
+from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_thickness, pull_cover, pull_means
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.fusion import fusion_barrier
@@ -145,14 +145,13 @@ class ParticleMedium(Medium):
 
     def missed(self, gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks rays"]:
         """See `Medium.missed`: what lengths of chords tell, of the largest extinction at the ends of what is covered."""
-        cover, reference = gathered.cover, task.entry.references[-1]
-        ends = cover.others or (cover.of_front, cover.of_back)
-        quantity = reference[:, None] + jnp.concatenate(ends)
-        there = jnp.tile(cover.front < cover.back, (2, 1, 1))
-        extinction = jnp.where(there, mean_extinction(self._tables[-1], quantity, quantity), 0).max(0)
-        length = task.border[:, -1:] - task.border[:, :1]
-        slant = task.path().sum(1) / jnp.where(length > 0, length, 1)
-        return extinction * slant * missed_length(gathered, task)
+        inside = by_rays(gathered.sums)[0] > 0
+
+        def find(items: Array, some: SlabTask, found: Array) -> Array:
+            own = gathered.at(jnp.minimum(items, found.shape[0] - 1))
+            return found.at[items].set(missed_thickness(own, some, self._tables[-1]), mode="drop")
+
+        return over_groups(find, jnp.zeros(task.shape[::2], task.depth.dtype), task, inside)
 
     @property
     def _tables(self) -> tuple[MeanTables, ...]:

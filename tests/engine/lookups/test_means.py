@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.lookups.means import MeanTables, mean_emission, mean_extinction
+from jaxsph.engine.lookups.means import MeanTables, mean_light
 
 COUNTS = (1, 2, 3, 6, 16, 17, 40, 70, 150)  # fixed shapes: few compilations
 WIDTHS = (0, 1e-7, 1e-5, 1e-3, 0.03, 0.3, 1, 3)
@@ -18,7 +18,7 @@ WIDTHS = (0, 1e-7, 1e-5, 1e-3, 0.03, 0.3, 1, 3)
 @jax.jit
 def means(transfer, near, far):
     tables = MeanTables.of(transfer.segments())
-    return jnp.stack([*mean_emission(tables, near, far, slice(0, 3)), mean_extinction(tables, near, far)], -1)
+    return jnp.stack(mean_light(tables, near, far, slice(0, 4)), -1)
 
 
 def control_points(count, how, rng):
@@ -183,11 +183,12 @@ def test_order_of_ends_does_not_matter_and_channels_are_those_selected(count):
     rng = np.random.default_rng(3)
     tables = MeanTables.of(made(count, "even", rng).segments())
     near, far = np.float32(rng.uniform(-2, 3, (2, 4, 5, 6)))
-    both = mean_emission(tables, near, far, slice(0, 3))
-    assert np.array_equal(mean_extinction(tables, near, far), mean_extinction(tables, far, near))
-    assert len(both) == 3
-    assert both[0].shape == near.shape
-    np.testing.assert_allclose(mean_emission(tables, near, far, slice(2, 3))[0], both[2], rtol=1e-6)
+    every = mean_light(tables, near, far, slice(0, 4))
+    assert np.array_equal(every, mean_light(tables, far, near, slice(0, 4)))
+    assert len(every) == 4
+    assert every[0].shape == near.shape
+    for some in (slice(0, 2), slice(2, 4), slice(2, 3), slice(3, 4)):
+        np.testing.assert_allclose(mean_light(tables, near, far, some), every[some], rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [5, 40])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.lookups.means import MeanTables, mean_emission, mean_extinction
+from jaxsph.engine.lookups.means import MeanTables, mean_light
 
 CASES = {
     "one": np.array([0.5]),
@@ -22,7 +22,7 @@ ARGUMENTS = ("values", "colors", "extinction", "near", "far")
 @jax.jit
 def means(values, colors, extinction, near, far):
     tables = MeanTables.of(js.TransferFunction(values, colors, extinction).segments())
-    return jnp.stack([*mean_emission(tables, near, far, slice(0, 3)), mean_extinction(tables, near, far)], -1)
+    return jnp.stack(mean_light(tables, near, far, slice(0, 4)), -1)
 
 
 def arguments(values, rng, number=100):
