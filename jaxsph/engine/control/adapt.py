@@ -6,6 +6,7 @@ Flow: slab windows -> probe -> [adapt: analysis -> levels -> merge] -> schedule 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
@@ -78,7 +79,7 @@ def adapt(
         full = next(cost for cost in costs if cost is not None)
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * ((~empty).sum(0) + 1)).astype(dtype)
+        rounding = rounding_of((~empty).sum(0), dtype)
         beside = slab_windows_with_borders(grid.ordered, grid.lists)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
@@ -93,6 +94,11 @@ def adapt(
     final, largest, paint = lax.cond(wanted.any(), decide, at_full_rate)
     schedule = coarse_schedule(windows, final, references, paint if plan.super_pixels else None, slab_samples)
     return schedule, largest, jnp.where(empty, EMPTY, final)
+
+
+def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:
+    """What rounding adds to the bound of bundles that have so many filled cells, see `adapt`."""
+    return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
 
 
 def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:

@@ -1,0 +1,158 @@
+"""A pixel explained: what its error bound is made of, and what its ray meets.
+
+Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.along -> [explain] -> Explanation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+import os
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsph.analysis.explanation.figure import figure_of
+from jaxsph.analysis.explanation.words import note_of, table_of
+from jaxsph.engine.frame.budget import budget_of
+from jaxsph.io.replace import written_whole
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics import short
+from jaxsph.numerics.checks import is_traced
+from jaxsph.reference.along import along
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Explanation:
+    r"""Why a pixel is what it is; made by `explain`. Lengths are in units of the scene.
+
+    Attributes:
+        pixel: row and column.
+        sources: shares of the error bound by name, that add up to `total`:
+            `"bounds"`, what coarser sampling and super-pixels are proven to change at most (with `relax`, estimated);
+            `"interpolation"`, of slabs from the pilot's lattice;
+            `"segments"`, what segments differ by from those of twice the length, borders of supports that they miss among it;
+            `"screen"`, of pixels between rays of a quadtree;
+            `"ended rays"`, light that rays still let through where they ended;
+            `"rounding"`, by which two images of the same samples differ.
+            Only those that the settings can have: none at full rate, which is what errors are measured against.
+        total: `image.error_bound` of the pixel; NaN where nothing is estimated.
+        certified: whether that is proven.
+        note: what there is to say of that in words.
+        levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
+        color, alpha: of the pixel, as rendered.
+        half_depth: where its transmittance falls to 1/2, as rendered; infinite where it does not.
+        depth: view depths of the places that are looked at along the ray, ascending: those of the samples; with other integrators
+            than `"samples"`, those by which the light integral is known to 1e-6, and the ends of portions twice.
+        quantity: Q there, of particles, else of the first volume (of two quantities, that of colours); NaN where there is none.
+        extinction_quantity: the second of two; None of one.
+        extinction: of all that is there, a unit length.
+        transmittance: of all that is up to there, with what a sample stands for: the last is the pixel's, but for its error.
+        particles: indices, ascending, of those particles whose supports the ray passes through between near and far, where they
+            are shown; entries of the scene's `particles` (of prepared ones in their order; of a periodic one whatever its copies).
+        added: of each of these, what it adds to alpha: of the light that particles take at a place, its share of the field there,
+            $\int T \sigma \, V_j W_j / \sum V W \, dl$. Of particles alone they add up to the ray's alpha.
+    """
+
+    pixel: tuple[int, int]
+    sources: dict[str, float]
+    total: float
+    certified: bool
+    note: str
+    levels: Int[np.ndarray, " cells"] | None
+    color: Float[np.ndarray, "3"]
+    alpha: float
+    half_depth: float
+    depth: Float[np.ndarray, " places"]
+    quantity: Float[np.ndarray, " places"]
+    extinction_quantity: Float[np.ndarray, " places"] | None
+    extinction: Float[np.ndarray, " places"]
+    transmittance: Float[np.ndarray, " places"]
+    particles: Int[np.ndarray, " particles"]
+    added: Float[np.ndarray, " particles"]
+
+    def __repr__(self) -> str:
+        told = f"error {self.total:.2g}", f"alpha {self.alpha:.4g}", f"{len(self.particles):,} particles met"
+        return short.line("Explanation", f"pixel {self.pixel}", *told)
+
+    def __str__(self) -> str:
+        return table_of(self)
+
+    def figure(self, quantity: str = "quantity", title: str = "") -> Any:
+        """Quantity, extinction and transmittance over depth, and the budget beside them: a figure of matplotlib's.
+
+        Args:
+            quantity: what it is called on its axis.
+            title: above the figure.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+        """
+        return figure_of(self, quantity, title)
+
+    def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
+        """Write the figure: `.png`, `.pdf` or `.svg`."""
+        made = self.figure(quantity, title)
+        with written_whole(path) as temporary:
+            made.savefig(temporary)
+
+
+def explain(
+    scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int]
+) -> Explanation:
+    """Explain a pixel of `jaxsph.render(scene, camera, settings)`: its error bound by source, and its ray (host side).
+
+    The bound is that of the image, whose pixels are drawn for it (at least those in rows about it), by its plans and compiled
+    programs. The ray is looked at in float64 by the formulas of the reference, whatever the settings leave out.
+
+    Args:
+        scene: particles, volumes and points.
+        camera, settings: as for `jaxsph.render`.
+        pixel: row and column, both from 0; negative ones are refused, as an image is not a list.
+
+    Raises:
+        ValueError: a pixel that the image does not have, traced arguments, a scene with `media`; as `jaxsph.render`.
+        CapacityError: as `jaxsph.render`.
+
+    Warns:
+        UserWarning: where segments cannot keep a tolerance in the rows that were drawn.
+    """
+    settings = Settings() if settings is None else settings
+    if is_traced(scene, camera, settings):
+        raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
+    row, column = _pixel(pixel, camera)
+    ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
+    budget = budget_of(scene, camera, settings, row, column)
+    return Explanation(
+        (row, column),
+        budget.sources,
+        budget.total,
+        budget.certified,
+        note_of(settings, budget.total),
+        budget.levels,
+        budget.color,
+        1 - budget.transmittance,
+        budget.depth,
+        ray.depth,
+        ray.quantities[0],
+        ray.quantities[1] if len(ray.quantities) > 1 else None,
+        ray.extinction,
+        ray.transmittance,
+        ray.particles,
+        ray.added,
+    )
+
+
+def _pixel(pixel: Any, camera: Camera) -> tuple[int, int]:
+    """Row and column, that the image has."""
+    try:
+        row, column = (operator.index(number) for number in pixel)
+    except (TypeError, ValueError):
+        raise ValueError(f"`pixel` must be two integers, row and column, got {pixel!r}") from None
+    if not (0 <= row < camera.height and 0 <= column < camera.width):
+        ends = f"a row from 0 to {camera.height - 1} and a column from 0 to {camera.width - 1}"
+        raise ValueError(f"`pixel` must have {ends}, got {(row, column)}; row 0 is the top, column 0 the left")
+    return row, column
