@@ -123,7 +123,7 @@ def explain(
     settings = Settings() if settings is None else settings
     if is_traced(scene, camera, settings):
         raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
-    row, column = _pixel(pixel, camera)
+    row, column = pixel_of(pixel, camera.width, camera.height)
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
     budget = budget_of(scene, camera, settings, row, column)
     return Explanation(
@@ -146,13 +146,17 @@ def explain(
     )
 
 
-def _pixel(pixel: Any, camera: Camera) -> tuple[int, int]:
-    """Row and column, that the image has."""
+def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
+    """Row and column, that an image of that size has.
+
+    Raises:
+        ValueError: it has not.
+    """
     try:
         row, column = (operator.index(number) for number in pixel)
     except (TypeError, ValueError):
         raise ValueError(f"`pixel` must be two integers, row and column, got {pixel!r}") from None
-    if not (0 <= row < camera.height and 0 <= column < camera.width):
-        ends = f"a row from 0 to {camera.height - 1} and a column from 0 to {camera.width - 1}"
-        raise ValueError(f"`pixel` must have {ends}, got {(row, column)}; row 0 is the top, column 0 the left")
+    if not (0 <= row < height and 0 <= column < width):
+        ends = f"a row from 0 to {height - 1} and a column from 0 to {width - 1}"
+        raise ValueError(f"`pixel` must have {ends}, got {row} {column}; row 0 is the top, column 0 the left")
     return row, column
