@@ -103,6 +103,7 @@ class _Asked:
         depth[0], depth[-1] = portions.start, portions.end  # such that depths ascend
         places = (depth, *self.record.quantities, seen.extinction, left)
         depth, *quantities, extinction, left = (value.T.ravel() for value in places)
+        left = np.minimum.accumulate(left)  # where rounding has it rise
         return Ray(depth, tuple(quantities), extinction, left, particles, added)
 
     def sampled(self, samples: int) -> Ray:

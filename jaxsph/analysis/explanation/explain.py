@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from jaxsph.analysis.explanation.figure import figure_of
 from jaxsph.analysis.explanation.words import note_of, table_of
 from jaxsph.engine.frame.budget import budget_of
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import written_whole
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
@@ -32,9 +33,10 @@ class Explanation:
     Attributes:
         pixel: row and column.
         sources: shares of the error bound by name, that add up to `total`:
-            `"bounds"`, what coarser sampling and super-pixels are proven to change at most (with `relax`, estimated);
+            `"coarse levels"` and `"super-pixels"`, what fewer samples along rays, and one colour for all rays of a cell, are
+            proven to change at most (with `relax`, estimated);
             `"interpolation"`, of slabs from the pilot's lattice;
-            `"segments"`, what segments differ by from those of twice the length, borders of supports that they miss among it;
+            `"segments"`, by how they differ from those of twice the length, with borders of supports that they miss;
             `"screen"`, of pixels between rays of a quadtree;
             `"ended rays"`, light that rays still let through where they ended;
             `"rounding"`, by which two images of the same samples differ.
@@ -101,7 +103,7 @@ class Explanation:
 
 
 def explain(
-    scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int]
+    scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int], plan: Plan | None = None
 ) -> Explanation:
     """Explain a pixel of `jaxsph.render(scene, camera, settings)`: its error bound by source, and its ray (host side).
 
@@ -111,7 +113,8 @@ def explain(
     Args:
         scene: particles, volumes and points.
         camera, settings: as for `jaxsph.render`.
-        pixel: row and column, both from 0; negative ones are refused, as an image is not a list.
+        pixel: row and column, both from 0; negative ones are refused, as a pixel beside the image is a mistake more often than not.
+        plan: as for `jaxsph.render`.
 
     Raises:
         ValueError: a pixel that the image does not have, traced arguments, a scene with `media`; as `jaxsph.render`.
@@ -125,7 +128,7 @@ def explain(
         raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
     row, column = pixel_of(pixel, camera.width, camera.height)
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
-    budget = budget_of(scene, camera, settings, row, column)
+    budget = budget_of(scene, camera, settings, row, column, plan)
     return Explanation(
         (row, column),
         budget.sources,

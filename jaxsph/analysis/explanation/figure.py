@@ -13,10 +13,10 @@ import numpy as np
 from jaxsph.io.libraries import require
 
 SIZE, DOTS_AN_INCH = (9.0, 5.4), 110
-DARK, GRAY, BLUE, RED = "#222222", "#8a8a8a", "#2b6cb0", "#c05621"
-SHARES = 2.6, 1  # of the width: the ray, the budget
-LEAST_BARS = 4  # that there is room for
-LETTERS = 32  # of a line beside the bars
+DARK, GRAY, BLUE, RED = "#222222", "#6b6b6b", "#2b6cb0", "#c05621"
+SHARES = 2.4, 1  # of the width: the ray, the budget
+LEAST_BARS, PARTICLES = 4, 10  # that there is room for
+LETTERS = 40  # of a line beside the bars
 MARGIN = 1.35  # times the largest share, for its number beside it
 
 
@@ -28,17 +28,19 @@ def figure_of(made: Any, quantity: str, title: str) -> Any:
 
     figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(3, 2, width_ratios=SHARES)
-    upper = figure.add_subplot(grid[0, 0])
-    others = [figure.add_subplot(grid[row, 0], sharex=upper) for row in (1, 2)]
     row, column = made.pixel
-    figure.suptitle(f"{title}{', ' if title else ''}pixel {row} {column}", x=0.01, ha="left", fontsize="medium")
-    _draw_ray(made, (upper, *others), quantity)
-    _draw_budget(made, figure.add_subplot(grid[:, 1]))
+    figure.suptitle(
+        f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}", x=0.01, ha="left", fontsize="medium"
+    )
+    along, beside = figure.subfigures(1, 2, width_ratios=SHARES)
+    _draw_ray(made, along.subplots(3, 1, sharex=True), quantity)
+    upper, lower = beside.subplots(2, 1, height_ratios=(1, 2))
+    _draw_budget(made, upper)
+    _draw_particles(made, lower)
     return figure
 
 
-def _draw_ray(made: Any, axes: tuple[Any, ...], quantity: str) -> None:
+def _draw_ray(made: Any, axes: Any, quantity: str) -> None:
     """Three panels over depth."""
     axes[0].plot(made.depth, made.quantity, color=BLUE, linewidth=1.2, label="of colour")
     if made.extinction_quantity is not None:
@@ -54,25 +56,40 @@ def _draw_ray(made: Any, axes: tuple[Any, ...], quantity: str) -> None:
     axes[1].set_ylim(0, None)
     for one, label in zip(axes, (quantity, "extinction", "transmittance"), strict=True):
         one.set_ylabel(label)
-        one.tick_params(axis="x", labelbottom=one is axes[-1])
     axes[-1].set_xlabel("depth")
     axes[-1].set_xlim(made.depth[0], made.depth[-1])
 
 
 def _draw_budget(made: Any, axes: Any) -> None:
-    """A bar a source, the largest above."""
+    """A bar a source."""
     known = not np.isnan(made.total)
     kind = "certified" if made.certified else "estimated"
-    axes.set_title(f"error bound {made.total:.3g}, {kind}" if known else "error bound unknown", fontsize="medium", loc="left")
-    shares = sorted(made.sources.items(), key=lambda one: one[1]) if known else []
-    for place, (_, share) in enumerate(shares):
-        axes.barh(place, share, height=0.6, color=BLUE)
-        axes.text(share, place, f" {share:.2g}", va="center", fontsize="small", color=DARK)
-    axes.set_yticks(range(len(shares)), [name for name, _ in shares])
-    axes.set_ylim(len(shares) - max(len(shares), LEAST_BARS) - 0.5, len(shares) - 0.5)
-    most = max((share for _, share in shares), default=0)
-    axes.set_xlim(0, MARGIN * most if most > 0 else 1)
-    axes.spines[["top", "right", "bottom"]].set_visible(False)
-    axes.set_xticks([])
+    title = f"error bound {made.total:.2g},\n{kind}" if known else "error bound:\nno estimate"
+    shares = sorted(made.sources.items(), key=lambda one: -one[1]) if known else []
+    _draw_bars(axes, title, shares, LEAST_BARS)
     if made.note:
-        axes.text(0.02, 0.02, textwrap.fill(made.note, LETTERS), fontsize="small", color=GRAY, transform=axes.transAxes)
+        note = textwrap.fill(made.note, LETTERS)
+        axes.text(0.02, 0.04, note, fontsize="x-small", color=GRAY, va="bottom", transform=axes.transAxes)
+
+
+def _draw_particles(made: Any, axes: Any) -> None:
+    """A bar for each of those that add most."""
+    most = np.argsort(-made.added, kind="stable")[:PARTICLES]
+    shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
+    title = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
+    _draw_bars(axes, title, shares, PARTICLES)
+
+
+def _draw_bars(axes: Any, title: str, bars: list[tuple[str, float]], room: int) -> None:
+    """Bars with their names and numbers, the first above; `room` for so many at least."""
+    axes.set_title(title, fontsize="small", loc="left")
+    names, lengths = [name for name, _ in bars], np.array([length for _, length in bars])
+    axes.barh(range(len(bars)), lengths, height=0.6, color=BLUE)
+    for place, length in enumerate(lengths):
+        axes.text(length, place, f" {length:.2g}", va="center", fontsize="small", color=DARK)
+    axes.set_yticks(range(len(bars)), names, fontsize="small")
+    axes.set_ylim(max(len(bars), room) - 0.5, -0.5)
+    axes.set_xlim(0, MARGIN * max(lengths.max(initial=0), np.finfo(float).tiny))
+    axes.set_xticks([])
+    axes.tick_params(axis="y", length=0)
+    axes.spines[:].set_visible(False)

@@ -80,7 +80,9 @@ def _ray(made: Any) -> list[str]:
     if made.extinction_quantity is not None:
         lines.append(_line("  of extinction", short.span(made.extinction_quantity)))
     if there:
-        lines.append(_line("extinction", f"{made.extinction.max():.4g} at depth {made.depth[made.extinction.argmax()]:.5g} at most"))
+        lines.append(
+            _line("extinction", f"{made.extinction.max():.4g} at depth {made.depth[made.extinction.argmax()]:.5g} at most")
+        )
     return lines
 
 

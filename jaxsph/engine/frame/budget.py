@@ -22,7 +22,7 @@ from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.layers import REFERENCE, Band
 from jaxsph.engine.frame.stages import ends, least_transmittance
-from jaxsph.engine.planning.fit import PLANS
+from jaxsph.engine.planning.fit import PLANS, seen_by
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
@@ -32,7 +32,8 @@ from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 
-BOUNDS, ROUNDING, INTERPOLATION, SCREEN, ENDED = "bounds", "rounding", "interpolation", "screen", "ended rays"
+LEVELS, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
+SCREEN, ENDED = "screen", "ended rays"
 """Sources; what integrators estimate is called as these are."""
 
 
@@ -55,20 +56,21 @@ class Budget(NamedTuple):
     levels: Int[np.ndarray, " cells"] | None
 
 
-def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column: int) -> Budget:
+def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None) -> Budget:
     """The budget of a pixel (eager, as `jaxsph.render` is, whose plans and compiled programs it shares).
 
     Raises:
         ValueError, CapacityError: as `jaxsph.render`.
     """
     clock, asked = Clock(), Request.of(scene, camera, settings)
-    plan, seen = PLANS.for_frame(asked, clock)
+    planned = plan is None
+    plan, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
     work, number = Work(seen, asked.camera, settings, plan, asked.scene.formulas), row // plan.band_height
     if plan.quadtree is not None:
-        image = work.image(clock)
+        image = work.image(clock, planned=planned)
         shares = _of_leaves(work, clock, image, row, column)
     else:
-        band, image = _drawn(work, clock, number)
+        band, image = _drawn(work, clock, number, planned)
         row -= number * plan.band_height
         shares = _of_rays(plan, settings, band, image, row, column)
     image = asked.in_given_unit(image)
@@ -78,12 +80,12 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
     return Budget(color, *map(float, numbers), total, bool(image.certified), _apart(total, shares), levels)
 
 
-def _drawn(work: Work, clock: Clock, number: int) -> tuple[Band, Image]:
+def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, Image]:
     """A band, and the image of it alone."""
     shards, plan = shards_at_hand(work.plan.cast.tuning), work.plan
     clock.foresee(lambda known: work.bands(shards, clock.forecast(known), [number], None))
     (band,) = work.bands(shards, clock, [number], None)
-    return band, image_of(work.developed(clock, [band]), work.camera, work.settings, plan, clock)
+    return band, image_of(work.developed(clock, [band]), work.camera, work.settings, plan, clock, planned=planned)
 
 
 def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int, column: int) -> dict[str, float | None]:
@@ -96,7 +98,10 @@ def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int,
     elif isinstance(plan.control, ControlPlan):
         levels = np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
         rounding = rounding_of(jnp.asarray((levels >= 0).sum()), image.error_bound.dtype)
-        shares |= {BOUNDS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
+        shares |= {LEVELS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
+        if plan.control.super_pixels:
+            painted = [shard.painted for shard in band.of_shards.verdicts if shard.painted is not None]
+            shares[SUPER_PIXELS] = float(_at(plan, unshard(tuple(painted)), row, column)) if painted else 0.0
     if ends(settings):
         shards = [shard.cut for shard in band.of_shards.cast if shard.cut is not None]
         ended = bool(_at(plan, unshard(tuple(shards)), row, column)) if shards else False
