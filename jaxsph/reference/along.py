@@ -84,7 +84,7 @@ class _Asked:
             self.first.look = self.record
         self.parts = [whole.seen_by(self.rays) for whole in self.wholes]
         self.roots = cut(self.rays, [part.cuts() for part in self.parts])
-        self.shown = [part.lies_over(self.roots) for part in self.parts][0]
+        self.shown, *_ = [part.lies_over(self.roots) for part in self.parts]
 
     def integrated(self) -> Ray:
         """By quadrature; what a portion takes in all is dealt out to its nodes as what is integrated there."""

@@ -127,9 +127,11 @@ class ParticlesMet(_MetByChords):
         self._quantities = [quantity[self.chords.sphere] for quantity in whole.quantities]
 
     def cuts(self) -> Cuts:
+        """See `Part`."""
         return borders(self.chords, 1 / self._scale)
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
+        """See `Part`."""
         count = self._lists.length[portions.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
@@ -175,6 +177,7 @@ class ParticlesMet(_MetByChords):
         return found
 
     def border_by(self, portions: Portions) -> np.ndarray:
+        """See `Part`."""
         which, chord = self._lists.over(portions.root)
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])

@@ -16,12 +16,11 @@ SAMPLES = 40
 LOOK = js.TransferFunction.from_points([0, 0.4, 1], [(1, 0.5, 0), (0, 0.5, 1), (1, 1, 1)], [0.5, 2.0, 0.2])
 
 
-def cloud(box=None, **more):
+def cloud(box=None):
     rng = np.random.default_rng(5)
     position = rng.uniform(-1, 1, (60, 3)).astype(np.float32)
-    return js.Particles.from_arrays(
-        position, rng.uniform(0.2, 0.6, 60), rng.uniform(size=60), rng.uniform(1, 2, 60), box=box, **more
-    )
+    columns = rng.uniform(0.2, 0.6, 60), rng.uniform(size=60), rng.uniform(1, 2, 60)
+    return js.Particles.from_arrays(position, *columns, box=box)
 
 
 def volume():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import operator
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class Explanation:
         extinction: of all that is there, a unit length.
         transmittance: of all that is up to there, with what a sample stands for: the last is the pixel's, but for its error.
         particles: indices, ascending, of those particles whose supports the ray passes through between near and far, where they
-            are shown; entries of the scene's `particles` (of prepared ones in their order; of a periodic one whatever its copies).
+            are shown; of the scene's `particles` as they are given (prepared ones in their order, periodic ones in any copy).
         added: of each of these, what it adds to alpha: of the light that particles take at a place, its share of the field there,
             $\int T \sigma \, V_j W_j / \sum V W \, dl$. Of particles alone they add up to the ray's alpha.
     """
@@ -98,7 +99,7 @@ class Explanation:
     def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
         """Write the figure: `.png`, `.pdf` or `.svg`."""
         made = self.figure(quantity, title)
-        with written_whole(path) as temporary:
+        with written_whole(Path(path)) as temporary:
             made.savefig(temporary)
 
 
@@ -113,7 +114,7 @@ def explain(
     Args:
         scene: particles, volumes and points.
         camera, settings: as for `jaxsph.render`.
-        pixel: row and column, both from 0; negative ones are refused, as a pixel beside the image is a mistake more often than not.
+        pixel: row and column, both from 0; negative ones are refused, as they are by `jaxsph.reference.integral`.
         plan: as for `jaxsph.render`.
 
     Raises:

@@ -29,12 +29,11 @@ def figure_of(made: Any, quantity: str, title: str) -> Any:
     figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     row, column = made.pixel
-    figure.suptitle(
-        f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}", x=0.01, ha="left", fontsize="medium"
-    )
-    along, beside = figure.subfigures(1, 2, width_ratios=SHARES)
-    _draw_ray(made, along.subplots(3, 1, sharex=True), quantity)
-    upper, lower = beside.subplots(2, 1, height_ratios=(1, 2))
+    words = f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}"
+    figure.suptitle(words, x=0.01, ha="left", fontsize="medium")
+    halves: Any = figure.subfigures(1, 2, width_ratios=SHARES)
+    _draw_ray(made, halves[0].subplots(3, 1, sharex=True), quantity)
+    upper, lower = halves[1].subplots(2, 1, height_ratios=(1, 2))
     _draw_budget(made, upper)
     _draw_particles(made, lower)
     return figure

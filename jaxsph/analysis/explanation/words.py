@@ -80,9 +80,8 @@ def _ray(made: Any) -> list[str]:
     if made.extinction_quantity is not None:
         lines.append(_line("  of extinction", short.span(made.extinction_quantity)))
     if there:
-        lines.append(
-            _line("extinction", f"{made.extinction.max():.4g} at depth {made.depth[made.extinction.argmax()]:.5g} at most")
-        )
+        most = made.extinction.argmax()
+        lines.append(_line("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}"))
     return lines
 
 

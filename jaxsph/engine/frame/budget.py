@@ -74,10 +74,10 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
         row -= number * plan.band_height
         shares = _of_rays(plan, settings, band, image, row, column)
     image = asked.in_given_unit(image)
-    color, *numbers = (np.asarray(layer)[row, column] for layer in (image.color, image.transmittance, image.depth))
+    color, left, depth = (np.asarray(layer)[row, column] for layer in (image.color, image.transmittance, image.depth))
     levels = None if image.levels is None else np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
     total = float(image.error_bound[row, column])
-    return Budget(color, *map(float, numbers), total, bool(image.certified), _apart(total, shares), levels)
+    return Budget(color, float(left), float(depth), total, bool(image.certified), _apart(total, shares), levels)
 
 
 def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, Image]:
