@@ -27,7 +27,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Explain(groups.Options, groups.Control, groups.Look, groups.View, groups.Beside, groups.Source):
+class Explain(groups.Options, groups.Draft, groups.Look, groups.View, groups.Beside, groups.Source):
     """Options of the command."""
 
     pixel: Annotated[Any, option("--pixel", "R C", values.pixel, OWN, "row and column, from 0 at the top and the left")] = None
