@@ -130,7 +130,7 @@ def _at(plan: Plan, of_bundles: Any, row: int, column: int) -> Any:
 
 
 def _apart(total: float, shares: dict[str, float | None]) -> dict[str, float]:
-    """All sources, that which was left open with what is left: a bound that was cut off at 1 is cut off there."""
+    """All sources, that which was left open with what is left; of a bound that was cut off at 1 they are cut off alike."""
     known = sum(share for share in shares.values() if share is not None)
-    left = total - known if np.isnan(total) else max(total - known, 0.0)
-    return {name: left if share is None else share for name, share in shares.items()}
+    scale, left = (total / known, 0.0) if known > total else (1.0, total - known)
+    return {name: left if share is None else scale * share for name, share in shares.items()}
