@@ -51,7 +51,8 @@ def _draw_ray(made: Any, axes: Any, quantity: str) -> None:
     axes[2].set_ylim(-0.03, 1.03)
     if np.isfinite(made.half_depth):
         for one in axes:
-            one.axvline(made.half_depth, color=GRAY, linewidth=0.8, linestyle=":")
+            one.axvline(made.half_depth, color=GRAY, linewidth=0.8, linestyle=":", label="half of the light is gone")
+        axes[2].legend(frameon=False, fontsize="small")
     axes[1].set_ylim(0, None)
     for one, label in zip(axes, (quantity, "extinction", "transmittance"), strict=True):
         one.set_ylabel(label)

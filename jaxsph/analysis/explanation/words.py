@@ -48,7 +48,7 @@ def _line(what: str, text: str) -> str:
 
 
 def _half(depth: float) -> str:
-    return f", half of it up to depth {depth:.5g}" if np.isfinite(depth) else ""
+    return f", half of the light gone at depth {depth:.5g}" if np.isfinite(depth) else ""
 
 
 def _budget(made: Any) -> list[str]:
@@ -90,7 +90,7 @@ def _particles(made: Any) -> list[str]:
         return []
     order = np.argsort(-made.added, kind="stable")
     running, total = np.cumsum(made.added[order]), made.added.sum()
-    some = f", {int(np.searchsorted(running, total / 2)) + 1:,} add half of {total:.4f}" if total > 0 else ""
+    some = f", half of {total:.4f} is by {int(np.searchsorted(running, total / 2)) + 1:,}" if total > 0 else ""
     lines = [_line("particles", f"{len(made.particles):,} met{some}")]
     listed = [which for which in order[:MOST] if made.added[which] > 0]
     return lines + [_line(f"  {made.particles[which]}", f"adds {made.added[which]:.3g}") for which in listed]

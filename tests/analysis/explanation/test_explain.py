@@ -120,6 +120,20 @@ def test_a_figure_is_drawn_and_saved(board, tmp_path):
         assert (tmp_path / f"{pixel[0]}.png").stat().st_size > 5000
 
 
+@pytest.mark.usefixtures("quick_programs")
+def test_of_two_quantities_both_are_told_and_drawn(board):
+    pytest.importorskip("matplotlib")
+    scene, camera = board
+    particles = dataclasses.replace(scene.particles, extinction_quantity=10 * scene.particles.quantity)
+    values = 10 * np.asarray(scene.transfer.values)
+    look = js.TransferFunction.from_points(scene.transfer.values, scene.transfer.colors, scene.transfer.extinction, values)
+    two = js.explain(js.Scene(particles=particles, transfer=look), camera, js.Settings(samples=SAMPLES), pixel=(20, 30))
+    one = js.explain(scene, camera, js.Settings(samples=SAMPLES), pixel=(20, 30))
+    np.testing.assert_allclose(two.extinction_quantity, 10 * one.quantity, rtol=1e-5, atol=1e-6)
+    assert two.transmittance[-1] == pytest.approx(one.transmittance[-1], abs=1e-5) and "of extinction" in str(two)
+    assert len(two.figure().get_axes()[0].get_legend().get_texts()) == 2
+
+
 @pytest.mark.parametrize("pixel", [(48, 0), (0, 64), (-1, 0), (0, -1)])
 def test_pixels_that_the_image_does_not_have_are_refused_with_those_that_it_has(board, pixel):
     with pytest.raises(ValueError, match="`pixel` must have a row from 0 to 47 and a column from 0 to 63"):
