@@ -59,8 +59,8 @@ def test_a_picture_made_by_what_explain_does_not_know_is_refused(capsys):
     image = js.Image(np.zeros((4, 4, 3), np.float32), layer, layer, layer, layer, True, 0, {}, (("jaxsph.command", command),))
     image.save("x.png")
     code, _, err = run(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 1, 1)
-    assert code == 2 and err == ["jaxsph explain: --like x.png: it was made with --progressive, which `jaxsph explain` does not know "
-                                 "(see `jaxsph explain --help`)"]  # fmt: skip
+    assert code == 2 and len(err) == 1
+    assert "--like x.png: it was made with --progressive, which `jaxsph explain` does not know" in err[0]
 
 
 @pytest.mark.parametrize(
