@@ -24,7 +24,8 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced
-from jaxsph.reference.along import along
+from jaxsph.reference.along import TOLERANCE, along
+from jaxsph.reference.light_integral import integral
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,6 +48,8 @@ class Explanation:
         note: what there is to say of that in words.
         levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
         color, alpha: of the pixel, as rendered.
+        integral_color, integral_alpha: the light integral along its ray, to 1e-6: what samples tend to as they become ever more.
+            How far the pixel is from it (`off_integral`) is what a tolerance of point samples says nothing of.
         half_depth: where its transmittance falls to 1/2, as rendered; infinite where it does not.
         depth: view depths of the places that are looked at along the ray, ascending: those of the samples; with other integrators
             than `"samples"`, those by which the light integral is known to 1e-6, and the ends of portions twice.
@@ -68,6 +71,8 @@ class Explanation:
     levels: Int[np.ndarray, " cells"] | None
     color: Float[np.ndarray, "3"]
     alpha: float
+    integral_color: Float[np.ndarray, "3"]
+    integral_alpha: float
     half_depth: float
     depth: Float[np.ndarray, " places"]
     quantity: Float[np.ndarray, " places"]
@@ -80,6 +85,12 @@ class Explanation:
     def __repr__(self) -> str:
         told = f"error {self.total:.2g}", f"alpha {self.alpha:.4g}", f"{len(self.particles):,} particles met"
         return short.line("Explanation", f"pixel {self.pixel}", *told)
+
+    @property
+    def off_integral(self) -> float:
+        """How far the pixel is from the light integral along its ray, in any colour or alpha."""
+        color = np.abs(np.asarray(self.color, np.float64) - self.integral_color)
+        return float(max(color.max(), abs(self.alpha - self.integral_alpha)))
 
     def __str__(self) -> str:
         return table_of(self)
@@ -129,6 +140,7 @@ def explain(
         raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
     row, column = pixel_of(pixel, camera.width, camera.height)
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
+    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
     budget = budget_of(scene, camera, settings, row, column, plan)
     return Explanation(
         (row, column),
@@ -139,6 +151,8 @@ def explain(
         budget.levels,
         budget.color,
         1 - budget.transmittance,
+        truth.color[0],
+        1 - float(truth.transmittance[0]),
         budget.depth,
         ray.depth,
         ray.quantities[0],

@@ -34,8 +34,10 @@ def note_of(settings: Settings, total: float) -> str:
 def table_of(made: Any) -> str:
     """An `Explanation` as a table."""
     row, column = made.pixel
-    color = " ".join(f"{float(channel):.3f}" for channel in made.color)
-    lines = [f"pixel {row} {column}: colour {color}, alpha {made.alpha:.4f}{_half(made.half_depth)}", *_budget(made)]
+    seen, truth = (" ".join(f"{float(channel):.3f}" for channel in color) for color in (made.color, made.integral_color))
+    lines = [f"pixel {row} {column}: colour {seen}, alpha {made.alpha:.4f}{_half(made.half_depth)}", *_budget(made)]
+    told = f"colour {truth}, alpha {made.integral_alpha:.4f}; the pixel is {made.off_integral:.2g} off"
+    lines.append(_line("light integral", told))
     if made.levels is not None:
         lines.append(_line("cells", _cells(made.levels)))
     lines += _ray(made)

@@ -65,4 +65,4 @@ def explain(
 
 def _values(made: Explanation) -> dict[str, Any]:
     """All that is known, for a program."""
-    return {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
+    return {field.name: getattr(made, field.name) for field in dataclasses.fields(made)} | {"off_integral": made.off_integral}

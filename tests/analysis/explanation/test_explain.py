@@ -100,6 +100,18 @@ def test_where_nothing_is_estimated_the_note_says_why(board):
     assert (full.total, full.sources) == (0, {}) and "full rate" in full.note
 
 
+def test_what_samples_lose_against_the_light_integral_is_told_beside_the_budget(board):
+    scene, camera = board
+    truth = js.reference.integral(scene, camera, pixels=(np.array([20]), np.array([30])))
+    coarse, fine = (js.explain(scene, camera, js.Settings(samples=samples), pixel=(20, 30)) for samples in (16, SAMPLES))
+    for one in (coarse, fine):
+        np.testing.assert_allclose(one.integral_color, truth.color[0], atol=2e-6)
+        assert one.integral_alpha == pytest.approx(1 - truth.transmittance[0], abs=2e-6)
+        off = [*(one.color - truth.color[0]), one.alpha - one.integral_alpha]
+        assert one.off_integral == pytest.approx(np.abs(off).max(), abs=1e-5)
+    assert coarse.off_integral > fine.off_integral > 1e-5 and f"{fine.off_integral:.2g} off" in str(fine)
+
+
 def test_the_table_says_the_budget_the_ray_and_the_particles_that_add_most(board):
     scene, camera = board
     one = js.explain(scene, camera, js.Settings(samples=SAMPLES), pixel=(20, 30))
