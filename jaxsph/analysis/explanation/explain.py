@@ -151,7 +151,7 @@ def explain(
         budget.levels,
         budget.color,
         1 - budget.transmittance,
-        truth.color[0],
+        np.asarray(truth.color[0]),
         1 - float(truth.transmittance[0]),
         budget.depth,
         ray.depth,
