@@ -13,6 +13,7 @@ from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jaxsph import io, reference, scale, scenes, sequence
+    from jaxsph.analysis.explanation.explain import explain
     from jaxsph.analysis.projection.project import project
     from jaxsph.analysis.resample import resample
     from jaxsph.analysis.slices import slice
@@ -68,6 +69,7 @@ __all__ = [
     "Volume",
     "Within",
     "emission_measure",
+    "explain",
     "io",
     "plan",
     "prepare",
@@ -113,6 +115,7 @@ NAMES = {
     "emission_measure": "jaxsph.model.particles.held:emission_measure",
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
+    "explain": "jaxsph.analysis.explanation.explain:explain",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",
     "Samples": "jaxsph.model.strategies:Samples",

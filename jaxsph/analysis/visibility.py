@@ -87,7 +87,7 @@ def visibility_histogram(
             raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
     camera = with_depths(camera, scene)
     parts, (transfer, record) = parts_of(scene, camera), _recording(scene, part)
-    looked = [one for one in parts if isinstance(one, AllParticles | AllOfVolume)][part]
+    looked = [one for one in (whole.bare for whole in parts) if isinstance(one, AllParticles | AllOfVolume)][part]
     looked.look = record
     chosen = _pixels(camera, rays, seed)
     for some in blocks(chosen, BLOCK):

@@ -30,7 +30,7 @@ OPTIONS = {
 SAME = (
     *("samples", "tolerance", "relax", "estimator", "integrator", "support", "share", "kernel", "color_by", "opacity_by", "mix"),
     *("eye", "target", "up", "center", "width", "view", "size", "colormap", "norm", "range", "preset", "transfer", "exposure"),
-    *("optical_depth", "background", "screen", "part_type", "where"),
+    *("optical_depth", "background", "screen", "part_type", "where", "pixel"),
 )
 NAMED = re.compile(r"`(\w+)`")
 

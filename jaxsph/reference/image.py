@@ -62,7 +62,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     u, v = _ray_coordinates(camera, every)
     square = 1 + u[None, :] ** 2 + v[:, None] ** 2
     lengths = np.sqrt(square) if camera.is_perspective else np.ones_like(square)  # path length a unit of depth
-    edges = _depth(camera, np.arange(settings.samples + 1), settings.samples)
+    edges = sample_borders(camera, settings.samples)
     places = None
     if scene.particles_within is not None:
         places = _world(camera, settings.samples, every)
@@ -85,6 +85,11 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
 def sample_depths(camera: Camera, samples: int) -> np.ndarray:
     """View depths (samples,) of the fine samples, s(i + 1/2), float64, length units."""
     return _depth(camera, np.arange(samples) + 0.5, samples)
+
+
+def sample_borders(camera: Camera, samples: int) -> np.ndarray:
+    """View depths (samples + 1,) between which the fine samples stand, s(i), float64, length units."""
+    return _depth(camera, np.arange(samples + 1), samples)
 
 
 def field(

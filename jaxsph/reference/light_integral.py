@@ -137,12 +137,12 @@ def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarra
     for part in parts:
         part.keep(held)
     portions = roots.some(held)._replace(root=np.arange(held.sum()))
-    portions, light, evaluations = _refined(rays, parts, portions, tolerance)
+    portions, light, evaluations = refined(rays, parts, portions, tolerance)
     chords = sum(len(part.chords.ray) for part in parts)
     return np.concatenate([_composite(rays, portions, light), evaluations[:, None]], 1), np.array([chords, len(portions.ray)])
 
 
-def _refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float) -> tuple[Portions, Light, np.ndarray]:
+def refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float) -> tuple[Portions, Light, np.ndarray]:
     """Split portions until the error of every ray is within tolerance, or no portion can be split."""
     count = len(rays.u)
     evaluations = np.zeros(count)

@@ -60,6 +60,11 @@ class Part(abc.ABC):
 class Whole(abc.ABC):
     """One part of a scene as a camera sees it."""
 
+    @property
+    def bare(self) -> Whole:
+        """The same without the clip that it may be in."""
+        return self
+
     @abc.abstractmethod
     def seen_by(self, rays: Rays) -> Part:
         """As some rays meet it."""
@@ -88,9 +93,9 @@ class AllParticles(Whole):
         self.spheres = Spheres(center, self.support, camera.is_perspective)
         self.kernel, self.look = kernels.by_name(particles.kernel), Look(transfer)
 
-    def seen_by(self, rays: Rays) -> Part:
+    def seen_by(self, rays: Rays) -> ParticlesMet:
         """See `Whole`."""
-        return _ParticlesMet(self, rays)
+        return ParticlesMet(self, rays)
 
 
 class _MetByChords(Part):
@@ -106,8 +111,12 @@ class _MetByChords(Part):
     def keep(self, which: np.ndarray) -> None:
         self._lists = self._lists.some(which)
 
+    def met_in(self, roots: np.ndarray) -> np.ndarray:
+        """Numbers of the chords that lie over any of a mask of the roots."""
+        return np.unique(self._lists.over(np.flatnonzero(roots))[1])
 
-class _ParticlesMet(_MetByChords):
+
+class ParticlesMet(_MetByChords):
     """Particles that some rays meet."""
 
     def __init__(self, whole: AllParticles, rays: Rays):
@@ -118,9 +127,11 @@ class _ParticlesMet(_MetByChords):
         self._quantities = [quantity[self.chords.sphere] for quantity in whole.quantities]
 
     def cuts(self) -> Cuts:
+        """See `Part`."""
         return borders(self.chords, 1 / self._scale)
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
+        """See `Part`."""
         count = self._lists.length[portions.root]
         which = np.flatnonzero(count)
         seen.evaluations += NODES * count
@@ -129,13 +140,12 @@ class _ParticlesMet(_MetByChords):
             means[:, :, some] = self._means(portions.some(which[some]))
         self._whole.look.add(seen, which, [_filled(quantity) for quantity in means], portions, self._rays.slant)
 
-    def _means(self, portions: Portions) -> list[np.ndarray]:
-        """All Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs.
+    def _weights(self, portions: Portions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs of a portion and a chord over it, portion by portion, and V W of each at nodes (nodes, pairs).
 
         With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
         """
         which, chord = self._lists.over(portions.root)
-        first = np.searchsorted(which, np.arange(len(portions.ray)))
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         scale, at = self._scale[chord], middle[which]
         place = PLACE.copy()
@@ -143,7 +153,12 @@ class _ParticlesMet(_MetByChords):
         along = place[:, None] * (half[which] * scale)
         into, left = (at - self.chords.entry[chord]) * scale, (self.chords.exit[chord] - at) * scale
         inside = np.clip((into + along) * (left - along), 0, 1)
-        weight = self._strength[chord] * self._whole.kernel.of_square(1 - inside, np)
+        return which, chord, self._strength[chord] * self._whole.kernel.of_square(1 - inside, np)
+
+    def _means(self, portions: Portions) -> list[np.ndarray]:
+        """All Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs."""
+        which, chord, weight = self._weights(portions)
+        first = np.searchsorted(which, np.arange(len(portions.ray)))
         total, found = np.add.reduceat(weight, first, axis=1), []
         for quantity in self._quantities:
             base = quantity[chord[first]]
@@ -151,7 +166,18 @@ class _ParticlesMet(_MetByChords):
             found.append(base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0))
         return found
 
+    def shared(self, amounts: np.ndarray, portions: Portions) -> np.ndarray:
+        """What is at nodes of portions (nodes, portions), dealt out to chords as V W there."""
+        found, held = np.zeros(len(self.chords.ray)), np.flatnonzero(self._lists.length[portions.root])
+        for some in self._lists.batches(portions.root[held]):
+            which, chord, weight = self._weights(portions.some(held[some]))
+            total = np.add.reduceat(weight, np.searchsorted(which, np.arange(len(some))), axis=1)
+            each = np.divide(amounts[:, held[some]], total, out=np.zeros_like(total), where=total > 0)
+            found += np.bincount(chord, (weight * each[:, which]).sum(0), len(found))
+        return found
+
     def border_by(self, portions: Portions) -> np.ndarray:
+        """See `Part`."""
         which, chord = self._lists.over(portions.root)
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
@@ -178,6 +204,10 @@ class _AllWithin(Whole):
 
     def __init__(self, whole: Whole, clip: Clip, camera: Camera):
         self.clip, self._whole, self._axes, self._eye = clip, whole, np.asarray(camera.axes, np.float64), camera.exact_eye()
+
+    @property
+    def bare(self) -> Whole:
+        return self._whole
 
     def seen_by(self, rays: Rays) -> Part:
         return _MetWithin(self._whole.seen_by(rays), self.clip, rays.start @ self._axes + self._eye, rays.direction @ self._axes)

@@ -54,6 +54,16 @@ def test_sums_over_all_values_are_the_mean_light_of_the_rays(perspective):
     np.testing.assert_allclose(found.emitted.sum(0), np.mean(truth.color, (0, 1)), atol=1e-4)
 
 
+@pytest.mark.parametrize("box", [None, (2, 2, 2)], ids=["clip", "period"])
+def test_a_clip_and_a_period_hide_what_they_hide_in_images(box):
+    rng = np.random.default_rng(5)
+    particles = js.Particles.from_arrays(rng.uniform(0, 2, (60, 3)).astype(np.float32), 0.5, rng.uniform(size=60), box=box)
+    camera = js.Camera.orthographic((1, 1, -3), (1, 1, 1), view_height=2, width=9, height=9, near=1, far=7)
+    scene = js.Scene(particles=particles, transfer=LOOK, within=js.Plane((0, 0, 1), (0, 0.1, 1)) if box is None else None)
+    found, truth = js.visibility_histogram(scene, camera), js.reference.integral(scene, camera)
+    np.testing.assert_allclose(found.absorbed.sum(), np.mean(1 - truth.transmittance), atol=1e-4)
+
+
 def test_values_beyond_the_control_points_have_bins_of_their_own():
     scene = js.Scene(volume=slab(1.5, 0.0), volume_transfer=LOOK)
     found = js.visibility_histogram(scene, flat_camera(), bins=30)

@@ -12,7 +12,7 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import movie, project, render, sweep, transfer
+from jaxsph.cli.commands import explain, movie, project, render, sweep, transfer
 from jaxsph.cli.commands import slice as slices
 from jaxsph.cli.options import groups
 from jaxsph.cli.options.table import COMMANDS
@@ -31,6 +31,9 @@ RUNS = {
     "info": (["info", "FILE"], ["info", "VOLUME"], ["info", SCENE], ["info", "--points", "FILE", "--volume", "VOLUME"]),
     "project": (["project", "FILE", *SMALL], ["project", "FILE", "--of", "volume", *SMALL],
                 ["project", "FILE", "--eye", "0,0,9", *SMALL], ["project", "FILE", "--center", "mass", *SMALL]),
+    "explain": (["explain", "FILE", "--pixel", "1", "1", *SMALL], ["explain", "VOLUME", "--pixel", "1,1", *SMALL],
+                ["explain", SCENE, "--pixel", "1,1", "-o", "a.png", *SMALL],
+                ["explain", "FILE", "--points", "FILE", "--volume", "VOLUME", "--pixel", "1,1", *SMALL]),
     "slice": (["slice", "FILE", *SMALL], ["slice", SCENE, *SMALL]),
     "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"], ["sweep", SCENE, "-o", "out"]),
     "merge": (["merge", "FILE.exr", "-o", "a.png"],),
@@ -74,6 +77,7 @@ def asked(tmp_path, monkeypatch):
         (sweep, "measured"),
         (transfer, "transfer_figure"),
         (slices, "slice_of"),
+        (explain, "explained"),
     ):
         monkeypatch.setattr(module, name, enough)
     return names

@@ -31,7 +31,7 @@ from jaxsph.cli.console import (
     time_line,
 )
 from jaxsph.cli.options import groups, values, words
-from jaxsph.cli.options.groups import DATA, MEANS, OUTPUT, QUALITY, flag, option, output
+from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, flag, option, output
 from jaxsph.cli.options.settings import devices_of, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
@@ -47,7 +47,7 @@ WHERE = ".exr or .png; of several files a folder, or a name with {} in it (defau
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(groups.Options, groups.Control, groups.Key, groups.Look, groups.View, groups.Mixed, groups.Source):
+class Render(groups.Options, groups.Draft, groups.Key, groups.Look, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
 
     output: Annotated[Path | None, output(WHERE)] = None
@@ -56,7 +56,6 @@ class Render(groups.Options, groups.Control, groups.Key, groups.Look, groups.Vie
         option("--background", "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"),
     ] = None
     annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")] = False
-    draft: Annotated[bool, flag("--draft", QUALITY, "a quarter of the samples, for looking around")] = False
     progressive: Annotated[bool, flag("--progressive", QUALITY, "by a quadtree, in stages: OUT is rewritten at each")] = False
     devices: Annotated[
         Any, option("--devices", "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
@@ -69,14 +68,9 @@ class Render(groups.Options, groups.Control, groups.Key, groups.Look, groups.Vie
         float | None,
         option("--from-disk", "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"),
     ] = None
-    like: Annotated[
-        Any, option("--like", "PICTURE", Path, DATA, "take the options by which a picture was made; those beside it win")
-    ] = None
 
 
 RENDER = Render()
-DRAFT = 4
-"""Samples of a picture over those of a draft."""
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
@@ -133,10 +127,6 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
 
 def _render(options: Any) -> None:
     """One picture."""
-    if options.draft and options.samples is not None:
-        raise UsageError("--draft and --samples exclude each other: one says how many samples, the other leaves it open")
-    if options.draft:
-        options = dataclasses.replace(options, samples=max(1, Settings().samples // DRAFT))
     settings, devices = settings_of(options), devices_of(options)
     if options.progressive and options.screen == "pixels":
         raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")

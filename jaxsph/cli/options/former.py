@@ -2,7 +2,7 @@
 
 Flow: words of a command line -> [former] -> words as options are now, what was told -> words -> cyclopts.
 
-The names of the contract of the first version stay silently: `--quantity`, and places of three words as in `--eye 0 0 9`.
+The names of the contract of the first version stay silently: `--quantity`, and places of several words as in `--eye 0 0 9`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxsph.cli.voice import UsageError
 
 COUNTS = {
     **dict.fromkeys(("--eye", "--target", "--up", "--center", "--box"), 3),
-    **dict.fromkeys(("--range", "--depth-range"), 2),
+    **dict.fromkeys(("--range", "--depth-range", "--pixel"), 2),
     **dict.fromkeys(("--clip-plane", "--clip-box", "--cut-box", "--slice"), 6),
     **dict.fromkeys(("--clip-sphere", "--cut-sphere"), 4),
 }
@@ -37,7 +37,7 @@ RENAMED: dict[str, tuple[str, str]] = {
     "--debug": ("--verbose", ""),
     "--frame-all": ("--width", "all"),
 }
-SILENT = {"--quantity", "--debug", "--eye", "--target", "--up", "--center", "--frame-all", "--axis"}
+SILENT = {"--quantity", "--debug", "--eye", "--target", "--up", "--center", "--frame-all", "--axis", "--pixel"}
 OF_SCENES = ("--particles", "--frame")
 BEHIND = {
     "--point-": ("--points", ("radius", "opacity", "color", "colormap", "type")),

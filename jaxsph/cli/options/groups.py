@@ -328,6 +328,16 @@ class Control(Quality):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Draft(Control):
+    """The same, of pictures that may be drafts."""
+
+    draft: Annotated[bool, flag("--draft", QUALITY, "a quarter of the samples, for looking around")] = False
+    like: Annotated[
+        Any, option("--like", "PICTURE", Path, DATA, "take the options by which a picture was made; those beside it win")
+    ] = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Key:
     """What stands beside a picture."""
 

@@ -14,12 +14,18 @@ from jaxsph.model import Settings
 
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
+DRAFT = 4
+"""Samples of a picture over those of a draft."""
 SETTINGS = ("samples", "integrator", "tolerance", "estimator", "relax", "screen")
 
 
 def settings_of(options: Any) -> Settings:
     """Settings from the options given; what `Settings` refuses is wrong usage."""
     given = {name: getattr(options, name, None) for name in SETTINGS}
+    if getattr(options, "draft", False):
+        if options.samples is not None:
+            raise UsageError("--draft and --samples exclude each other: one says how many samples, the other leaves it open")
+        given["samples"] = max(1, Settings().samples // DRAFT)
     given["memory_limit"] = None if options.memory is None else int(options.memory * 2**30)
     with wrong_usage():
         return Settings(**{name: value for name, value in given.items() if value is not None})

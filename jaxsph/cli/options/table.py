@@ -74,6 +74,15 @@ COMMANDS = {
     ),
     "merge": Command(PARTS, "merge", "make a picture of the parts of `render --tile`", ("jaxsph merge part_*.exr -o whole.exr",)),
     "sweep": Command(QUALITY, "sweep", "measure error against tolerance against time", ("jaxsph sweep scene:mixer -o sweep",)),
+    "explain": Command(
+        QUALITY,
+        "explain",
+        "explain a pixel: its error bound by source, and what its ray meets",
+        (
+            "jaxsph explain snap_042.hdf5 --pixel 120 200",
+            "jaxsph explain scene:mixer --pixel 256 256 --integrator segments --tolerance 0.01 -o pixel.png",
+        ),
+    ),
     "demo": Command(QUALITY, "demo", "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
     "doctor": Command(SYSTEM, "doctor", "say versions, devices and the cache", ("jaxsph doctor",)),
     "cache": Command(SYSTEM, "cache", "say where compiled programs are kept, and how large they are", ("jaxsph cache",)),

@@ -68,6 +68,14 @@ def numbers(names: str) -> Callable[[str], tuple[float, ...]]:
 place = numbers("X,Y,Z")
 
 
+def pixel(text: str) -> tuple[int, ...]:
+    """Row and column of a pixel."""
+    found = numbers("R,C")(text)
+    if any(number != int(number) for number in found):
+        raise ValueError(f"must be whole numbers R,C, got {text!r}")
+    return tuple(int(number) for number in found)
+
+
 def center(text: str) -> tuple[float, ...] | str:
     """What is in the middle."""
     if text in ("densest", "mass"):

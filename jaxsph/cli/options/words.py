@@ -24,6 +24,10 @@ COMMAND = "jaxsph.command"
 """Metadata of a picture: the words of its command, as JSON."""
 OF_THIS_RUN = ("--output", "--config", "--save-config", "--like", "--quiet", "--verbose", "--json", "--no-cache", "--tile")
 """Options that are of one run, and none of the picture."""
+OF_THE_FILE = ("--annotate", "--background", "--unit", "--length-unit", "--devices", "--memory")
+"""Options that change no pixel of a picture but how it is written, or by what means it is made."""
+ADOPTED = {"explain": "render"}
+"""Commands that take the options of pictures of another one."""
 Entry = tuple[str | None, str | None]
 """An option and its value; None is the option of a file, or the value of a flag."""
 
@@ -167,9 +171,13 @@ def _like(file: str, command: str, declared: Declared) -> list[Entry]:
     if text is None:
         raise UsageError(f"--like {file}: it does not say by which command it was made; only pictures of `jaxsph render` do")
     own, *words = json.loads(str(text))
-    if own != command:
-        raise UsageError(f"--like {file}: it was made by `jaxsph {own}`, not by `jaxsph {command}`")
+    if own not in (command, ADOPTED.get(command)):
+        raise UsageError(f"--like {file}: it was made by `jaxsph {own}`, not by `jaxsph {ADOPTED.get(command, command)}`")
     found = entries(words, declared)
+    unknown = [str(word).partition("=")[0] for name, word in found if name is None and str(word).startswith("--")]
+    for name in unknown:
+        if name not in OF_THIS_RUN + OF_THE_FILE:
+            raise UsageError(f"--like {file}: it was made with {name}, which `jaxsph {command}` does not know")
     return [(name, value) for name, value in found if name is not None and name not in OF_THIS_RUN]
 
 

@@ -6,6 +6,7 @@ Flow: slab windows -> probe -> [adapt: analysis -> levels -> merge] -> schedule 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, slab_windows_with_borders
 from jaxsph.engine.control.analysis import analyse
+from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.control.levels import bound, choose
 from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels
 from jaxsph.engine.control.ranges import tables_of_parts
@@ -53,7 +55,7 @@ def adapt(
     slab_samples: int,
     plan: ControlPlan,
     tuning: Tuning,
-) -> tuple[SlabSchedule, Float[Array, " bundles"], Int[Array, "cells bundles"]]:
+) -> tuple[SlabSchedule, Float[Array, " bundles"], Float[Array, " bundles"], Int[Array, "cells bundles"]]:
     r"""Decide how every cell is sampled, at full rate all but the `wanted`; where none is, nothing is analysed.
 
     Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
@@ -63,8 +65,8 @@ def adapt(
     stay at level 0 are the images the same bits.
 
     Returns:
-        The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0); and
-        each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
+        The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0), and what
+        of that is by super-pixels; and each cell's candidate: level 0 to 4, super-pixel (5), or -1 where there is nothing.
     """
     cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
@@ -73,26 +75,33 @@ def adapt(
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 
-    def decide() -> tuple[Array, Array, Array]:
+    def decide() -> tuple[Array, Array, Array, Array]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
         full = next(cost for cost in costs if cost is not None)
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
-        rounding = 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * ((~empty).sum(0) + 1)).astype(dtype)
+        rounding = rounding_of((~empty).sum(0), dtype)
         beside = slab_windows_with_borders(grid.ordered, grid.lists)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
         free = _nowhere(beside, num_cells, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
-        return final, bound(errors.error, jnp.where(empty, 0, final), rounding), errors.paint
+        painted = jnp.where(~empty & (final == SUPER_PIXEL), errors.error[SUPER_PIXEL], 0).sum(0)
+        return final, bound(errors.error, jnp.where(empty, 0, final), rounding), painted, errors.paint
 
-    def at_full_rate() -> tuple[Array, Array, Array]:
-        return jnp.zeros((num_cells, bundles), jnp.int32), jnp.zeros(bundles, dtype), jnp.zeros((4, num_cells, bundles), dtype)
+    def at_full_rate() -> tuple[Array, Array, Array, Array]:
+        none = jnp.zeros(bundles, dtype)
+        return jnp.zeros((num_cells, bundles), jnp.int32), none, none, jnp.zeros((4, num_cells, bundles), dtype)
 
-    final, largest, paint = lax.cond(wanted.any(), decide, at_full_rate)
+    final, largest, painted, paint = lax.cond(wanted.any(), decide, at_full_rate)
     schedule = coarse_schedule(windows, final, references, paint if plan.super_pixels else None, slab_samples)
-    return schedule, largest, jnp.where(empty, EMPTY, final)
+    return schedule, largest, painted, jnp.where(empty, EMPTY, final)
+
+
+def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:
+    """What rounding adds to the bound of bundles that have so many filled cells, see `adapt`."""
+    return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
 
 
 def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:

@@ -123,11 +123,13 @@ class Verdict(NamedTuple):
         bound: how wrong each bundle's pixels can be.
         full: evaluations at full rate.
         levels: what each cell was given; None where there are no levels.
+        painted: what of the bound is by super-pixels; None where there is none of these.
     """
 
     bound: Float[Array, " bundles"]
     full: Float[Array, " bundles"]
     levels: Int[Array, "cells bundles"] | None
+    painted: Float[Array, " bundles"] | None = None
 
 
 class Decided(NamedTuple):
@@ -305,8 +307,9 @@ def decide_by_bounds(
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
     references = schedule.references
-    schedule, bound, levels = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
-    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels))
+    decided = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
+    schedule, bound, painted, levels = decided
+    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels, painted))
 
 
 def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) -> Overlap | None:

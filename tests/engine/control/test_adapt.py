@@ -11,7 +11,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES
-from jaxsph.engine.control.adapt import EMPTY, ControlPlan, adapt, untouched
+from jaxsph.engine.control.adapt import EMPTY, ControlPlan, adapt, rounding_of, untouched
 from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.field.schedule import evaluations, full_rate
 from jaxsph.engine.runtime.tuning import CPU
@@ -42,12 +42,22 @@ ALIKE, MIXED = np.full(24, 0.5), np.tile([0.0, 1.0], 12)
 
 
 def test_what_is_alike_is_coarsened_within_the_tolerance(adapted):
-    (schedule, bound, levels), grid, reference = adapted(ALIKE, 0.1)
+    (schedule, bound, _, levels), grid, reference = adapted(ALIKE, 0.1)
     full = full_rate(grid.windows, reference)
     assert (np.asarray(bound) <= 0.1).all() and (np.asarray(bound) > 0).any()
     spent, most = (evaluations(one, grid.samples, 4).sum() for one in (schedule, full))
     assert 0 < float(spent) < 0.9 * float(most)
     assert set(np.unique(levels)) <= set(range(EMPTY, SUPER_PIXEL + 1)) and (np.asarray(levels) > 0).any()
+
+
+def test_super_pixels_have_their_share_of_the_bound_and_no_more(adapted):
+    for quantity, tolerance in ((ALIKE, 0.1), (MIXED, 0.3)):
+        (_, bound, painted, levels), *_ = adapted(quantity, tolerance)
+        bound, painted, levels = (np.asarray(value) for value in (bound, painted, levels))
+        assert (levels == SUPER_PIXEL).any(0)[painted > 0].all() and painted.any() and (painted <= bound).all()
+        alone = ((levels <= 0) | (levels == SUPER_PIXEL)).all(0)
+        rounding = np.asarray(rounding_of((levels >= 0).sum(0), np.float32)) * (levels > 0).any(0)
+        np.testing.assert_allclose(painted[alone] + rounding[alone], bound[alone], rtol=1e-5)
 
 
 def test_a_smaller_tolerance_never_saves_more(adapted):
@@ -57,13 +67,13 @@ def test_a_smaller_tolerance_never_saves_more(adapted):
 
 @pytest.mark.parametrize(("tolerance", "wanted"), [(0.3, False), (0.0, True)])
 def test_what_is_not_wanted_or_not_allowed_is_the_reference_image(adapted, tolerance, wanted):
-    (schedule, bound, levels), grid, reference = adapted(MIXED, tolerance, wanted)
+    (schedule, bound, painted, levels), grid, reference = adapted(MIXED, tolerance, wanted)
     full, slabs = full_rate(grid.windows, reference), len(grid.windows.count)
     for name in ("filled", "length", "count"):
         found, expected = (np.asarray(getattr(one, name)) for one in (schedule, full))
         np.testing.assert_array_equal(found[..., :slabs, :], expected, err_msg=name)
         assert not found[..., slabs:, :].any(), "slabs past the last have nothing"
     assert not (schedule.painted | schedule.filled & (schedule.level > 0)).any()
-    assert not np.asarray(bound).any()
+    assert not np.asarray(bound).any() and not np.asarray(painted).any()
     at_full_rate = np.asarray(untouched(grid.windows, 4))
     np.testing.assert_array_equal(np.asarray(levels)[at_full_rate == 0], 0)

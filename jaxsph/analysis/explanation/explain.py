@@ -1,0 +1,180 @@
+"""A pixel explained: what its error bound is made of, and what its ray meets.
+
+Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.along -> [explain] -> Explanation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsph.analysis.explanation.figure import figure_of
+from jaxsph.analysis.explanation.words import note_of, table_of
+from jaxsph.engine.frame.budget import budget_of
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.io.replace import written_whole
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics import short
+from jaxsph.numerics.checks import is_traced
+from jaxsph.reference.along import TOLERANCE, along
+from jaxsph.reference.light_integral import integral
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Explanation:
+    r"""Why a pixel is what it is; made by `explain`. Lengths are in units of the scene.
+
+    Attributes:
+        pixel: row and column.
+        sources: shares of the error bound by name, that add up to `total`:
+            `"coarse levels"` and `"super-pixels"`, what fewer samples along rays, and one colour for all rays of a cell, are
+            proven to change at most (with `relax`, estimated);
+            `"interpolation"`, of slabs from the pilot's lattice;
+            `"segments"`, by how they differ from those of twice the length, with borders of supports that they miss;
+            `"screen"`, of pixels between rays of a quadtree;
+            `"ended rays"`, light that rays still let through where they ended;
+            `"rounding"`, by which two images of the same samples differ.
+            Only those that the settings can have: none at full rate, which is what errors are measured against.
+        total: `image.error_bound` of the pixel; NaN where nothing is estimated.
+        certified: whether that is proven.
+        note: what there is to say of that in words.
+        levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
+        color, alpha: of the pixel, as rendered.
+        integral_color, integral_alpha: the light integral along its ray, to 1e-6: what samples tend to as they become ever more.
+            How far the pixel is from it (`off_integral`) is what a tolerance of point samples says nothing of.
+        half_depth: where its transmittance falls to 1/2, as rendered; infinite where it does not.
+        depth: view depths of the places that are looked at along the ray, ascending: those of the samples; with other integrators
+            than `"samples"`, those by which the light integral is known to 1e-6, and the ends of portions twice.
+        quantity: Q there, of particles, else of the first volume (of two quantities, that of colours); NaN where there is none.
+        extinction_quantity: the second of two; None of one.
+        extinction: of all that is there, a unit length.
+        transmittance: of all that is up to there, with what a sample stands for: the last is the pixel's, but for its error.
+        particles: indices, ascending, of those particles whose supports the ray passes through between near and far, where they
+            are shown; of the scene's `particles` as they are given (prepared ones in their order, periodic ones in any copy).
+        added: of each of these, what it adds to alpha: of the light that particles take at a place, its share of the field there,
+            $\int T \sigma \, V_j W_j / \sum V W \, dl$. Of particles alone they add up to the ray's alpha.
+    """
+
+    pixel: tuple[int, int]
+    sources: dict[str, float]
+    total: float
+    certified: bool
+    note: str
+    levels: Int[np.ndarray, " cells"] | None
+    color: Float[np.ndarray, "3"]
+    alpha: float
+    integral_color: Float[np.ndarray, "3"]
+    integral_alpha: float
+    half_depth: float
+    depth: Float[np.ndarray, " places"]
+    quantity: Float[np.ndarray, " places"]
+    extinction_quantity: Float[np.ndarray, " places"] | None
+    extinction: Float[np.ndarray, " places"]
+    transmittance: Float[np.ndarray, " places"]
+    particles: Int[np.ndarray, " particles"]
+    added: Float[np.ndarray, " particles"]
+
+    def __repr__(self) -> str:
+        told = f"error {self.total:.2g}", f"alpha {self.alpha:.4g}", f"{len(self.particles):,} particles met"
+        return short.line("Explanation", f"pixel {self.pixel}", *told)
+
+    @property
+    def off_integral(self) -> float:
+        """How far the pixel is from the light integral along its ray, in any colour or alpha."""
+        color = np.abs(np.asarray(self.color, np.float64) - self.integral_color)
+        return float(max(color.max(), abs(self.alpha - self.integral_alpha)))
+
+    def __str__(self) -> str:
+        return table_of(self)
+
+    def figure(self, quantity: str = "quantity", title: str = "") -> Any:
+        """Quantity, extinction and transmittance over depth, and the budget beside them: a figure of matplotlib's.
+
+        Args:
+            quantity: what it is called on its axis.
+            title: above the figure.
+
+        Raises:
+            ImportError: matplotlib is not installed.
+        """
+        return figure_of(self, quantity, title)
+
+    def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
+        """Write the figure: `.png`, `.pdf` or `.svg`."""
+        made = self.figure(quantity, title)
+        with written_whole(Path(path)) as temporary:
+            made.savefig(temporary)
+
+
+def explain(
+    scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int], plan: Plan | None = None
+) -> Explanation:
+    """Explain a pixel of `jaxsph.render(scene, camera, settings)`: its error bound by source, and its ray (host side).
+
+    The bound is that of the image, whose pixels are drawn for it (at least those in rows about it), by its plans and compiled
+    programs. The ray is looked at in float64 by the formulas of the reference, whatever the settings leave out.
+
+    Args:
+        scene: particles, volumes and points.
+        camera, settings: as for `jaxsph.render`.
+        pixel: row and column, both from 0; negative ones are refused, as they are by `jaxsph.reference.integral`.
+        plan: as for `jaxsph.render`.
+
+    Raises:
+        ValueError: a pixel that the image does not have, traced arguments, a scene with `media`; as `jaxsph.render`.
+        CapacityError: as `jaxsph.render`.
+
+    Warns:
+        UserWarning: where segments cannot keep a tolerance in the rows that were drawn.
+    """
+    settings = Settings() if settings is None else settings
+    if is_traced(scene, camera, settings):
+        raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
+    row, column = pixel_of(pixel, camera.width, camera.height)
+    ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
+    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
+    budget = budget_of(scene, camera, settings, row, column, plan)
+    return Explanation(
+        (row, column),
+        budget.sources,
+        budget.total,
+        budget.certified,
+        note_of(settings, budget.total),
+        budget.levels,
+        budget.color,
+        1 - budget.transmittance,
+        np.asarray(truth.color[0]),
+        1 - float(truth.transmittance[0]),
+        budget.depth,
+        ray.depth,
+        ray.quantities[0],
+        ray.quantities[1] if len(ray.quantities) > 1 else None,
+        ray.extinction,
+        ray.transmittance,
+        ray.particles,
+        ray.added,
+    )
+
+
+def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
+    """Row and column, that an image of that size has.
+
+    Raises:
+        ValueError: it has not.
+    """
+    try:
+        row, column = (operator.index(number) for number in pixel)
+    except (TypeError, ValueError):
+        raise ValueError(f"`pixel` must be two integers, row and column, got {pixel!r}") from None
+    if not (0 <= row < height and 0 <= column < width):
+        ends = f"a row from 0 to {height - 1} and a column from 0 to {width - 1}"
+        raise ValueError(f"`pixel` must have {ends}, got {row} {column}; row 0 is the top, column 0 the left")
+    return row, column

@@ -1,0 +1,82 @@
+"""A pixel explained on the command line: a table, one JSON object, a figure; and pixels that are none are wrong usage."""
+
+import json
+
+import numpy as np
+import pytest
+from commanded import apart, run
+
+import jaxsph as js
+
+TINY = ["--size", "24x16", "--samples", "16"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
+    np.savez("a.npz", position=position, heat=position[:, 0], support=np.full(60, 0.8, np.float32))
+
+
+def test_a_pixel_of_a_file_is_explained_in_a_table(capsys):
+    code, out, prose, wrong = apart(capsys, "explain", "a.npz", "--color-by", "heat", "--pixel", 8, 12, *TINY)
+    assert (code, wrong) == (0, []) and out.startswith("pixel 8 12: colour") and "particles" in out
+    scene, camera = js.io.read_scene("a.npz", color_by="heat", size=(24, 16))
+    assert out.strip() == str(js.explain(scene, camera, js.Settings(samples=16), pixel=(8, 12)))
+    assert any(line.startswith("camera") for line in prose)
+
+
+def test_json_has_the_budget_and_the_ray_in_one_object(capsys):
+    code, out, _, wrong = apart(capsys, "explain", "a.npz", "--color-by", "heat", "--pixel=8,12", *TINY, "--json")
+    told = json.loads(out)
+    assert (code, wrong) == (0, []) and told["command"] == "explain" and told["pixel"] == [8, 12]
+    assert (told["total"], told["sources"], told["certified"]) == (0, {}, True)
+    assert len(told["depth"]) == len(told["quantity"]) == len(told["extinction"]) == len(told["transmittance"]) == 16
+    assert told["transmittance"][-1] == pytest.approx(1 - told["alpha"], abs=1e-6)
+    assert len(told["particles"]) == len(told["added"]) > 0 and sum(told["added"]) == pytest.approx(told["alpha"], abs=1e-6)
+
+
+def test_a_figure_is_written_and_its_path_said(capsys):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(capsys, "explain", "scene:radial:particles=50", "--pixel", 8, 12, *TINY, "-o", "pixel.png")
+    assert (code, err) == (0, []) and "\npixel.png" in out
+    with open("pixel.png", "rb") as file:
+        assert file.read(4) == b"\x89PNG"
+
+
+def test_a_pixel_of_a_picture_is_explained_by_the_options_that_it_was_made_by(capsys):
+    more = ["--color-by", "heat", "--eye", 0, 0, 6, "--background", "white", "--draft", "--size", "24x16"]
+    assert run(capsys, "render", "a.npz", *more, "-o", "x.png")[0] == 0
+    code, out, _, wrong = apart(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 8, 12)
+    assert (code, wrong) == (0, [])
+    scene, camera = js.io.read_scene("a.npz", color_by="heat", size=(24, 16), eye=(0, 0, 6))
+    assert out.strip() == str(js.explain(scene, camera, js.Settings(samples=64), pixel=(8, 12)))
+
+
+def test_a_picture_made_by_what_explain_does_not_know_is_refused(capsys):
+    layer = np.zeros((4, 4), np.float32)
+    command = json.dumps(["render", "a.npz", "--progressive", "--output=x.png"])
+    image = js.Image(np.zeros((4, 4, 3), np.float32), layer, layer, layer, layer, True, 0, {}, (("jaxsph.command", command),))
+    image.save("x.png")
+    code, _, err = run(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 1, 1)
+    assert code == 2 and len(err) == 1
+    assert "--like x.png: it was made with --progressive, which `jaxsph explain` does not know" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--pixel", 16, 0], "--pixel must have a row from 0 to 15 and a column from 0 to 23, got 16 0"),
+        (["--pixel", -1, 0], "got -1 0"),
+        (["--pixel", "1.5,2"], "--pixel must be whole numbers R,C"),
+        (["--pixel", "1"], "--pixel must be R,C"),
+        (["--pixel"], "--pixel"),
+        ([], "--pixel R C"),
+        (["--pixel", 1, 2, "-o", "a.exr"], ".png"),
+        (["--pixel", 1, 2, "--tolerance", -1], "--tolerance must be >= 0"),
+    ],
+    ids=str,
+)
+def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, said):
+    code, _, err = run(capsys, "explain", "a.npz", *arguments, *TINY)
+    assert code == 2 and len(err) == 1 and said in err[0]
