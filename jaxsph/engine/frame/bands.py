@@ -29,7 +29,6 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.runtime.device_executors import Devices, OnDevices
 from jaxsph.engine.runtime.executors import Clock, Executor
-from jaxsph.engine.runtime.tuning import shards_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
@@ -56,7 +55,7 @@ class Work:
 
     def drawn(self, clock: Clock, progress: Progress | None = None) -> Drawn:
         """All bands, on the devices of a clock."""
-        least, told = shards_at_hand(self.plan.cast.tuning), _Told(progress, self.plan.bands)
+        least, told = self.plan.shards, _Told(progress, self.plan.bands)
         if not clock.devices:
             dealt, work = Dealing(((),), (tuple(range(self.plan.bands)),), least), self
         else:

@@ -26,7 +26,6 @@ from jaxsph.engine.planning.fit import PLANS, seen_by
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
-from jaxsph.engine.runtime.tuning import shards_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -82,7 +81,7 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
 
 def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, Image]:
     """A band, and the image of it alone."""
-    shards, plan = shards_at_hand(work.plan.cast.tuning), work.plan
+    shards, plan = work.plan.shards, work.plan
     clock.foresee(lambda known: work.bands(shards, clock.forecast(known), [number], None))
     (band,) = work.bands(shards, clock, [number], None)
     return band, image_of(work.developed(clock, [band]), work.camera, work.settings, plan, clock, planned=planned)
@@ -114,7 +113,7 @@ def _of_leaves(work: Work, clock: Clock, image: Image, row: int, column: int) ->
     plan, shares = work.plan, dict[str, float | None]({SCREEN: None})
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
-        frame = work.begun(shards_at_hand(plan.cast.tuning), clock)
+        frame = work.begun(plan.shards, clock)
         decided, _ = frame.decide(frame.grid(jnp.int32(first), clock).of(frame.ordered), clock)
         shares[INTERPOLATION] = float(_at(plan, unshard(tuple(one.verdict.bound for one in decided)), row - first, column))
     if ends(work.settings):

@@ -18,7 +18,6 @@ from jaxsph.engine.frame.refinement_stages import Decisions, mark
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock, Executor, Forecast
-from jaxsph.engine.runtime.tuning import shards_at_hand
 from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.marking import Quality
 from jaxsph.engine.screen.packets import Queue
@@ -107,8 +106,7 @@ class Progressive:
         plan, self._seen = PLANS.for_frame(asked, self._clock)
 
         def frame_by(run: Executor) -> Frame:
-            shards = shards_at_hand(plan.cast.tuning)
-            return Frame.begun(self._seen, asked.camera, self._settings, plan, asked.scene.formulas, shards, run)
+            return Frame.begun(self._seen, asked.camera, self._settings, plan, asked.scene.formulas, plan.shards, run)
 
         def rehearse(known: list[bool]) -> None:
             run = Forecast(known)

@@ -22,7 +22,7 @@ from jaxsph.engine.field.lattice import FINEST, Spacing
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.memory_estimate import frame_bytes, quadtree_bytes
 from jaxsph.engine.request import DOUBLINGS, first_samples
-from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning
+from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
 from jaxsph.engine.screen.quadtree import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
@@ -99,6 +99,11 @@ class Plan:
             self.control.nodes if isinstance(self.control, PilotPlan) else None,
             self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
         )
+
+    @property
+    def shards(self) -> int:
+        """Of a band, that this process runs side by side: of a quadtree so many as its coarse lattice has, too."""
+        return shards_at_hand(self.cast.tuning, *(() if self.quadtree is not None else (self.lists.num_bundles,)))
 
     def dealt(self, shards: int) -> Plan:
         """With columns of tiles beyond the image such that a band's bundles can be dealt to so many shards."""

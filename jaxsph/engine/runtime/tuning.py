@@ -18,7 +18,8 @@ from jaxtyping import Array
 
 from jaxsph.numerics.checks import require_sizes
 
-MAX_SHARDS = 4  # a tile has four bundles, so that many divide any band
+MAX_SHARDS = 64  # of a band
+BUNDLES_OF_TILE = 4  # so many shards divide any band
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +110,6 @@ def cores_at_hand() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def shards_at_hand(tuning: Tuning) -> int:
-    """How many shards are run side by side: a power of two, as many as there are cores."""
-    return min(tuning.max_shards, 1 << (cores_at_hand().bit_length() - 1))
+def shards_at_hand(tuning: Tuning, bundles: int = BUNDLES_OF_TILE) -> int:
+    """How many shards are run side by side: a power of two, as many as there are cores, that divides so many bundles."""
+    return min(tuning.max_shards, 1 << (cores_at_hand().bit_length() - 1), bundles & -bundles)

@@ -22,11 +22,15 @@ def test_sizes_below_one_are_refused_by_name(size, value):
         dataclasses.replace(CPU, **{size: value})
 
 
-@pytest.mark.parametrize(("cores", "shards"), [(1, 1), (2, 2), (3, 2), (4, 4), (7, 4), (64, MAX_SHARDS)])
-def test_shards_are_as_many_as_cores_but_divide_any_band(monkeypatch, cores, shards):
+@pytest.mark.parametrize(("cores", "bundles", "shards"), [
+    (1, 4096, 1), (2, 4096, 2), (3, 4096, 2), (7, 4096, 4), (16, 4096, 16), (16, 4 * 31 * 31, 4), (24, 4 * 30 * 31, 8),
+    (200, 4096, MAX_SHARDS), (16, 4, 4),
+])  # fmt: skip
+def test_shards_are_as_many_as_cores_but_divide_the_band(monkeypatch, cores, bundles, shards):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
-    assert shards_at_hand(CPU) == shards
-    assert 4 % shards == 0, "a tile has four bundles"
+    assert shards_at_hand(CPU, bundles) == shards
+    assert bundles % shards == 0
+    assert shards_at_hand(CPU) == min(shards, 4), "a tile has four bundles"
     assert shards_at_hand(ACCELERATOR) == 1
 
 
