@@ -196,21 +196,26 @@ def _pick(sides: Sides, test: Test, plan: ListPlan, pool: ThreadPoolExecutor) ->
 def _split(pairs: _Pairs, plan: ListPlan, pool: ThreadPoolExecutor) -> tuple[np.ndarray, np.ndarray] | None:
     """Ranks of the lists, and where each begins and ends; None without room for so many."""
     rows = [slice(*map(int, start[[0, -1]])) for start in pairs.start]
-    corners = [(row, child) for row in range(plan.tile_rows) for child in range(4)]
-    touched = list(pool.map(lambda corner: pairs.touched[rows[corner[0]]] & (1 << corner[1]) != 0, corners))
+
+    def look(row: int) -> list[np.ndarray]:
+        return [pairs.touched[rows[row]] & (1 << child) != 0 for child in range(4)]
+
+    # a row of tiles at a time: to hand a thread less takes longer than to do it
+    touched = [found for of_row in pool.map(look, range(plan.tile_rows)) for found in of_row]
     begin = np.concatenate([[0], np.cumsum([np.count_nonzero(found) for found in touched])])
     if begin[-1] > plan.list_capacity:
         return None
     rank, borders = _zeros(plan.list_capacity + 1), np.zeros((2, plan.tile_rows, plan.tile_columns, 4), np.int32)
 
-    def split(nth: int) -> None:
-        row, child = corners[nth]
-        some = np.flatnonzero(touched[nth])
-        pairs.rank[rows[row]].take(some, out=rank[begin[nth] : begin[nth + 1]], mode="clip")
-        places = begin[nth] + np.searchsorted(some, pairs.start[row] - pairs.start[row, 0])
-        borders[0, row, :, child], borders[1, row, :, child] = places[:-1], places[1:]
+    def split(row: int) -> None:
+        for child in range(4):
+            nth = 4 * row + child
+            some = np.flatnonzero(touched[nth])
+            pairs.rank[rows[row]].take(some, out=rank[begin[nth] : begin[nth + 1]], mode="clip")
+            places = begin[nth] + np.searchsorted(some, pairs.start[row] - pairs.start[row, 0])
+            borders[0, row, :, child], borders[1, row, :, child] = places[:-1], places[1:]
 
-    list(pool.map(split, range(len(corners))))
+    list(pool.map(split, range(plan.tile_rows)))
     return rank, borders.reshape(2, -1)
 
 
