@@ -4,9 +4,10 @@ Built-in scenes and particle files at 512 x 512, as points and segments of sever
 refined for tolerances, against `jaxsph.reference.integral` at random pixels among those that any particle touches. A pixel's
 error is its largest difference over red, green, blue and alpha; `silent` are pixels over thrice the tolerance whose estimate is
 under a third of their error. Images are timed in turns, compiled programs only; what compiling takes is told apart,
-as the time of the first image. The pilot is a contender, whose tolerance is kept against its 1,024 samples and not the integral. For each image but points' `points_time` is the time that uniform points take for the same 99.9 %
-error, by a power law between the two numbers of samples beside it. Integrals are kept in `--cache`. Writes `results/truth.json`;
-ends in an assert on mean errors.
+as the time of the first image. The pilot is a contender, whose tolerance is kept against its 1,024 samples and not the integral.
+For each image but points' `points_time` is the time that uniform points take for the same 99.9 % error, by a power law between
+the two numbers of samples beside it. Integrals are kept in `--cache`. Writes `results/truth.json`; ends in an assert on mean
+errors.
 
     python benchmarks/truth.py [SCENE or FILE ...] [--samples 64 128 256 512] [--tolerances 0.03 0.01 0.004] [--cache FOLDER]
 """
