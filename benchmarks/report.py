@@ -358,8 +358,9 @@ def truths(found: dict) -> str:
     return f"""## Against the light integral
 {found["size"]} x {found["size"]} pixels, errors at up to {max(scene["pixels"] for scene in found["scenes"])} random ones that any
 particle touches, against `jaxsph.reference.integral`; {found["run"]["device"]}, {found["run"]["cores"]} cores, medians in turns.
-`samples` are points, `pilot` the same with 1,024 samples and that estimator's tolerance; `over, thrice` are the shares of pixels over the tolerance and over three times it, `told / true` the 1 %,
-50 % and 99 % quantiles of the estimate over the error, `points, s` the time of uniform points of the same 99.9 % error.
+`samples` are points, `pilot` the same with 1,024 samples and that estimator's tolerance; `over, thrice` are the shares of pixels
+over the tolerance and over three times it, `told / true` the 1 %, 50 % and 99 % quantiles of the estimate over the error,
+`points, s` the time of uniform points of the same 99.9 % error.
 
 {table(header, rows)}
 """
