@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jaxsph.model.scene import Scene
     from jaxsph.model.settings import Settings
     from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
+    from jaxsph.model.surface import Surface
     from jaxsph.model.transfer.function import TransferFunction
     from jaxsph.model.volume import Volume
     from jaxsph.numerics.faults import CapacityError
@@ -64,6 +65,7 @@ __all__ = [
     "Snapshots",
     "Sphere",
     "StepDoubling",
+    "Surface",
     "TransferFunction",
     "Volume",
     "Within",
@@ -91,6 +93,7 @@ NAMES = {
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
     "IsoSurface": "jaxsph.engine.media.iso_surface:IsoSurface",
+    "Surface": "jaxsph.model.surface:Surface",
     "Scene": "jaxsph.model.scene:Scene",
     "Box": "jaxsph.model.clips.shapes:Box",
     "Plane": "jaxsph.model.clips.shapes:Plane",

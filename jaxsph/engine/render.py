@@ -27,7 +27,7 @@ from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 
@@ -99,6 +99,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         ValueError: no plan, one for another image, or a quadtree over a mesh.
     """
     require_asked(scene, camera, settings)
+    scene = widened(scene)
     camera = with_depths(camera, scene)
     if plan is None:
         raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")

@@ -118,7 +118,7 @@ def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
 
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
-    return bool(scene.point_sets) or registry.integrator_class(integrator).between
+    return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
 
 
 @compiled_quickly
