@@ -16,7 +16,7 @@ from jaxsph.numerics.checks import is_traced, require_finite, require_positive, 
 from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage",)
-COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.15
+COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
 
 

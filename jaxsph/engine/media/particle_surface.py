@@ -5,14 +5,14 @@ Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> norm
 **Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
 level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
 below the level there is no surface, and that is a theorem. Else the field is asked for at one place more, where it may be
-largest. The first change of sign between neighbouring places is a crossing. It is followed by false position (the Illinois form:
+largest, and then, if it is not reached there, at the vertex of the parabola through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the Illinois form:
 Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's, to some roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
-where it weighs most; and of what several make together that which holds the mean of their feet. An *estimate* are two things:
-several thin parts in one interval, none of which one particle makes alone; and a gap in the fluid that is thinner than an
-interval, of a ray that begins in the fluid. More samples find them.
+where it weighs most; and of what several make together that which holds the mean of their feet, or the vertex. An *estimate*
+are two things: several thin parts in one interval, none of which one particle makes alone; and a gap in the fluid that is
+thinner than an interval, of a ray that begins in the fluid. More samples find them.
 
 A clip's face is such a place, too, in the intervals that it cuts: what is thin there is an estimate as well.
 """
@@ -46,6 +46,7 @@ from jaxsph.model.transfer.function import Segments, TransferFunction, find, rea
 from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree
 
+NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
 STEPS = 5  # of false position, from a bracket of at most a sample; Newton's after them squares what is left
 
 
@@ -184,15 +185,24 @@ class ParticleSurface(Medium):
         below = (weight[:, 1:] < self.level) & (weight[:, :-1] < self.level)
         wanted, place = below & (bound.upper >= self.level), bound.place
         if self.clip is not None:
-            part = parts_of(rays.task, self.clip)
+            part = parts_of(rays.task, self.clip, rays.task.depth, jnp.ones((), at.dtype))
             begin, length = at[:, :-1], at[:, 1:] - at[:, :-1]
             enters, leaves = (part.begin > 0) & (part.share > 0), (part.end < 1) & (part.share > 0)
             place = jnp.where(enters, begin + part.begin * length, jnp.where(leaves, begin + part.end * length, place))
             wanted |= enters | leaves
-        between = jnp.where(wanted, place, at[:, :-1])
-        known = lax.cond(wanted.any(), lambda: rays.weights(between), lambda: weight[:, :-1])
-        known = jnp.where(wanted, known, weight[:, :-1])
+        between, known = self._asked(rays, wanted, (jnp.where(wanted, place, at[:, :-1]), weight[:, :-1]))
+        vertex, peak = _vertex((at[:, :-1], between, at[:, 1:]), (weight[:, :-1], known, weight[:, 1:]))
+        near = below & wanted & (known < self.level) & (peak >= NEAR * self.level)
+        if self.clip is not None:
+            near &= ~(enters | leaves)
+        between, known = self._asked(rays, near, (jnp.where(near, vertex, between), known))
         return _interleaved(at, between), _interleaved(weight, known)
+
+    def _asked(self, rays: Piercing, wanted: Array, places: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Places, and the field there: known, or asked for where it is wanted."""
+        place, known = places
+        asked = lax.cond(wanted.any(), lambda: rays.weights(place), lambda: known)
+        return place, jnp.where(wanted, asked, known)
 
     def _lit(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Float[Array, "tasks 7 rays"]:
         """The depth of the crossing, relative to the middle; colour, and normal."""
@@ -266,6 +276,18 @@ def _first(crossed: Bool[Array, "tasks places rays"], *of_places: Array) -> list
     for k in range(crossed.shape[1] - 2, -1, -1):
         found = [jnp.where(crossed[:, k], one[:, k], so_far) for one, so_far in zip(of_places, found, strict=True)]
     return found
+
+
+def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Where the parabola through three points is highest, between the outer two, and how high; the middle one where it is not."""
+    (begin, middle, end), (first, value, last) = places, values
+    before, behind = middle - begin, end - middle
+    rise, fall = (value - first) * behind, (value - last) * before
+    bent = (before > 0) & (behind > 0) & (rise + fall > 0)
+    total = jnp.where(bent, rise + fall, 1)
+    move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
+    curve = jnp.where(bent, total / jnp.where(bent, before * behind * (end - begin), 1), 0)
+    return jnp.clip(middle + move, begin, end), value + curve * move**2
 
 
 def _interleaved(borders: Float[Array, "tasks borders rays"], between: Float[Array, "tasks intervals rays"]) -> Array:
