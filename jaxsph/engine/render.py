@@ -6,6 +6,7 @@ Flow: view_scene -> plan -> frame, band by band -> layers -> Image.
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import Any
 
 import jax
@@ -29,6 +30,7 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
+from jaxsph.model.surface import coverage_at_centers
 from jaxsph.numerics.checks import is_traced
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
@@ -67,7 +69,8 @@ def render(
         `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
         camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
         grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
-        memory does not grow with samples or particles in a cell. Images with super-pixels or of the pilot estimator have no
+        memory does not grow with samples or particles in a cell. Images with super-pixels, of the pilot estimator or of
+        surfaces of particles have no
         derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
@@ -76,7 +79,7 @@ def render(
         CapacityError: eager, when a given `plan` is too small for this frame.
 
     Warns:
-        UserWarning: eager, where segments cannot keep a tolerance everywhere; `error_bound` says where.
+        UserWarning: eager, where no ray meets a surface of particles, with the range of their coverage; where segments cannot keep a tolerance everywhere; `error_bound` says where.
 
     References:
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
@@ -89,7 +92,25 @@ def render(
     clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
     made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
     work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
-    return asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+    image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+    if asked.scene.surface is not None:
+        _tell_if_unreached(asked.scene, image)
+    return image
+
+
+def _tell_if_unreached(scene: Scene, image: Image) -> None:
+    """Warn where no ray meets the surface, with the range of what its level is a level of."""
+    surface, particles = scene.surface, scene.particles
+    if surface is None or particles is None or bool((image.transmittance < 1).any()):
+        return
+    found = coverage_at_centers(particles)
+    told = f"{found.min():.3g} to {found.max():.3g} at particles' centres" if found.size else "0, as there are no particles"
+    warnings.warn(
+        f"no ray meets the surface of level {float(surface.level):g}: the coverage by particles is {told}; give a level below "
+        "that, look where particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:

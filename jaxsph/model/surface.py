@@ -11,11 +11,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.spatial
 
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage",)
+MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
 
@@ -64,6 +68,27 @@ class Surface:
             number = np.asarray(value, np.float64)
             require_finite(name, number, "give a finite number")
             if name in ("level", "smoothing"):
-                require_positive(name, number, "coverage is 0 away from a fluid" if name == "level" else "1 takes supports as given")
+                require_positive(
+                    name, number, "coverage is 0 away from a fluid" if name == "level" else "1 takes supports as given"
+                )
             elif not ((number >= 0) & (number <= 1)).all():
                 raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
+
+
+def coverage_at_centers(particles: Particles, most: int = MOST_CENTERS) -> np.ndarray:
+    r"""$\sum V_j W_j$ at the centres of some particles, at most so many, evenly out of all; nothing without any (host side)."""
+    real = np.asarray(particles.valid)
+    position, support, volume = (
+        np.asarray(column, np.float64)[real] for column in (particles.position, particles.support, particles.volume)
+    )
+    if not len(position):
+        return np.zeros(0)
+    centers = position[:: -(-len(position) // most)]
+    near = scipy.spatial.cKDTree(position).query_ball_point(centers, support.max())
+    kernel = kernels.by_name(particles.kernel)
+
+    def at(center: np.ndarray, here: list[int]) -> float:
+        square = ((position[here] - center) ** 2).sum(1) / support[here] ** 2
+        return float((volume[here] / support[here] ** 3 * kernel.norm * kernel.of_square(square, np)).sum())
+
+    return np.array([at(*one) for one in zip(centers, near, strict=True)])

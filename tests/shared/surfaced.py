@@ -44,7 +44,11 @@ def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES
 
     def at(ray: np.ndarray, depth: Any) -> np.ndarray:
         depth = np.asarray(depth)[..., None]
-        return ray * depth if camera.is_perspective else np.concatenate([np.broadcast_to(ray[:2], (*depth.shape[:-1], 2)), depth], -1)
+        return (
+            ray * depth
+            if camera.is_perspective
+            else np.concatenate([np.broadcast_to(ray[:2], (*depth.shape[:-1], 2)), depth], -1)
+        )
 
     found = [_of_ray(at, ray, depths, weights, level, within, camera) for ray in rays]
     depth, clearance = (np.array([one[k] for one in found]) for k in (0, 1))

@@ -13,8 +13,9 @@ the sum of these largest weights bounds the field in between from above.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax import lax
@@ -22,7 +23,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
-from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
@@ -105,21 +105,26 @@ class Piercing:
         """Of the field between borders, relative to the middle."""
         smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
 
-        def add(block: Block, passed: Passed, so_far: tuple[Any, Array]) -> tuple[Any, Array]:
-            (upper, weighed), first = apart_of(so_far[0]), so_far[1]
-            for k in range(BLOCK):
-                foot = passed.foot[:, k, None]
-                at = jnp.clip(foot, begin, end)
-                rest = (at - foot) ** 2 * passed.rate[:, k, None]
-                weight = smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
-                upper, weighed = upper + weight, weighed + weight * at
-                first = jnp.minimum(first, jnp.where(weight >= level, at, far))
-            return together_of(upper, weighed), first
+        def of_one(block: Block, passed: Passed, k: int) -> tuple[Array, ...]:
+            foot = passed.foot[:, k, None]
+            at = jnp.clip(foot, begin, end)
+            rest = (at - foot) ** 2 * passed.rate[:, k, None]
+            weight = smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
+            return weight, weight * at, jnp.where(weight >= level, at, far)
 
-        far = jnp.asarray(jnp.finfo(border.dtype).max, border.dtype)
+        def both(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
+            return a[0] + b[0], a[1] + b[1], jnp.minimum(a[2], b[2])
+
+        def add(block: Block, passed: Passed, so_far: tuple[Array, ...]) -> tuple[Array, ...]:
+            halves = [
+                functools.reduce(both, (of_one(block, passed, k) for k in range(first, BLOCK, 2))) for first in (0, 1)
+            ]  # in one loop, by a reduction: see `field.sums`
+            operands = tuple(jnp.stack(pair) for pair in zip(*halves, strict=True))
+            return both(so_far, lax.reduce(operands, (zero, zero, far), both, (0,)))
+
+        zero, far = jnp.zeros((), border.dtype), jnp.asarray(jnp.finfo(border.dtype).max, border.dtype)
         nothing = jnp.zeros((begin.shape[0], begin.shape[1], self.lines.u.shape[1]), border.dtype)
-        sums, first = self._over(add, (together_of(nothing, nothing), nothing + far))
-        upper, weighed = apart_of(sums)
+        upper, weighed, first = self._over(add, (nothing, nothing, nothing + far))
         mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
         return Bound(upper, jnp.clip(jnp.where(first < far, first, mean), begin, end))
 

@@ -47,7 +47,8 @@ from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
-STEPS = 5  # of false position, from a bracket of at most a sample; Newton's after them squares what is left
+STEPS = 10  # of false position, at most
+ENOUGH = 0.6  # power of eps, as a share of the level, at which they end: Newton's step squares that
 
 
 class Hit(NamedTuple):
@@ -163,7 +164,9 @@ class ParticleSurface(Medium):
         crossed = inside[:, 1:] != inside[:, :-1]
         if self.clip is not None:
             crossed &= self.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
-        bracket = Bracket(*_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - self.level, values[:, 1:] - self.level))
+        bracket = Bracket(
+            *_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - self.level, values[:, 1:] - self.level)
+        )
         number = crossed.shape[1]
         first = jnp.where(crossed, jnp.arange(number, dtype=jnp.int32)[:, None], number).min(1)
         met = first < number
@@ -207,18 +210,28 @@ class ParticleSurface(Medium):
     def _lit(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Float[Array, "tasks 7 rays"]:
         """The depth of the crossing, relative to the middle; colour, and normal."""
 
-        def step(_: Array, ends: Bracket) -> Bracket:
+        def goes_on(carry: tuple[Bracket, Array, Array, Array]) -> Array:
+            _, _, here, number = carry
+            return (number < STEPS) & (met & (jnp.abs(here) > enough)).any()
+
+        def step(carry: tuple[Bracket, Array, Array, Array]) -> tuple[Bracket, Array, Array, Array]:
+            ends, moved, _, number = carry
             place = ends.secant()
             here = rays.weights(place[:, None])[:, 0] - self.level
             behind = (here >= 0) == (ends.at_low >= 0)  # the crossing lies behind
-            return Bracket(
+            side = jnp.where(behind, 1, -1).astype(moved.dtype)
+            kept = jnp.where(side == moved, 0.5, 1).astype(here.dtype)  # an end that stays twice weighs half
+            moving = Bracket(
                 jnp.where(behind, place, ends.low),
                 jnp.where(behind, ends.high, place),
-                jnp.where(behind, here, ends.at_low / 2),
-                jnp.where(behind, ends.at_high / 2, here),
+                jnp.where(behind, here, kept * ends.at_low),
+                jnp.where(behind, kept * ends.at_high, here),
             )
+            return moving, side, here, number + 1
 
-        ends = lax.fori_loop(0, STEPS, step, bracket)
+        enough = self.level * float(jnp.finfo(self.level.dtype).eps) ** ENOUGH
+        start = bracket, jnp.zeros(met.shape, jnp.int32), jnp.full(met.shape, jnp.inf, enough.dtype), jnp.int32(0)
+        ends, *_ = lax.while_loop(goes_on, step, start)
         place = ends.secant()
         found = rays.found(place)
         ray = rays.lines.slope_u, rays.lines.slope_v, jnp.ones_like(place)

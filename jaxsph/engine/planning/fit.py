@@ -227,7 +227,8 @@ def shape_of(asked: Request) -> FrameShape:
         margin = longest_interval(camera, samples) if _between(scene, settings.integrator) else 0.0
         capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
     size = camera.width, camera.height, samples
-    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)
+    opaque = scene.surface is not None
+    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator, opaque)
 
 
 def _num_classes(support: Any) -> int:

