@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from jaxsph.model.image import Image
     from jaxsph.model.particles.held import emission_measure
     from jaxsph.model.particles.particles import Particles
+    from jaxsph.model.particles.surface import Surface
     from jaxsph.model.points import Points
     from jaxsph.model.projection import Projection
     from jaxsph.model.scene import Scene
     from jaxsph.model.settings import Settings
     from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
-    from jaxsph.model.surface import Surface
     from jaxsph.model.transfer.function import TransferFunction
     from jaxsph.model.volume import Volume
     from jaxsph.numerics.faults import CapacityError
@@ -93,7 +93,7 @@ NAMES = {
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
     "IsoSurface": "jaxsph.engine.media.iso_surface:IsoSurface",
-    "Surface": "jaxsph.model.surface:Surface",
+    "Surface": "jaxsph.model.particles.surface:Surface",
     "Scene": "jaxsph.model.scene:Scene",
     "Box": "jaxsph.model.clips.shapes:Box",
     "Plane": "jaxsph.model.clips.shapes:Plane",

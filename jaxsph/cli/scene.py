@@ -29,7 +29,7 @@ from jaxsph.io.opening.views import camera_and_clip
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both
-from jaxsph.model.surface import Surface
+from jaxsph.model.particles.surface import Surface
 from jaxsph.numerics.nearest import did_you_mean
 
 ISO_COLOR = 0.85, 0.8, 0.7

@@ -28,9 +28,9 @@ from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
+from jaxsph.model.particles.surface import coverage_at_centers
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
-from jaxsph.model.surface import coverage_at_centers
 from jaxsph.numerics.checks import is_traced
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
@@ -70,8 +70,7 @@ def render(
         camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
         grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
         memory does not grow with samples or particles in a cell. Images with super-pixels, of the pilot estimator or of
-        surfaces of particles have no
-        derivatives and raise `NotImplementedError`, as do second derivatives.
+        surfaces of particles have no derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,
@@ -79,7 +78,8 @@ def render(
         CapacityError: eager, when a given `plan` is too small for this frame.
 
     Warns:
-        UserWarning: eager, where no ray meets a surface of particles, with the range of their coverage; where segments cannot keep a tolerance everywhere; `error_bound` says where.
+        UserWarning: eager, where no ray meets a surface of particles, with the range of their coverage; and where segments
+            cannot keep a tolerance everywhere: `error_bound` says where.
 
     References:
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.

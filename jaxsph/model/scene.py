@@ -20,8 +20,8 @@ from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.particles import NOTHING, Particles
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.points import Points
-from jaxsph.model.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import short
@@ -187,7 +187,9 @@ def widened(scene: Scene) -> Scene:
     surface, particles = scene.surface, scene.particles
     if surface is None or particles is None:
         return scene
-    given = {name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")}
+    given: dict[str, Any] = {
+        name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")
+    }
     smoothing = given["smoothing"].astype(particles.support.dtype)
     wide = dataclasses.replace(particles, support=particles.support * smoothing)
     packed = dataclasses.replace(surface, **given | {"smoothing": jnp.ones_like(smoothing)})

@@ -17,8 +17,8 @@ from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.views import MEASURE, length_of
 from jaxsph.model import Settings, registry
 from jaxsph.model.particles.kernels import KERNELS
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.scene import MIXES
-from jaxsph.model.surface import Surface
 from jaxsph.model.transfer.domains import DOMAINS
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS

@@ -181,7 +181,8 @@ def _with_half_depth(
 def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segment, slot: Array, border: Array) -> Array:
     """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they have not `crossed` it.
 
-    In a sample in which something ends them, that is where. Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
+    In a sample in which something ends them, that is where. Whatever the products of the samples round to here, one that has
+    crossed does so at the last sample if not before.
     """
     thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[slot]
     left, reached = transmitted(thickness), transmittance

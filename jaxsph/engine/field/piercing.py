@@ -124,7 +124,8 @@ class Piercing:
 
         zero, far = jnp.zeros((), border.dtype), jnp.asarray(jnp.finfo(border.dtype).max, border.dtype)
         nothing = jnp.zeros((begin.shape[0], begin.shape[1], self.lines.u.shape[1]), border.dtype)
-        upper, weighed, first = self._over(add, (nothing, nothing, nothing + far))
+        start: tuple[Array, ...] = (nothing, nothing, nothing + far)
+        upper, weighed, first = self._over(add, start)
         mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
         return Bound(upper, jnp.clip(jnp.where(first < far, first, mean), begin, end))
 

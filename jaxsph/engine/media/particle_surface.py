@@ -5,8 +5,9 @@ Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> norm
 **Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
 level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
 below the level there is no surface, and that is a theorem. Else the field is asked for at one place more, where it may be
-largest, and then, if it is not reached there, at the vertex of the parabola through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the Illinois form:
-Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's, to some roundings of a support.
+largest, and then, if it is not reached there, at the vertex of the parabola through the three. The first change of sign between
+neighbouring places is a crossing. It is followed by false position (the Illinois form: Dahlquist & Bjoerck 1974, section 6.2)
+and a step of Newton's, to some roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
@@ -41,7 +42,7 @@ from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import COLORS, Medium
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.surface import Surface
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree
@@ -183,7 +184,7 @@ class ParticleSurface(Medium):
     def _places(
         self, rays: Piercing, at: Float[Array, "tasks borders rays"], weight: Float[Array, "tasks borders rays"]
     ) -> tuple[Float[Array, "tasks places rays"], Float[Array, "tasks places rays"]]:
-        """Depths relative to the middle at which the field is known, ascending: borders, and one place between each; and the field."""
+        """Ascending depths, relative to the middle: borders, and a place between each two; and the field there."""
         bound = rays.bound(at[:, :, 0], self.level)
         below = (weight[:, 1:] < self.level) & (weight[:, :-1] < self.level)
         wanted, place = below & (bound.upper >= self.level), bound.place

@@ -28,10 +28,10 @@ from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.exposure import exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
-from jaxsph.model.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
