@@ -155,7 +155,7 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
     """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
     if io.is_volume(options.source):
-        refuse(options, options.of_particles, "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface"), "is for particles, and this is a volume")
         volume, name = cli_parts.volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")

@@ -111,6 +111,12 @@ class Scene:
             absent = "`particles`, `volume`, `points` and `media` are all absent"
             raise ValueError(f"{absent}; give `jaxsph.Scene` something to look at")
 
+    def check_without_surface(self, who: str) -> None:
+        """`check`, for those who know particles as a medium alone; and raise `ValueError` where there is a surface."""
+        self.check()
+        if self.surface is not None:
+            raise ValueError(f"`surface` is unknown to {who}; give `surface=None`, with a `transfer` for the particles")
+
     @property
     def dtype(self) -> Any:
         """float32, or float64 if any part is."""

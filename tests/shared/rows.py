@@ -112,6 +112,10 @@ def _surface(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     return js.Scene(media=(js.IsoSurface.from_volume(_grid(rng), 0.62),))
 
 
+def _fluid(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return dataclasses.replace(_particles(frames, rng, kernel), surface=js.Surface(0.02, smoothing=1.2))
+
+
 def _all(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     scene, volume = _particles(frames, rng, kernel), _volume(frames, rng, kernel)
     more = {"volume": volume.volume, "volume_transfer": volume.volume_transfer, "points": _stars(rng)}
@@ -124,6 +128,7 @@ MEDIA = {
     "volume": _volume,
     "points": _points,
     "surface": _surface,
+    "fluid": _fluid,
     "all together": _all,
     "periodic": _periodic,
 }

@@ -83,6 +83,15 @@ class Bracket(NamedTuple):
         return self.low + jnp.clip(share, 0, 1) * (self.high - self.low)
 
 
+class _Search(NamedTuple):
+    """Brackets of all rays, which end of each moved last, rays whose brackets still shrink, and how often they have."""
+
+    ends: Bracket
+    side: Int[Array, "tasks rays"]
+    active: Bool[Array, "tasks rays"]
+    number: Int[Array, ""]
+
+
 @tree(static=("kernel",))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
@@ -211,28 +220,27 @@ class ParticleSurface(Medium):
     def _lit(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Float[Array, "tasks 7 rays"]:
         """The depth of the crossing, relative to the middle; colour, and normal."""
 
-        def goes_on(carry: tuple[Bracket, Array, Array, Array]) -> Array:
-            _, _, here, number = carry
-            return (number < STEPS) & (met & (jnp.abs(here) > enough)).any()
+        def goes_on(carry: _Search) -> Array:
+            return (carry.number < STEPS) & carry.active.any()
 
-        def step(carry: tuple[Bracket, Array, Array, Array]) -> tuple[Bracket, Array, Array, Array]:
-            ends, moved, _, number = carry
+        def step(carry: _Search) -> _Search:
+            ends, active = carry.ends, carry.active
             place = ends.secant()
             here = rays.weights(place[:, None])[:, 0] - self.level
             behind = (here >= 0) == (ends.at_low >= 0)  # the crossing lies behind
-            side = jnp.where(behind, 1, -1).astype(moved.dtype)
-            kept = jnp.where(side == moved, 0.5, 1).astype(here.dtype)  # an end that stays twice weighs half
+            side = jnp.where(behind, 1, -1).astype(carry.side.dtype)
+            kept = jnp.where(side == carry.side, 0.5, 1).astype(here.dtype)  # an end that stays twice weighs half
             moving = Bracket(
                 jnp.where(behind, place, ends.low),
                 jnp.where(behind, ends.high, place),
                 jnp.where(behind, here, kept * ends.at_low),
                 jnp.where(behind, kept * ends.at_high, here),
             )
-            return moving, side, here, number + 1
+            ends = jax.tree.map(lambda old, new: jnp.where(active, new, old), ends, moving)  # whatever other rays take
+            return _Search(ends, side, active & (jnp.abs(here) > enough), carry.number + 1)
 
         enough = self.level * float(jnp.finfo(self.level.dtype).eps) ** ENOUGH
-        start = bracket, jnp.zeros(met.shape, jnp.int32), jnp.full(met.shape, jnp.inf, enough.dtype), jnp.int32(0)
-        ends, *_ = lax.while_loop(goes_on, step, start)
+        ends = lax.while_loop(goes_on, step, _Search(bracket, jnp.zeros(met.shape, jnp.int32), met, jnp.int32(0))).ends
         place = ends.secant()
         found = rays.found(place)
         ray = rays.lines.slope_u, rays.lines.slope_v, jnp.ones_like(place)
