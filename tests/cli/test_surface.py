@@ -17,7 +17,7 @@ TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
 
 @pytest.fixture
 def asked(tmp_path, monkeypatch):
-    """A small file in an otherwise empty working directory, and the scenes that commands ask pictures of, which none is made of."""
+    """A small file in an otherwise empty working directory; the scenes that commands ask pictures of, which show fog instead."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     columns = {"temperature": rng.uniform(1, 2, 60), "density": np.full(60, 8.0), "mass": np.full(60, 1.0)}
