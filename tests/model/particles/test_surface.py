@@ -81,3 +81,10 @@ def test_a_level_that_no_ray_meets_is_an_empty_picture_and_told_with_the_range()
     nobody = dataclasses.replace(scene.particles, valid=np.zeros_like(scene.particles.valid))
     with pytest.warns(UserWarning, match="0, as there are no particles"):
         js.render(dataclasses.replace(scene, particles=nobody), camera(), SETTINGS)
+
+
+def test_a_camera_is_fitted_to_a_surface_without_a_transfer_function_as_to_an_even_fog():
+    particles = some(200, 0.2)
+    even = js.TransferFunction.from_points([0.0, 1.0], np.ones((2, 3)), [1.0, 1.0])
+    fog = js.Camera.fitted(js.Scene(particles=particles, transfer=even))
+    assert js.Camera.fitted(js.Scene(particles=particles, surface=js.Surface())).describe() == fog.describe()
