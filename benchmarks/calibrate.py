@@ -47,6 +47,7 @@ import jaxsph as js
 from jaxsph.engine.control.interpolation_error import DEVIATIONS_AROUND, MIN_CLEARANCE, SUBSAMPLED_SHARE
 from jaxsph.engine.control.pilot import DEVIATIONS, RESOLVED
 from jaxsph.engine.control.spacing import DEVIATION_PER_BEND
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import written_whole
 
 TOLERANCES = 0.002, 0.004, 0.01, 0.03
@@ -63,7 +64,7 @@ Record = dict
 View = tuple[Look, js.Scene, js.Camera]
 
 
-def planned(views: Iterable[View]) -> js.Plan:
+def planned(views: Iterable[View]) -> Plan:
     """One plan for all of them, such that they share compiled programs."""
     settings, plan = js.Settings(tolerance=TAKEN_APART_AT, estimator="pilot"), None
     for _, scene, camera in views:
@@ -71,7 +72,7 @@ def planned(views: Iterable[View]) -> js.Plan:
     return plan
 
 
-def measure(kind: str, views: Iterable[View], plan: js.Plan, choices: Iterable[float]) -> list[Record]:
+def measure(kind: str, views: Iterable[View], plan: Plan, choices: Iterable[float]) -> list[Record]:
     """One record for each view."""
     records = []
     for look, scene, camera in views:
@@ -81,7 +82,7 @@ def measure(kind: str, views: Iterable[View], plan: js.Plan, choices: Iterable[f
     return records
 
 
-def decided(scene: js.Scene, camera: js.Camera, plan: js.Plan, choices: Iterable[float]) -> list[Record]:
+def decided(scene: js.Scene, camera: js.Camera, plan: Plan, choices: Iterable[float]) -> list[Record]:
     """Errors at all tolerances, with every choice of `DEVIATIONS`."""
     full = js.render(scene, camera, js.Settings())
     true, found = tolerance.layers(full), []

@@ -28,6 +28,7 @@ from jaxsph.engine.field.sums import Sums
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, make_grid
 from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
 from jaxsph.model import registry
 from jaxsph.model.transfer.function import TransferFunction
@@ -45,7 +46,7 @@ class Frame:
     transfer: TransferFunction
     lattice: Lattice
     found: InterpolationError
-    plan: js.Plan
+    plan: Plan
     kernel: str
 
     @property
@@ -80,7 +81,7 @@ class Frame:
         return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
 
 
-def frame_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Frame:
+def frame_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Frame:
     """Grid, lattice and interpolation error as a frame of the pilot has them."""
     assert plan.bands == 1, "the image is too large to be looked at in one piece"
     grid, transfer = _seen(scene, camera, plan)
@@ -88,7 +89,7 @@ def frame_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Frame:
     return Frame(grid, camera, transfer, lattice, found, plan, scene.particles.kernel)
 
 
-def _seen(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> tuple[Grid, TransferFunction]:
+def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, TransferFunction]:
     viewed, transfer, _ = view_scene(scene, camera, samples=plan.samples, num_classes=plan.num_classes)
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
@@ -98,7 +99,7 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> tuple[Grid, Tran
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))
 def _judged(
-    grid: Grid, camera: js.Camera, transfer: TransferFunction, *, plan: js.Plan, kernel: str
+    grid: Grid, camera: js.Camera, transfer: TransferFunction, *, plan: Plan, kernel: str
 ) -> tuple[Lattice, InterpolationError]:
     """`stages.sum_shard`, but that a lattice is sampled even where it does not pay."""
     nodes, slab_samples = plan.control.nodes, plan.cast.slab_samples

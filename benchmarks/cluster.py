@@ -54,7 +54,7 @@ class Rate(NamedTuple):
     processor_seconds_a_frame: float
 
 
-def rate(workers: int, snapshots: js.Snapshots, camera: js.Camera, folder: Path, cores: list[int]) -> Rate:
+def rate(workers: int, snapshots: js.sequence.Snapshots, camera: js.Camera, folder: Path, cores: list[int]) -> Rate:
     """How fast frames are rendered by so many workers."""
     moments = snapshots.moments(snapshots.times)
     with local_client(workers, cores=cores) as client:
@@ -125,7 +125,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         paths = write_snapshots(folder, options.particles)
-        snapshots = js.Snapshots.from_files(paths)
+        snapshots = js.sequence.Snapshots.from_files(paths)
         camera = js.Camera.framing(snapshots, width=256, height=256)
         rates: dict[int, list[Rate]] = {1: [], 2: []}
         for _ in range(options.turns):

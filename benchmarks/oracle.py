@@ -37,6 +37,7 @@ from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.schedule import full_rate, reference_quantities
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.model.transfer.function import Segments, look_up
 
@@ -199,7 +200,7 @@ def cut(scene: js.Scene, camera: js.Camera) -> Cut:
     return Cut(light, filled // work.shape[1], filled % work.shape[1], work.ravel()[filled].astype(float), work.shape)
 
 
-def grid_of(scene: js.Scene, camera: js.Camera, plan: js.Plan) -> Grid:
+def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
     depths = half_steps(camera, scene.particles.dtype, plan.samples)[1::2]
     ordered = rank_particles(
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from jaxsph.engine.media.iso_surface import IsoSurface
     from jaxsph.engine.media.within import Within
     from jaxsph.engine.planning.fit import plan
-    from jaxsph.engine.planning.plan import Plan
     from jaxsph.engine.render import render
     from jaxsph.model.camera.camera import Camera
     from jaxsph.model.camera.path import CameraPath
@@ -31,8 +30,8 @@ if TYPE_CHECKING:
     from jaxsph.model.image import Image
     from jaxsph.model.particles.held import emission_measure
     from jaxsph.model.particles.particles import Particles
+    from jaxsph.model.particles.surface import Surface
     from jaxsph.model.points import Points
-    from jaxsph.model.projection import Projection
     from jaxsph.model.scene import Scene
     from jaxsph.model.settings import Settings
     from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     from jaxsph.model.volume import Volume
     from jaxsph.numerics.faults import CapacityError
     from jaxsph.sequence.frames import render_frames
-    from jaxsph.sequence.snapshots import Snapshots
     from jaxsph.trade.sweep import sweep
 
 __all__ = [
@@ -53,18 +51,16 @@ __all__ = [
     "IsoSurface",
     "Particles",
     "Pilot",
-    "Plan",
     "Plane",
     "Points",
-    "Projection",
     "Quadtree",
     "Samples",
     "Scene",
     "Segments",
     "Settings",
-    "Snapshots",
     "Sphere",
     "StepDoubling",
+    "Surface",
     "TransferFunction",
     "Volume",
     "Within",
@@ -93,13 +89,13 @@ NAMES = {
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
     "IsoSurface": "jaxsph.engine.media.iso_surface:IsoSurface",
+    "Surface": "jaxsph.model.particles.surface:Surface",
     "Scene": "jaxsph.model.scene:Scene",
     "Box": "jaxsph.model.clips.shapes:Box",
     "Plane": "jaxsph.model.clips.shapes:Plane",
     "Sphere": "jaxsph.model.clips.shapes:Sphere",
     "Within": "jaxsph.engine.media.within:Within",
     "Image": "jaxsph.model.image:Image",
-    "Projection": "jaxsph.model.projection:Projection",
     # Looks.
     "TransferFunction": "jaxsph.model.transfer.function:TransferFunction",
     "visibility_histogram": "jaxsph.analysis.visibility:visibility_histogram",
@@ -124,10 +120,8 @@ NAMES = {
     "Segments": "jaxsph.model.strategies:Segments",
     "StepDoubling": "jaxsph.model.strategies:StepDoubling",
     "Quadtree": "jaxsph.model.strategies:Quadtree",
-    "Plan": "jaxsph.engine.planning.plan:Plan",
     "CapacityError": "jaxsph.numerics.faults:CapacityError",
     # Sequences.
-    "Snapshots": "jaxsph.sequence.snapshots:Snapshots",
     "render_frames": "jaxsph.sequence.frames:render_frames",
     # Rooms: files, built-in scenes, the oracle, pictures by parts, many frames.
     "io": "jaxsph.io",
@@ -141,8 +135,11 @@ FORMER = {
     "FrameFile": ("jaxsph.sequence.task:FrameFile", "jaxsph.sequence.FrameFile"),
     "FramesError": ("jaxsph.sequence.task:FramesError", "jaxsph.sequence.FramesError"),
     "OnDisk": ("jaxsph.scale.on_disk:OnDisk", "jaxsph.scale.OnDisk"),
+    "Plan": ("jaxsph.engine.planning.plan:Plan", "jaxsph.engine.planning.plan.Plan"),
+    "Projection": ("jaxsph.model.projection:Projection", "jaxsph.model.projection.Projection"),
     "ProjectionPlan": ("jaxsph.analysis.projection.plan:ProjectionPlan", "jaxsph.analysis.projection.plan.ProjectionPlan"),
     "Slice": ("jaxsph.analysis.slices:Slice", "jaxsph.analysis.slices.Slice"),
+    "Snapshots": ("jaxsph.sequence.snapshots:Snapshots", "jaxsph.sequence.Snapshots"),
     "along_axis": ("jaxsph.model.camera.camera:Camera.along_axis", "jaxsph.Camera.along_axis"),
     "control_values": (
         "jaxsph.model.transfer.function:TransferFunction.control_values",

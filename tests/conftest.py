@@ -24,6 +24,7 @@ from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.errors import fits
 from jaxsph.engine.field.schedule import reference_quantities
 from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory_maps, programs
 
@@ -53,10 +54,10 @@ class Frames:
     samples: int = SAMPLES
     capacity: int = CAPACITY
 
-    def plan(self, slab_samples: int = 4, num_classes: int = 3) -> js.Plan:
+    def plan(self, slab_samples: int = 4, num_classes: int = 3) -> Plan:
         lists = ListPlan(2, 2, 4 * self.capacity, 16 * self.capacity)
         cast = CastPlan(16, slab_samples, 48)  # batches that end within a layer
-        return js.Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
+        return Plan(self.width, self.height, self.samples, self.capacity, num_classes, 1, lists, cast, 0)
 
     def deep(self, slab_samples: int) -> Frames:
         """Frames of as many whole cells as the coarsest level merges, and one that is not whole."""

@@ -46,7 +46,7 @@ def test_the_page_for_users_of_jax_runs_as_pasted():
 
 
 def test_there_are_blocks_to_run():
-    assert len(BLOCKS) == 10 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
+    assert len(BLOCKS) == 11 and all(len(block.split("\n")) <= 20 for block in BLOCKS)
 
 
 def test_pictures_and_files_that_are_named_exist():

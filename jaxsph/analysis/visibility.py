@@ -79,7 +79,7 @@ def visibility_histogram(
     References:
         Correa & Ma 2011, *Visibility histograms and visibility-driven transfer functions*.
     """
-    scene.check()
+    scene.check_without_surface("`visibility_histogram`")
     if scene.media:
         raise ValueError("`media` must be `()` for `visibility_histogram`, which knows particles, volumes and points")
     for name, number, most in (("rays", rays, 1 << 24), ("bins", bins, MAX_BINS)):

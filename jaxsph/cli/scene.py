@@ -29,12 +29,13 @@ from jaxsph.io.opening.views import camera_and_clip
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both
+from jaxsph.model.particles.surface import Surface
 from jaxsph.numerics.nearest import did_you_mean
 
 ISO_COLOR = 0.85, 0.8, 0.7
 OF_SCENES = ("particles", "frame")
 """What stands behind the name of a built-in scene."""
-OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso")
+OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface")
 
 
 def require_something(options: Any, also: str = "") -> None:
@@ -129,6 +130,9 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
         scene = dataclasses.replace(scene, within=both(scene.within, clip))
         if looked:
             scene = exposed(scene, camera, options)
+    if getattr(options, "surface", None) is not None:
+        scene = dataclasses.replace(scene, surface=Surface(options.surface))
+        say("surface", f"where the coverage by particles is {options.surface:g}")
     return Opened(scene, camera, labels, ()), [(options.source, particles)]
 
 
@@ -151,7 +155,7 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
     """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
     if io.is_volume(options.source):
-        refuse(options, options.of_particles, "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface"), "is for particles, and this is a volume")
         volume, name = cli_parts.volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")

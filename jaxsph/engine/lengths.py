@@ -44,7 +44,7 @@ POWERS: dict[type, dict[str, int]] = {
 }
 """Powers of length of the fields of all that a scene is made of; volumes of particles count by their ratios alone."""
 PARTS: dict[type, tuple[str, ...]] = {
-    Scene: ("particles", "transfer", "media", "volume", "volume_transfer", "points", "within"),
+    Scene: ("particles", "transfer", "media", "volume", "volume_transfer", "points", "within", "surface"),
     Particles: ("box",),
     IsoSurface: ("volume",),
     Outside: ("clip",),

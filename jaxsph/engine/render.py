@@ -6,6 +6,7 @@ Flow: view_scene -> plan -> frame, band by band -> layers -> Image.
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import Any
 
 import jax
@@ -27,7 +28,8 @@ from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
-from jaxsph.model.scene import Scene
+from jaxsph.model.particles.surface import coverage_at_centers
+from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
 
@@ -67,8 +69,8 @@ def render(
         `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
         camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
         grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
-        memory does not grow with samples or particles in a cell. Images with super-pixels or of the pilot estimator have no
-        derivatives and raise `NotImplementedError`, as do second derivatives.
+        memory does not grow with samples or particles in a cell. Images with super-pixels, of the pilot estimator or of
+        surfaces of particles have no derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,
@@ -76,20 +78,39 @@ def render(
         CapacityError: eager, when a given `plan` is too small for this frame.
 
     Warns:
-        UserWarning: eager, where segments cannot keep a tolerance everywhere; `error_bound` says where.
+        UserWarning: eager, where no ray meets a surface of particles, with the range of their coverage; and where segments
+            cannot keep a tolerance everywhere: `error_bound` says where.
 
     References:
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
     """
     settings = Settings() if settings is None else settings
     if plan is not None and not isinstance(plan, Plan):
-        raise ValueError(f"`plan` must be a `jaxsph.Plan`, got {type(plan).__name__}; make one with `jaxsph.plan`")
+        raise ValueError(f"`plan` must be a plan, got {type(plan).__name__}; make one with `jaxsph.plan`")
     if is_traced(scene, camera, settings):
         return _traced_image(scene, camera, settings, plan, devices)
     clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
     made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
     work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
-    return asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+    image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+    if asked.scene.surface is not None:
+        _tell_if_unreached(asked.scene, image)
+    return image
+
+
+def _tell_if_unreached(scene: Scene, image: Image) -> None:
+    """Warn where no ray meets the surface, with the range of what its level is a level of."""
+    surface, particles = scene.surface, scene.particles
+    if surface is None or particles is None or bool((image.transmittance < 1).any()):
+        return
+    found = coverage_at_centers(particles)
+    told = f"{found.min():.3g} to {found.max():.3g} at particles' centres" if found.size else "0, as there are no particles"
+    warnings.warn(
+        f"no ray meets the surface of level {float(surface.level):g}: the coverage by particles is {told}; give a level below "
+        "that, look where particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan | None, devices: Any) -> Image:
@@ -99,6 +120,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
         ValueError: no plan, one for another image, or a quadtree over a mesh.
     """
     require_asked(scene, camera, settings)
+    scene = widened(scene)
     camera = with_depths(camera, scene)
     if plan is None:
         raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")

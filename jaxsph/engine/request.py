@@ -15,7 +15,7 @@ from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
@@ -48,6 +48,8 @@ class Request(NamedTuple):
             ValueError: arguments of other kinds, or a combination that nothing can render.
         """
         require_asked(scene, camera, settings)
+        scene = widened(scene)
+        _require_marched(scene, settings)
         camera = with_depths(camera, scene)
         digits = digits_to_scale(scene, camera)
         scene = reachable(scaled(scene, digits), settings)
@@ -74,6 +76,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
             for that nothing can keep.
     """
     scene.check()
+    _require_marched(scene, settings)
     if registry.integrator_class(settings.integrator).asks_points:
         _require_points(scene, settings.integrator)
     if settings.tolerance is None:
@@ -84,6 +87,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
         "`Scene(points=...)`": bool(scene.point_sets),
+        "`Scene(surface=...)`": scene.surface is not None,
     }
     if settings.screen == "quadtree":
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
@@ -95,6 +99,19 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
     return settings
+
+
+def _require_marched(scene: Scene, settings: Settings) -> None:
+    """Raise where a surface of particles is to be marched by what cannot find it."""
+    if scene.surface is None:
+        return
+    if registry.integrator_class(settings.integrator).asks_points:
+        raise ValueError(
+            f"`integrator={settings.integrator!r}` asks media for points, and `Scene(surface=...)` lies between them; give "
+            "`integrator='samples'`, or leave the surface out"
+        )
+    if settings.is_refined:
+        raise ValueError("`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or leave that out")
 
 
 def _require_points(scene: Scene, integrator: str) -> None:

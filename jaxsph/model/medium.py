@@ -47,6 +47,8 @@ class Medium(abc.ABC):
         at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
+        stops_rays: whether `stops` tells where rays end at something opaque, behind which nothing is marched.
+        no_derivatives: what is said where an image of it is differentiated; None where that is right.
         in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
             part of an interval.
     """
@@ -54,6 +56,8 @@ class Medium(abc.ABC):
     at_points: ClassVar[bool] = True
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
+    stops_rays: ClassVar[bool] = False
+    no_derivatives: ClassVar[str | None] = None
 
     @property
     def dtype(self) -> Any:
@@ -137,6 +141,13 @@ class Medium(abc.ABC):
         By default nothing is.
         """
         return jnp.zeros(task.shape[::2], task.depth.dtype)
+
+    def stops(self, gathered: Any, task: Any) -> Float[Array, "tasks rays"]:
+        """View depths at which rays end in slabs, infinite where they do not; of media that `stops_rays`.
+
+        There lies the half depth of rays that arrive with more, exactly and not to within a sample.
+        """
+        raise NotImplementedError(f"`{type(self).__name__}` says that it stops rays: define `stops`, which tells where")
 
     def met(self, gathered: Any, task: Any) -> list[Array]:
         """What an integrator makes light of: `optics` at samples or, of a task that is `between` them, all `means`."""

@@ -20,6 +20,7 @@ from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.particles import NOTHING, Particles
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
@@ -43,13 +44,15 @@ class Scene:
 
     Attributes:
         particles: the particle set.
-        transfer: maps its quantity to colour and extinction; given with particles, and only then.
+        transfer: maps its quantity to colour and extinction; given with particles, and only then. With a surface it is that
+            surface's colours, and may be left out.
         media: other media in the same rays, see `docs/extending.md`.
         volume: a quantity on a regular grid, rendered as a medium that shares the rays; or a tuple of several.
         volume_transfer: maps it to colour and extinction; given with a volume, and only then, and for several one each.
         points: a point set, or a tuple of several.
         mix: how parts that share a sample are mixed. Extinctions add up either way; "extinction" has colours weigh by extinction,
             "opacity" adds colours times opacities (Kaehler, Abel & Hege 2007, equations 1 to 4), see `model.mixture`.
+        surface: of the particles, which are then shown by it alone.
         within: where all of it is shown, by `jaxsph.Plane`, `Box` and `Sphere`; nothing is there elsewhere. None is everywhere.
     """
 
@@ -61,11 +64,12 @@ class Scene:
     points: Points | tuple[Points, ...] | None = None
     mix: str = "extinction"
     within: Clip | None = None
+    surface: Surface | None = None
 
     def __post_init__(self) -> None:
         if self.mix not in MIXES:
             raise ValueError(f"`mix` must be one of {', '.join(map(repr, MIXES))}, got {self.mix!r}")
-        kinds = {"particles": Particles, "transfer": TransferFunction}
+        kinds = {"particles": Particles, "transfer": TransferFunction, "surface": Surface}
         several = {"volume": Volume, "volume_transfer": TransferFunction, "points": Points}
         for name, kind in (kinds | several).items():
             value = getattr(self, name)
@@ -87,7 +91,9 @@ class Scene:
 
     def check(self) -> None:
         """Raise `ValueError` where there is nothing to look at, or a part without what it looks like."""
-        for part, look in PAIRS:
+        if self.surface is not None and self.particles is None:
+            raise ValueError("`surface` is that of `particles`, got None; give both to `jaxsph.Scene`, or neither")
+        for part, look in PAIRS[self.surface is not None :]:
             if (getattr(self, part) is None) != (getattr(self, look) is None):
                 missing, given = (look, part) if getattr(self, look) is None else (part, look)
                 raise ValueError(f"`{missing}` must be given with `{given}`, got None; give both to `jaxsph.Scene`, or neither")
@@ -95,7 +101,7 @@ class Scene:
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")
         two_quantities = self.particles is not None and self.particles.extinction_quantity is not None
-        if two_quantities and self.transfer is not None and self.transfer.extinction_values is None:
+        if two_quantities and self.surface is None and self.transfer is not None and self.transfer.extinction_values is None:
             raise ValueError(
                 "`particles` carry two quantities, but `transfer` looks up colour and extinction by one: give "
                 "`jaxsph.TransferFunction.from_points(..., extinction_values=...)`, control points in units of the second, or "
@@ -104,6 +110,12 @@ class Scene:
         if self.particles is None and not volumes and not self.point_sets and not self.media:
             absent = "`particles`, `volume`, `points` and `media` are all absent"
             raise ValueError(f"{absent}; give `jaxsph.Scene` something to look at")
+
+    def check_without_surface(self, who: str) -> None:
+        """`check`, for those who know particles as a medium alone; and raise `ValueError` where there is a surface."""
+        self.check()
+        if self.surface is not None:
+            raise ValueError(f"`surface` is unknown to {who}; give `surface=None`, with a `transfer` for the particles")
 
     @property
     def dtype(self) -> Any:
@@ -174,6 +186,20 @@ def spheres_of(scene: Scene) -> Particles:
         rest = jnp.concatenate([one.astype(dtype) for one in rests])
     valid = jnp.concatenate([one.valid for one in sets])
     return Particles(**columns, valid=valid, kernel=scene.formulas.kernel, position_rest=rest)
+
+
+def widened(scene: Scene) -> Scene:
+    """The scene with `smoothing` put into the supports of its particles, whose volumes stay: what all stages are given."""
+    surface, particles = scene.surface, scene.particles
+    if surface is None or particles is None:
+        return scene
+    given: dict[str, Any] = {
+        name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")
+    }
+    smoothing = given["smoothing"].astype(particles.support.dtype)
+    wide = dataclasses.replace(particles, support=particles.support * smoothing)
+    packed = dataclasses.replace(surface, **given | {"smoothing": jnp.ones_like(smoothing)})
+    return dataclasses.replace(scene, particles=wide, surface=packed)
 
 
 def first_spheres(scene: Scene) -> tuple[int, ...]:

@@ -52,7 +52,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     settings = settings or Settings()
     if every < 1:
         raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
-    scene.check()
+    scene.check_without_surface("the reference")
     if scene.media:
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
     camera = with_depths(camera, scene)

@@ -75,7 +75,7 @@ def integral(
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2 (field). Kaehler, Abel & Hege 2007, equations 1 to 4 (parts).
     """
     started = time.perf_counter()
-    scene.check()
+    scene.check_without_surface("the reference")
     if scene.media:
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
     if not tolerance >= LEAST_TOLERANCE:

@@ -124,7 +124,7 @@ class IntegralAt:
     @classmethod
     def of(cls, scene: Scene, camera: Camera, count: int) -> IntegralAt | None:
         """At so many pixels of the whole image, always the same of one size; None of no pixels, or of `media` unknown to it."""
-        if not count or scene.media:
+        if not count or scene.media or scene.surface is not None:
             return None
         number = camera.width * camera.height
         chosen = np.random.default_rng(SEED).choice(number, min(count, number), replace=False)

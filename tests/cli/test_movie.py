@@ -65,7 +65,7 @@ def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, capsy
     more = ["--fps", 10, "--samples", 16, "--frame-format", "exr", "--range", "-1,2"]
     code, out, _ = run(capsys, *sequence, "--camera", "keys.json", *more)
     assert code == 0 and "s_2.mp4, 4 frames" in out and "20 x 12" in out
-    snapshots = js.Snapshots.from_files(sequence)
+    snapshots = js.sequence.Snapshots.from_files(sequence)
     transfer, _ = look_of(snapshots.survey.middle, "temperature", Look(range=(-1, 2)))
     path = js.CameraPath.load("keys.json")
     for frame in (1, 2, 4):

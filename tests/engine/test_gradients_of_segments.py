@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.model.particles import kernels
 
 CAPACITY = 6
 RTOL = 1e-4
 SETTINGS = js.Settings(samples=12, integrator="segments")
-PLAN = js.Plan(8, 6, 12, CAPACITY, 3, 1, ListPlan(1, 1, 64, 256), CastPlan(8, 4, 16), 0, integrator="segments")
+PLAN = Plan(8, 6, 12, CAPACITY, 3, 1, ListPlan(1, 1, 64, 256), CastPlan(8, 4, 16), 0, integrator="segments")
 
 
 def of_segments(frames):

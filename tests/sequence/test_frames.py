@@ -45,7 +45,7 @@ def snapshots(tmp_path):
         ids = rng.permutation(count)
         columns = {"id": ids, "support": np.full(count, 2.0 * count ** (-1 / 3)), "temperature": start[ids, 0]}
         np.savez(tmp_path / f"s_{number:03d}.npz", position=position[ids], time=when, **columns)
-    return js.Snapshots.from_files(sorted(tmp_path.glob("s_*.npz")))
+    return js.sequence.Snapshots.from_files(sorted(tmp_path.glob("s_*.npz")))
 
 
 @pytest.mark.slow

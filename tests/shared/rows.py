@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
+from jaxsph.engine.planning.plan import Plan
 
 WIDTH, HEIGHT, SAMPLES, COUNT = 10, 9, 16, 24
 OUTSIDE = ~js.Sphere((0.1, 0.0, 0.1), 0.55)
@@ -53,7 +54,7 @@ class Row:
         scene = MEDIA[self.media](size, rng, self.kernel)
         return dataclasses.replace(scene, within=_double(CLIPS[self.clip])), size.camera(rng, dtype=np.float64)
 
-    def plan(self, frames: Any) -> js.Plan:
+    def plan(self, frames: Any) -> Plan:
         """With room for other scenes of these shapes."""
         plan = js.plan(*self.inputs(frames), self.settings, headroom=4)
         return js.plan(*self.inputs(frames, self.seed + 1), self.settings, like=plan, headroom=4)
@@ -112,6 +113,10 @@ def _surface(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     return js.Scene(media=(js.IsoSurface.from_volume(_grid(rng), 0.62),))
 
 
+def _fluid(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return dataclasses.replace(_particles(frames, rng, kernel), surface=js.Surface(0.02, smoothing=1.2))
+
+
 def _all(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     scene, volume = _particles(frames, rng, kernel), _volume(frames, rng, kernel)
     more = {"volume": volume.volume, "volume_transfer": volume.volume_transfer, "points": _stars(rng)}
@@ -124,6 +129,7 @@ MEDIA = {
     "volume": _volume,
     "points": _points,
     "surface": _surface,
+    "fluid": _fluid,
     "all together": _all,
     "periodic": _periodic,
 }

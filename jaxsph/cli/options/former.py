@@ -22,6 +22,8 @@ COUNTS = {
 LISTS = ("--tolerances", "--estimators", "--baselines", "--frames")
 """Options of `sweep` that took any number of words."""
 FLAGS = ("--not-periodic",)
+ALONE = {"--surface": 0.5}
+"""Values of options that may be given without one."""
 RENAMED: dict[str, tuple[str, str]] = {
     "--quantity": ("--color-by", "{}"),
     "--domain": ("--norm", "{}"),
@@ -76,7 +78,8 @@ def rewritten(command: str, words: Sequence[str], offered: Callable[[str, str], 
         name, equals, value = word.partition("=")
         of_words = name in COUNTS or (name in LISTS and made.command == "sweep")
         if not name.startswith("--") or (offered(made.command, name) and not of_words):
-            made.words.append(word)
+            alone = name in ALONE and not equals and not (left and _is_number(left[0]))
+            made.words.append(f"{name}={ALONE[name]}" if alone else word)
             continue
         given = [value] if equals else _taken(name, left, made.command)
         if name in OF_SCENES or name.startswith(tuple(BEHIND)):

@@ -17,6 +17,7 @@ from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.views import MEASURE, length_of
 from jaxsph.model import Settings, registry
 from jaxsph.model.particles.kernels import KERNELS
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.scene import MIXES
 from jaxsph.model.transfer.domains import DOMAINS
 from jaxsph.model.transfer.looks import PRESETS
@@ -272,12 +273,25 @@ class Look(opening.Look):
         float | None,
         option("--optical-depth", "DEPTH", values.number, LOOK, "of typical rays, instead of what is chosen", show=False),
     ] = None
+    surface: Annotated[Any, NOT_HERE] = None
 
     def __post_init__(self) -> None:
         """What Python checks, and a depth that numbers can hold."""
         if self.optical_depth is not None and self.optical_depth > MAX_OPTICAL_DEPTH:
             raise ValueError(f"`optical_depth` must be at most {MAX_OPTICAL_DEPTH:g}, got {self.optical_depth:g}")
         super().__post_init__()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SurfaceLook(Look):
+    """The same, of a picture whose particles may be shown by their surface."""
+
+    surface: Annotated[
+        float | None,
+        option(
+            "--surface", "[LEVEL]", values.number, LOOK, f"of particles, where they cover so much (default {Surface().level})"
+        ),
+    ] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

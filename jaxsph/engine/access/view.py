@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
@@ -145,17 +146,38 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     CSPH only knows ratios of strengths. They are taken by mantissa and exponent, as H^3 soon leaves the range of float32. What
     all of them are divided by changes nothing, and carries no gradient; nor does a strength of 0.
     """
+    strength, peak, _, counts = _strengths(particles, live)
     support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
-    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
-    mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
-    counts = live & (large > 0)
-    lowest = jnp.iinfo(jnp.int32).min
-    exponent -= jnp.where(counts, exponent, lowest).max(initial=lowest // 2)
-    strength = mantissa * exponents.power_of_two(exponent, mantissa.dtype)
-    peak = lax.stop_gradient(strength.max(initial=0))
     strength = strength / jnp.where(peak > 0, peak, 1)
     kernel = kernels.by_name(particles.kernel)
     lift = 2.0 ** lift_of_sizes(kernel)
     size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
     weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & exponents.is_subnormal(volume))
     return size / support, size, weak
+
+
+def _strengths(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array, Array]:
+    """V / H^3 in units of a power of two; the largest in these units, that power, and which particles have any."""
+    support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
+    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
+    mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
+    counts = live & (large > 0)
+    lowest = jnp.iinfo(jnp.int32).min
+    unit = jnp.where(counts, exponent, lowest).max(initial=lowest // 2)
+    strength = mantissa * exponents.power_of_two(exponent - unit, mantissa.dtype)
+    return strength, lax.stop_gradient(strength.max(initial=0)), unit, counts
+
+
+def weight_of(coverage: Any, particles: Particles, live: Bool[Array, " particles"]) -> Float[Array, ""]:
+    r"""The sum of weights, as `scale` and `size` fold them, that is so much of $\sum V_j W_j$; never 0.
+
+    Without live particles that have any volume, it is of no meaning.
+    """
+    kernel = kernels.by_name(particles.kernel)
+    _, peak, unit, _ = _strengths(particles, live)
+    lifted = jnp.asarray(coverage, peak.dtype) * 2.0 ** (kernel.degree * lift_of_sizes(kernel)) / kernel.norm
+    bits = jnp.finfo(peak.dtype).maxexp - 2
+    half = jnp.clip(-unit, -2 * bits, 2 * bits) // 2
+    rest = jnp.clip(-unit, -2 * bits, 2 * bits) - half
+    lifted = lifted / jnp.where(peak > 0, peak, 1) * exponents.power_of_two(half, peak.dtype)
+    return jnp.maximum(lifted * exponents.power_of_two(rest, peak.dtype), jnp.finfo(peak.dtype).tiny)

@@ -168,7 +168,7 @@ def _moved(
     moving = [i for i, move in enumerate(moves) if not _is_zero(move)]
     if not moving:
         return found, still
-    _require_values(fixed)
+    _require_values(fixed, inputs.media)
     wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
 
     def push(moves: list[Array]) -> Layers:
@@ -202,8 +202,11 @@ def _moves(part: Any) -> bool:
     return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
 
 
-def _require_values(fixed: NonDiffInputs) -> None:
+def _require_values(fixed: NonDiffInputs, media: tuple[Medium, ...]) -> None:
     """Raise where values come from elsewhere, so that their derivatives would be missing."""
+    for medium in media:
+        if medium.no_derivatives is not None:
+            raise NotImplementedError(medium.no_derivatives)
     if fixed.schedule.paint is not None:
         raise NotImplementedError(
             "an image with super-pixels has no derivatives, as their colours come from bounds; "

@@ -64,11 +64,12 @@ class RayState:
     square: Float[Array, "packets rays"] | None = None
 
 
-def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False) -> Segment:
-    """Slabs with nothing in them; `estimated`: and with no error."""
+def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False, stopping: bool = False) -> Segment:
+    """Slabs with nothing in them; `estimated`: and with no error; `stopping`: and where nothing ends rays."""
     red, green, blue, error = (jnp.zeros((slots, rays), dtype) for _ in range(4))
     through, thickness = jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype)
-    return Segment((red, green, blue), through, thickness, error if estimated else None)
+    stop = jnp.full((slots, rays), jnp.inf, dtype) if stopping else None
+    return Segment((red, green, blue), through, thickness, error if estimated else None, stop)
 
 
 def fresh_rays(packets: int, rays: int, dtype: Any, together: Together, estimated: bool = False) -> RayState:
@@ -149,7 +150,7 @@ def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_dep
     emitted, left = [channel[slot] for channel in light.color], light.transmittance[slot]
     behind = rays.transmittance * left
     crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
-    depth = _with_half_depth(rays, crossed, light.thickness, slot, border, half_depths)
+    depth = _with_half_depth(rays, crossed, light, slot, border, half_depths)
     color = tuple(color + rays.transmittance * added for color, added in zip(rays.color, emitted, strict=True))
     square = rays.square
     if square is not None and light.error is not None:
@@ -158,12 +159,12 @@ def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_dep
 
 
 def _with_half_depth(
-    rays: RayState, crossed: Array, thickness: Array, slot: Array, border: Array, together: int
+    rays: RayState, crossed: Array, light: Segment, slot: Array, border: Array, together: int
 ) -> Float[Array, "packets rays"]:
     """`depth` of rays, found for a few packets at a time of those where any ray has crossed one half: others cost nothing."""
     number = crossed.shape[0]
     if together >= number:
-        return _half_depth(rays.depth, crossed, rays.transmittance, thickness, slot, border)
+        return _half_depth(rays.depth, crossed, rays.transmittance, light, slot, border)
     some = crossed.any(1)
     packets = lax.sort(jnp.where(some, jnp.arange(number, dtype=jnp.int32), number))
 
@@ -171,18 +172,19 @@ def _with_half_depth(
         packet = lax.dynamic_slice_in_dim(packets, nth * together, together)
         here = jnp.minimum(packet, number - 1)
         of_rays = [value[here] for value in (depth, crossed, rays.transmittance)]
-        found = fusion_barrier(nth >= 0, _half_depth, *of_rays, thickness, slot[here], border[here])
+        found = fusion_barrier(nth >= 0, _half_depth, *of_rays, light, slot[here], border[here])
         return depth.at[packet].set(found, mode="drop")
 
     return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + together - 1) // together, find_some, rays.depth)
 
 
-def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: Array, slot: Array, border: Array) -> Array:
+def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segment, slot: Array, border: Array) -> Array:
     """Where rays that enter slabs with `transmittance` fall to one half; `depth` where they have not `crossed` it.
 
-    Whatever the products of the samples round to here, one that has crossed does so at the last sample if not before.
+    In a sample in which something ends them, that is where. Whatever the products of the samples round to here, one that has
+    crossed does so at the last sample if not before.
     """
-    thickness = thickness[slot]
+    thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[slot]
     left, reached = transmitted(thickness), transmittance
     for k in range(thickness.shape[1]):
         behind = transmittance * left[:, k]
@@ -190,7 +192,10 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, thickness: A
         filled = thickness[:, k] > 0
         share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
         here = crossed & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
-        depth = jnp.where(here, start + jnp.minimum(share, 1) * (end - start), depth)
+        place = start + jnp.minimum(share, 1) * (end - start)
+        if stop is not None:
+            place = jnp.where((stop >= start) & (stop <= end), stop, place)
+        depth = jnp.where(here, place, depth)
         crossed = crossed & ~here
         reached = behind
     return depth

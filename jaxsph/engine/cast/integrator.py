@@ -26,12 +26,14 @@ class Segment:
         transmittance: what it lets through, the exponential of minus the sum of `thickness`.
         thickness: optical thickness between borders.
         error: how wrong colours and transmittance are estimated to be, whatever shines behind; None where that is not asked for.
+        stop: view depths at which rays end, see `Medium.stops`; None where nothing ends them so.
     """
 
     color: tuple[Float[Array, "slabs rays"], Float[Array, "slabs rays"], Float[Array, "slabs rays"]]
     transmittance: Float[Array, "slabs rays"]
     thickness: Float[Array, "slabs samples rays"]
     error: Float[Array, "slabs rays"] | None = None
+    stop: Float[Array, "slabs rays"] | None = None
 
 
 class Integrator:

@@ -111,7 +111,7 @@ def march(
 
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
     rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining)
-    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining)
+    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
     start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
     found = lax.fori_loop(0, batches.number, march_batch, start)
     left_out, cut = (None, None) if found.left_out is None else found.left_out
@@ -127,7 +127,8 @@ def segments_of(
     task = dataclasses.replace(task, measured=compared)
     gathered = medium.gather(task)
     if not compared:
-        return integrator(medium, gathered, task)
+        light = integrator(medium, gathered, task)
+        return dataclasses.replace(light, stop=medium.stops(gathered, task)) if medium.stops_rays else light
     light = integrator.compared(medium, gathered, task)
     tasks, samples, rays = light.thickness.shape
     return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))

@@ -86,6 +86,8 @@ class Frame:
         limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
         allowed = None if limits is None else limits.tolerance
         least = jnp.asarray(least_transmittance(settings), dtype) if ends(settings) else None
+        if least is None and any(medium.stops_rays for medium in seen.media):  # what lets nothing through hides all behind it
+            least = jnp.asarray(jnp.finfo(dtype).tiny, dtype)
         if limits is not None and plan.quadtree is not None:
             limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
         return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least, seen.within)

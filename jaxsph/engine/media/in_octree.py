@@ -34,7 +34,7 @@ def in_octree(scene: Scene) -> Scene:
         ValueError: under a trace; for particles of two quantities; for points that are spread at "feet" or "centres", or splats,
             which have no extinction at a point.
     """
-    scene.check()
+    scene.check_without_surface("octrees")
     if is_traced(scene):
         raise ValueError(
             "`scene` must be of concrete arrays, as octrees are built on the host; call `in_octree` outside of `jax.jit` and "

@@ -10,7 +10,6 @@ a few steps of false position (the Illinois form: Dahlquist & Bjoerck 1974, sect
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.headlight import OPAQUE, headlight, square_of
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
@@ -31,7 +31,6 @@ from jaxsph.numerics.trees import tree
 
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
 POLISHED = 2  # steps of Newton's after those: the last has the derivatives, and they are as good as the root before it
-OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
 Coordinates = list[Float[Array, "tasks samples rays"]]
 
 
@@ -143,28 +142,17 @@ class IsoSurface(Medium):
         share = _crossing(grid, self.level, front, back, begin, end)
         for _ in range(POLISHED):  # of what comes before a step nothing is left in its derivatives, see `_newton`
             share = _newton(grid, self.level, front, back, lax.stop_gradient(share))
-        return met, self._shade(grid.directions(_gradient(grid, _between(front, back, share))), ray)
+        return met, headlight(grid.directions(_gradient(grid, _between(front, back, share))), ray, self.ambient)
 
     def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, Array]:
         """Opaque samples, and how brightly they shine."""
         met, shade = gathered
-        length = jnp.sqrt(_square(lax.stop_gradient(_ray(_ends(task)))))
+        length = jnp.sqrt(square_of(lax.stop_gradient(_ray(_ends(task)))))
         return jnp.where(met & (length > 0), OPAQUE / jnp.where(length > 0, length, 1), 0), shade
 
     def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """The colour, shaded."""
         return [jnp.broadcast_to(color * samples, task.shape) for color in list(self.color)[channels]]
-
-    def _shade(self, normal: Coordinates, ray: tuple[Array, ...]) -> Float[Array, "tasks 1 rays"]:
-        """Ambient light, and the light from the eye that the surface faces; where it faces nowhere, all of it."""
-        along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
-        square = _square(normal) * _square(ray)
-        facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
-        return self.ambient + (1 - self.ambient) * facing
-
-
-def _square(vector: Sequence[Array]) -> Array:
-    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def _ray(ends: tuple[tuple[Array, ...], tuple[Array, ...]]) -> tuple[Array, ...]:

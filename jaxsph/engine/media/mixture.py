@@ -79,6 +79,16 @@ class Mixture(Medium):
             operator.add, (medium.missed(one, task) for medium, one in zip(self.media, gathered, strict=True))
         )
 
+    @property
+    def stops_rays(self) -> bool:  # type: ignore[override]
+        """Whether any of them does."""
+        return any(medium.stops_rays for medium in self.media)
+
+    def stops(self, gathered: tuple[Any, ...], task: Any) -> Float[Array, "tasks rays"]:
+        """By the first of them."""
+        found = [medium.stops(one, task) for medium, one in zip(self.media, gathered, strict=True) if medium.stops_rays]
+        return functools.reduce(jnp.minimum, found)
+
     def every_other(self, gathered: tuple[Any, ...]) -> tuple[Any, ...]:
         """Of each."""
         return tuple(medium.every_other(one) for medium, one in zip(self.media, gathered, strict=True))

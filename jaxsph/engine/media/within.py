@@ -58,6 +58,16 @@ class Within(Medium):
         return self.medium.between_samples
 
     @property
+    def stops_rays(self) -> bool:  # type: ignore[override]
+        """As the medium."""
+        return self.medium.stops_rays
+
+    @property
+    def no_derivatives(self) -> str | None:  # type: ignore[override]
+        """As the medium."""
+        return self.medium.no_derivatives
+
+    @property
     def dtype(self) -> Any:
         """That of the medium."""
         return self.medium.dtype
@@ -122,6 +132,10 @@ class Within(Medium):
         """Of what is inside, where the medium knows of parts; else all that the medium misses."""
         return self.medium.missed(gathered, self._task(task, self._part(task)))
 
+    def stops(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks rays"]:
+        """Those of the medium: where it is not shown, no sample counts."""
+        return self.medium.stops(gathered, task)
+
     def every_other(self, gathered: Any) -> Any:
         """See `Medium`."""
         return self.medium.every_other(gathered)
@@ -139,7 +153,7 @@ class Within(Medium):
             some = [jnp.where(inside, cotangent, 0) for cotangent in cotangents]
             of_medium, places = self.medium.pull(total.medium, gathered, task, some)
             return dataclasses.replace(total, medium=of_medium), places
-        part, pull_part = jax.vjp(functools.partial(_parts, task), self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
+        part, pull_part = jax.vjp(functools.partial(parts_of, task), self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
         inner = self._task(task, part)
         some = cotangents if self.medium.in_parts else [part.share * cotangent for cotangent in cotangents]
         of_medium, places = self.medium.pull(total.medium, gathered, inner, some)
@@ -157,7 +171,7 @@ class Within(Medium):
         return dataclasses.replace(self, medium=medium)
 
     def _part(self, task: SlabTask) -> Part:
-        return _parts(task, self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
+        return parts_of(task, self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
 
     def _task(self, task: SlabTask, part: Part) -> SlabTask:
         """For the medium: with the part of each interval, if it looks at that."""
@@ -169,7 +183,7 @@ def over_slabs(clip: Clip, slabs: Any) -> Overlap:
     return clip.over((slabs.x_lower, slabs.y_lower, slabs.z_lower), (slabs.x_upper, slabs.y_upper, slabs.z_upper))
 
 
-def _parts(task: SlabTask, clip: Clip, depth: Float[Array, "tasks samples"], factor: Float[Array, ""]) -> Part:
+def parts_of(task: SlabTask, clip: Clip, depth: Float[Array, "tasks samples"], factor: Float[Array, ""]) -> Part:
     """What of each interval lies in a clip, of rays at `factor` times their coordinates."""
     ends = dataclasses.replace(task, depth=depth[:, jnp.array([0, -1])], u=task.u * factor, v=task.v * factor).positions()
     spans = clip.spans(*((tuple(at[:, k] for at in ends)) for k in (0, 1)))

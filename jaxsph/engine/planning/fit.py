@@ -118,7 +118,7 @@ def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
 
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
-    return bool(scene.point_sets) or registry.integrator_class(integrator).between
+    return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
 
 
 @compiled_quickly
@@ -227,7 +227,8 @@ def shape_of(asked: Request) -> FrameShape:
         margin = longest_interval(camera, samples) if _between(scene, settings.integrator) else 0.0
         capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
     size = camera.width, camera.height, samples
-    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator)
+    opaque = scene.surface is not None
+    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator, opaque)
 
 
 def _num_classes(support: Any) -> int:

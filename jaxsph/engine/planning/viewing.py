@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.resolution import too_fine
 from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.lookups.quantities import in_units_of, too_small
+from jaxsph.engine.media.particle_surface import ParticleSurface
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
@@ -46,7 +47,8 @@ class Seen(NamedTuple):
 
     def with_data(self, scene: Scene) -> Seen:
         """With the arrays of the scene that media read, which no stage is to copy."""
-        given = (*(volume for volume, _ in scene.volumes), *scene.point_sets, *scene.media)
+        surface = () if scene.surface is None else (scene.surface,)
+        given = (*surface, *(volume for volume, _ in scene.volumes), *scene.point_sets, *scene.media)
         return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
 
 
@@ -67,6 +69,9 @@ def view_scene(
     depths = sphere_depths(camera, dtype, samples, between_samples)
     viewed = view_particles(particles, camera, depths, num_classes)
     media = _media(scene, camera, dtype)
+    if scene.surface is not None:
+        clip = _clip(within, camera, dtype)
+        media, transfer = (ParticleSurface.seen(scene.surface, particles, viewed, transfer, clip), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)

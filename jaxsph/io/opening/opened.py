@@ -28,6 +28,7 @@ from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.exposure import exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
@@ -132,6 +133,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
+    surface = _surface_of(loaded.shown, look)
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
@@ -140,11 +142,25 @@ def staged(
         view = dataclasses.replace(view, center=tuple(place))
     camera, clip, said = camera_and_clip(scene, view, rows)
     scene = dataclasses.replace(scene, within=both(scene.within, clip))
-    scene = exposed(scene, camera, look)
+    if surface is None:
+        scene = exposed(scene, camera, look)
+    else:
+        scene = dataclasses.replace(scene, surface=surface)
+        smoothed = "" if surface.smoothing == 1 else f", supports times {surface.smoothing:g}"
+        said = [("surface", f"where the coverage by particles is {surface.level:g}{smoothed}"), *said]
     transfer = scene.looks[0]
     span = f"{float(transfer.values[0]):.6g} .. {float(transfer.values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or _labels(loaded), tuple(said))
+
+
+def _surface_of(shown: Particles | Volume, look: Look) -> Surface | None:
+    """The surface that is asked for; that of a volume is another."""
+    if look.surface is None:
+        return None
+    if isinstance(shown, Volume):
+        raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
+    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

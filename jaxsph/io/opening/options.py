@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.clips.clips import Clip
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.domains import DOMAINS
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
@@ -86,6 +87,8 @@ class Look:
         transfer: a transfer function, or the file of one, which says all of it: nothing else goes with it but `exposure`.
         exposure: stops by which extinction is larger (2 to this power) than what is fitted to the picture.
         optical_depth: of typical columns, > 0, instead of what is fitted to the picture.
+        surface: particles are shown by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of
+            a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. None shows them as a medium.
 
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
@@ -98,8 +101,11 @@ class Look:
     transfer: TransferFunction | str | os.PathLike[str] | None = None
     exposure: float = 0.0
     optical_depth: float | None = None
+    surface: Any = None
 
     def __post_init__(self) -> None:
+        if self.surface is not None and not isinstance(self.surface, Surface):
+            Surface(self.surface)  # which checks its level
         for name, known in (("norm", DOMAINS), ("preset", PRESETS)):
             value = getattr(self, name)
             if value is not None and value not in known:

@@ -21,6 +21,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.preview.exposure import typical_exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 
 CENTRAL = 0.99
 FILLED = 0.88
@@ -90,6 +91,7 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
     """
     width_pixels, height_pixels = direction.size
     aspect = width_pixels / height_pixels
+    scene = _evenly_lit(scene)
     middle, height, largest = _first(scene, direction, center)
     camera = direction.camera(middle, height, scene)
     for nth in range(STEPS_BACK + LOOKS):
@@ -189,6 +191,15 @@ def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tup
     middle = (low + high) / 2 @ direction.axes if center is None else np.asarray(center, np.float64)
     height = max(high[1] - low[1], (high[0] - low[0]) / aspect)
     return middle, float(min(height, largest)), float(largest)
+
+
+def _evenly_lit(scene: Scene) -> Scene:
+    """A scene whose surface shows all of its particles alike as one of an even fog of them; others as they are."""
+    if scene.surface is None or scene.particles is None:
+        return scene
+    particles = dataclasses.replace(scene.particles, extinction_quantity=None)
+    even = TransferFunction.from_points((0.0, 1.0), np.ones((2, 3)), (1.0, 1.0))
+    return dataclasses.replace(scene, particles=particles, transfer=even, surface=None)
 
 
 def _strength(scene: Scene) -> np.ndarray:

@@ -18,11 +18,12 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.model.particles import kernels
 
 WIDTH, HEIGHT, SAMPLES, CAPACITY = 13, 10, 32, 8
 SETTINGS = js.Settings(samples=SAMPLES, integrator="segments")
-PLAN = js.Plan(WIDTH, HEIGHT, SAMPLES, CAPACITY, 4, 1, ListPlan(2, 2, 128, 512), CastPlan(16, 4, 48), 0, integrator="segments")
+PLAN = Plan(WIDTH, HEIGHT, SAMPLES, CAPACITY, 4, 1, ListPlan(2, 2, 128, 512), CastPlan(16, 4, 48), 0, integrator="segments")
 CLOSE = 1e-5  # of alpha
 ROUNDING = 64 * np.finfo(np.float32).eps  # of the square of what positions reach to: what grazes a support meets it or not
 FACE = 32 * np.finfo(np.float32).eps  # length units that a face may be off by, so that rays nearly along it meet it elsewhere

@@ -14,6 +14,7 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.engine.media.octree_medium import OctreeParticles, OctreePoints
+from jaxsph.engine.planning.plan import Plan
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -88,7 +89,7 @@ def test_the_same_samples_show_the_same():
 
 def test_under_a_trace_what_has_no_octree_is_refused_and_says_how_to_make_one():
     lists, cast = ListPlan(2, 2, 64, 64), CastPlan(64, 4, 128)
-    plan = js.Plan(WIDTH, HEIGHT, 32, 64, 1, 1, lists, cast, 0, integrator="step_doubling", step_tolerance=STEPS.step_tolerance)
+    plan = Plan(WIDTH, HEIGHT, 32, 64, 1, 1, lists, cast, 0, integrator="step_doubling", step_tolerance=STEPS.step_tolerance)
 
     def color(view, scene):
         return js.render(scene, view, STEPS, plan=plan).color

@@ -14,13 +14,14 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.numerics import faults
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 SETTINGS = js.Settings(samples=24)
 WIDTH, HEIGHT, CAPACITY = 21, 18, 64
-PLAN = js.Plan(WIDTH, HEIGHT, 24, 192, 4, 1, ListPlan(2, 2, 1024, 4096), CastPlan(64, 4, 128), 0)
+PLAN = Plan(WIDTH, HEIGHT, 24, 192, 4, 1, ListPlan(2, 2, 1024, 4096), CastPlan(64, 4, 128), 0)
 """For all images, such that those of the same parts share programs: all point sets have one capacity, all volumes one shape."""
 RNG = np.random.default_rng(8)
 COUNT = 40

@@ -10,6 +10,7 @@ from PIL import Image as Pillow
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.model.projection import Projection
 
 
 def made(mean=False, name="column.mass"):
@@ -17,7 +18,7 @@ def made(mean=False, name="column.mass"):
     weight = np.where(np.arange(12).reshape(3, 4) == 5, 0, 1).astype(np.float32)
     values = np.where(weight > 0, values, np.nan) if mean else np.where(weight > 0, values, 0)
     known = (("jaxsph.kernel", "cubic_spline"),)
-    return js.Projection(
+    return Projection(
         jnp.asarray(values), jnp.asarray(weight) if mean else None, jnp.float32(0.25), False, 0, name, "Msun/kpc**2", known
     )
 

@@ -1,0 +1,186 @@
+r"""The weights of particles along single rays, at depths that each ray has for itself: where fields are bounded and searched.
+
+Flow: schedule -> [piercing] -> particle_surface.
+
+A ray passes a particle at the distance b, nearest at its *foot*; at the depth t their squared distance is
+$b^2 + (t - t_{foot})^2 |d|^2$, so with feet found once each weight takes one square more. Depths are relative to the middle of a
+slab, and positions to where each ray is there, such that nothing large cancels.
+
+A kernel falls with distance. So between two depths a particle weighs most at its foot, or at the end that is nearer to it, and
+the sum of these largest weights bounds the field in between from above.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.field.fetch import Block, fetch
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.model.particles import kernels
+from jaxsph.numerics.fusion import fusion_barrier
+
+Carry = TypeVar("Carry")
+BLOCK = 16  # particles of each slab, unrolled
+
+
+class Lines(NamedTuple):
+    """Rays of slabs.
+
+    Attributes:
+        u, v: lateral coordinates at the middle of the slab; `slope_u`, `slope_v`: a unit of depth.
+        square: of their length a unit of depth.
+        middle: its depth.
+    """
+
+    u: Float[Array, "tasks rays"]
+    v: Float[Array, "tasks rays"]
+    slope_u: Float[Array, "tasks rays"]
+    slope_v: Float[Array, "tasks rays"]
+    square: Float[Array, "tasks rays"]
+    middle: Float[Array, "tasks 1"]
+
+    @classmethod
+    def of(cls, task: SlabTask) -> Lines:
+        """Of the slabs of a task."""
+        u, v = task.ray_coordinates()
+        middle = 0.5 * (task.border[:, :1] + task.border[:, -1:])
+        if not task.perspective:
+            return cls(u, v, jnp.zeros_like(u), jnp.zeros_like(v), jnp.ones_like(u), middle)
+        return cls(u * middle, v * middle, u, v, 1 + u * u + v * v, middle)
+
+    def at(self, place: Float[Array, "tasks some rays"]) -> tuple[Float[Array, "tasks some rays"], ...]:
+        """View coordinates of points of the rays, by depths relative to the middle."""
+        x, y = self.u[:, None] + place * self.slope_u[:, None], self.v[:, None] + place * self.slope_v[:, None]
+        return x, y, place + self.middle[:, None]
+
+
+class Passed(NamedTuple):
+    """A block of particles, as rays pass them: feet, what kernels need of the distance there, and of a unit of depth squared."""
+
+    foot: Float[Array, "tasks block rays"]
+    nearest: Float[Array, "tasks block rays"]
+    rate: Float[Array, "tasks block rays"]
+
+
+class Bound(NamedTuple):
+    """Of the intervals between neighbouring depths.
+
+    Attributes:
+        upper: of the field.
+        place: where it may be largest: at the foot of the first particle that alone reaches the level, else at the mean of all
+            feet, by weight.
+    """
+
+    upper: Float[Array, "tasks intervals rays"]
+    place: Float[Array, "tasks intervals rays"]
+
+
+class Found(NamedTuple):
+    """The field, its gradient in view space, and quantities relative to the slab's references times weights, at points."""
+
+    weight: Float[Array, "tasks rays"]
+    gradient: tuple[Float[Array, "tasks rays"], ...]
+    weighted: tuple[Float[Array, "tasks rays"], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Piercing:
+    """Rays of slabs, and the particles in their windows."""
+
+    ordered: Ordered
+    rank: Int[Array, " pairs"]
+    task: SlabTask
+    lines: Lines
+    kernel: str
+
+    def bound(self, border: Float[Array, "tasks borders"], level: Float[Array, ""]) -> Bound:
+        """Of the field between borders, relative to the middle."""
+        smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
+
+        def of_one(block: Block, passed: Passed, k: int) -> tuple[Array, ...]:
+            foot = passed.foot[:, k, None]
+            at = jnp.clip(foot, begin, end)
+            rest = (at - foot) ** 2 * passed.rate[:, k, None]
+            weight = smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
+            return weight, weight * at, jnp.where(weight >= level, at, far)
+
+        def both(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
+            return a[0] + b[0], a[1] + b[1], jnp.minimum(a[2], b[2])
+
+        def add(block: Block, passed: Passed, so_far: tuple[Array, ...]) -> tuple[Array, ...]:
+            halves = [
+                functools.reduce(both, (of_one(block, passed, k) for k in range(first, BLOCK, 2))) for first in (0, 1)
+            ]  # in one loop, by a reduction: see `field.sums`
+            operands = tuple(jnp.stack(pair) for pair in zip(*halves, strict=True))
+            return both(so_far, lax.reduce(operands, (zero, zero, far), both, (0,)))
+
+        zero, far = jnp.zeros((), border.dtype), jnp.asarray(jnp.finfo(border.dtype).max, border.dtype)
+        nothing = jnp.zeros((begin.shape[0], begin.shape[1], self.lines.u.shape[1]), border.dtype)
+        start: tuple[Array, ...] = (nothing, nothing, nothing + far)
+        upper, weighed, first = self._over(add, start)
+        mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
+        return Bound(upper, jnp.clip(jnp.where(first < far, first, mean), begin, end))
+
+    def weights(self, place: Float[Array, "tasks some rays"]) -> Float[Array, "tasks some rays"]:
+        """The field at depths relative to the middle."""
+        smooth = kernels.by_name(self.kernel)
+
+        def add(block: Block, passed: Passed, total: Array) -> Array:
+            for k in range(BLOCK):
+                rest = (place - passed.foot[:, k, None]) ** 2 * passed.rate[:, k, None]
+                total = total + smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
+            return total
+
+        return self._over(add, jnp.zeros_like(place))
+
+    def found(self, place: Float[Array, "tasks rays"]) -> Found:
+        """Field, gradient and quantities at one depth of each ray."""
+        smooth, lines, number = kernels.by_name(self.kernel), self.lines, len(self.task.entry.references)
+        here = lines.u + place * lines.slope_u, lines.v + place * lines.slope_v, place
+
+        def add(block: Block, passed: Passed, total: Array) -> Array:
+            size, scale = block.size[..., None], block.scale[..., None]
+            rest = (place[:, None] - passed.foot) ** 2 * passed.rate
+            weight = smooth.weigh(passed.nearest, rest, size, jnp)
+            slope = 2 * scale**2 * smooth.slope(passed.nearest, rest, size, jnp)
+            there = block.x[..., None], block.y[..., None], block.z[..., None] - lines.middle[..., None]
+            rows = [weight, *(slope * (at[:, None] - of) for at, of in zip(here, there, strict=True))]
+            rows += [weight * quantity[..., None] for quantity in block.quantities]
+            return total + jnp.stack([row.sum(1) for row in rows])
+
+        weight, *rows = self._over(add, jnp.zeros((4 + number, *place.shape), place.dtype))
+        return Found(weight, tuple(rows[:3]), tuple(rows[3:]))
+
+    def _over(self, add: Callable[[Block, Passed, Carry], Carry], start: Carry) -> Carry:
+        """All particles of the windows, a block at a time."""
+        entry = self.task.entry
+        windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
+
+        def fetched(index: Array) -> Block:
+            return fetch(self.ordered, self.rank, windows, index, references)[1]
+
+        def put(nth: Array, carry: Carry) -> Carry:
+            block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+            return add(block, fusion_barrier(nth >= 0, self._passed, block), carry)
+
+        blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+        return lax.fori_loop(0, blocks, put, start)
+
+    def _passed(self, block: Block) -> Passed:
+        """How rays pass a block of particles."""
+        lines = self.lines
+        x, y = block.x[..., None] - lines.u[:, None], block.y[..., None] - lines.v[:, None]
+        z, scale = block.z[..., None] - lines.middle[..., None], block.scale[..., None]
+        along = x * lines.slope_u[:, None] + y * lines.slope_v[:, None] + z
+        foot = along / lines.square[:, None]
+        away = jnp.maximum((x * x + y * y + z * z) - along * foot, 0)
+        nearest = kernels.by_name(self.kernel).prepare(away * scale**2, block.size[..., None])
+        return Passed(foot, nearest, scale**2 * lines.square[:, None])

@@ -1,0 +1,34 @@
+"""Surfaces in a light at the eye: what is shared by all media that are one.
+
+Flow: gradient, ray -> [headlight] -> iso_surface, particle_surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
+
+
+def headlight(
+    normal: Sequence[Float[Array, "..."]], ray: Sequence[Float[Array, "..."]], ambient: Float[Array, ""]
+) -> Float[Array, "..."]:
+    """Ambient light, and the light from the eye that a surface faces (Lambert); where it faces nowhere, all of it.
+
+    Args:
+        normal, ray: x, y and z of a vector across the surface and of one along the ray, of any lengths.
+        ambient: share of the light that a surface has which is seen edge on.
+    """
+    along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
+    square = square_of(normal) * square_of(ray)
+    facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
+    return ambient + (1 - ambient) * facing
+
+
+def square_of(vector: Sequence[Float[Array, "..."]]) -> Float[Array, "..."]:
+    """Of its length."""
+    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2

@@ -1,0 +1,319 @@
+r"""The surface of particles as a medium: opaque where a ray first crosses a level of their coverage, shaded by its gradient.
+
+Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> normal -> shade] -> integrator.
+
+**Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
+level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
+below the level there is no surface, and that is a theorem. Else the field is asked for at one place more, where it may be
+largest, and then, if it is not reached there, at the vertex of the parabola through the three. The first change of sign between
+neighbouring places is a crossing. It is followed by false position (the Illinois form: Dahlquist & Bjoerck 1974, section 6.2)
+and a step of Newton's, to some roundings of a support.
+
+**What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
+what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
+where it weighs most; and of what several make together that which holds the mean of their feet, or the vertex. An *estimate*
+are two things: several thin parts in one interval, none of which one particle makes alone; and a gap in the fluid that is
+thinner than an interval, of a ray that begins in the fluid. More samples find them.
+
+A clip's face is such a place, too, in the intervals that it cuts: what is thin there is an estimate as well.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Viewed, weight_of
+from jaxsph.engine.field.cover import over_groups
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.piercing import Lines, Piercing
+from jaxsph.engine.field.scattered import gather_scattered
+from jaxsph.engine.field.sums import by_rays
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.headlight import OPAQUE, headlight
+from jaxsph.engine.media.within import parts_of
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.medium import COLORS, Medium
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.surface import Surface
+from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.numerics import faults
+from jaxsph.numerics.trees import tree
+
+NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
+STEPS = 10  # of false position, at most
+ENOUGH = 0.6  # power of eps, as a share of the level, at which they end: Newton's step squares that
+
+
+class Hit(NamedTuple):
+    """Where rays first meet the surface in slabs.
+
+    Attributes:
+        depth: view depth; infinite where a ray does not.
+        interval: which of the slab's it is in; -1 for none.
+        color: red, green and blue, lit.
+        normal: of unit length, out of the fluid, in view space; 0 for none.
+    """
+
+    depth: Float[Array, "tasks rays"]
+    interval: Int[Array, "tasks rays"]
+    color: Float[Array, "tasks 3 rays"]
+    normal: Float[Array, "tasks 3 rays"]
+
+
+class Bracket(NamedTuple):
+    """Depths before and behind a crossing, relative to the middle of a slab, and the field less the level there."""
+
+    low: Float[Array, "tasks rays"]
+    high: Float[Array, "tasks rays"]
+    at_low: Float[Array, "tasks rays"]
+    at_high: Float[Array, "tasks rays"]
+
+    def secant(self) -> Float[Array, "tasks rays"]:
+        """Where a straight line crosses."""
+        change = self.at_low - self.at_high
+        share = jnp.where(change != 0, self.at_low / jnp.where(change != 0, change, 1), 0.5)
+        return self.low + jnp.clip(share, 0, 1) * (self.high - self.low)
+
+
+class _Search(NamedTuple):
+    """Brackets of all rays, which end of each moved last, rays whose brackets still shrink, and how often they have."""
+
+    ends: Bracket
+    side: Int[Array, "tasks rays"]
+    active: Bool[Array, "tasks rays"]
+    number: Int[Array, ""]
+
+
+@tree(static=("kernel",))
+class ParticleSurface(Medium):
+    """The surface of a scene's particles in view space, see `jaxsph.Surface`.
+
+    Attributes:
+        level: as a sum of weights, see `access.view.weight_of`.
+        color, ambient: as of the surface.
+        segments: of the transfer function that colours it; None without one.
+        clip: where it is shown; None everywhere.
+        fault: fault word.
+        kernel: name of the smoothing kernel.
+        ordered, rank: particles and lists of a band.
+    """
+
+    at_points = False
+    between_samples = True
+    stops_rays = True
+    no_derivatives = (
+        "an image of a surface of particles (`Scene(surface=...)`) has no derivatives yet; leave the surface out and give a "
+        "`transfer`, or take the surface of a grid (`jaxsph.resample`, `jaxsph.IsoSurface`)"
+    )
+    level: Float[Array, ""]
+    color: Float[Array, "3"]
+    ambient: Float[Array, ""]
+    segments: Segments | None
+    clip: Clip | None
+    fault: Int[Array, ""]
+    kernel: str
+    ordered: Ordered | None = None
+    rank: Int[Array, " pairs"] | None = None
+
+    @classmethod
+    def seen(
+        cls, surface: Surface, particles: Particles, viewed: Viewed, transfer: TransferFunction | None, clip: Clip | None
+    ) -> ParticleSurface:
+        """Of particles as a camera sees them, with supports that are widened already."""
+        dtype = viewed.x.dtype
+        level, color, ambient = (jnp.asarray(one, dtype) for one in (surface.level, surface.color, surface.ambient))
+        usable = (level > 0) & jnp.isfinite(level) & jnp.isfinite(color).all() & jnp.isfinite(ambient)
+        segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
+        fault = faults.raised(faults.BAD_SURFACE, ~usable)
+        return cls(weight_of(level, particles, viewed.live), color, ambient, segments, clip, fault, particles.kernel)
+
+    def in_band(self, grid: Grid) -> ParticleSurface:
+        """With the particles of a band."""
+        return dataclasses.replace(self, ordered=grid.ordered, rank=grid.lists.rank)
+
+    def faults(self) -> Int[Array, ""]:
+        """Whether level and colour are usable."""
+        return self.fault
+
+    def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
+        """Nothing of its own: particles are in the grid, by which slabs are filled."""
+        return jnp.zeros_like(slabs.z_lower, bool)
+
+    def gather(self, task: SlabTask) -> Hit:
+        """Where the rays of slabs first meet the surface, and how it looks there."""
+        if self.ordered is None or self.rank is None:
+            raise ValueError("a surface is asked for without the lists of a band; call `in_band` first")
+        on_borders = dataclasses.replace(task, depth=task.border, between=False, part=None, measured=False)
+        sums = (gather_scattered if task.scattered else gather)(self.ordered, self.rank, on_borders, self.kernel)
+        weight = by_rays(sums)[0]
+        tasks, _, rays = weight.shape
+        nothing = jnp.asarray([jnp.inf, -1, *[0] * 6], weight.dtype)[None, :, None]
+
+        def search(items: Array, some: SlabTask, found: Array) -> Array:
+            rows = self._searched(some, weight[jnp.minimum(items, tasks - 1)])
+            return found.at[items].set(rows, mode="drop")
+
+        found = over_groups(search, jnp.broadcast_to(nothing, (tasks, 8, rays)), on_borders, weight >= self.level)
+        return Hit(found[:, 0], found[:, 1].astype(jnp.int32), found[:, 2:5], found[:, 5:])
+
+    def _searched(self, task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> Float[Array, "tasks 8 rays"]:
+        """Rows of `Hit`, of some slabs, given the field on their borders."""
+        assert self.ordered is not None and self.rank is not None
+        rays = Piercing(self.ordered, self.rank, task, Lines.of(task), self.kernel)
+        at = jnp.broadcast_to((task.border - rays.lines.middle)[..., None], weight.shape)
+        places, values = self._places(rays, at, weight)
+        inside = values >= self.level
+        crossed = inside[:, 1:] != inside[:, :-1]
+        if self.clip is not None:
+            crossed &= self.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
+        bracket = Bracket(
+            *_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - self.level, values[:, 1:] - self.level)
+        )
+        number = crossed.shape[1]
+        first = jnp.where(crossed, jnp.arange(number, dtype=jnp.int32)[:, None], number).min(1)
+        met = first < number
+
+        def lit() -> Array:
+            return self._lit(rays, bracket, met)
+
+        none = jnp.zeros((met.shape[0], 7, met.shape[1]), weight.dtype)
+        rows = lax.cond(met.any(), lit, lambda: none)
+        depth = jnp.where(met, rows[:, 0] + rays.lines.middle, jnp.inf)
+        interval = jnp.where(met, first // 2, -1).astype(weight.dtype)
+        return jnp.concatenate([depth[:, None], interval[:, None], rows[:, 1:]], 1)
+
+    def _places(
+        self, rays: Piercing, at: Float[Array, "tasks borders rays"], weight: Float[Array, "tasks borders rays"]
+    ) -> tuple[Float[Array, "tasks places rays"], Float[Array, "tasks places rays"]]:
+        """Ascending depths, relative to the middle: borders, and a place between each two; and the field there."""
+        bound = rays.bound(at[:, :, 0], self.level)
+        below = (weight[:, 1:] < self.level) & (weight[:, :-1] < self.level)
+        wanted, place = below & (bound.upper >= self.level), bound.place
+        if self.clip is not None:
+            part = parts_of(rays.task, self.clip, rays.task.depth, jnp.ones((), at.dtype))
+            begin, length = at[:, :-1], at[:, 1:] - at[:, :-1]
+            enters, leaves = (part.begin > 0) & (part.share > 0), (part.end < 1) & (part.share > 0)
+            place = jnp.where(enters, begin + part.begin * length, jnp.where(leaves, begin + part.end * length, place))
+            wanted |= enters | leaves
+        between, known = self._asked(rays, wanted, (jnp.where(wanted, place, at[:, :-1]), weight[:, :-1]))
+        vertex, peak = _vertex((at[:, :-1], between, at[:, 1:]), (weight[:, :-1], known, weight[:, 1:]))
+        near = below & wanted & (known < self.level) & (peak >= NEAR * self.level)
+        if self.clip is not None:
+            near &= ~(enters | leaves)
+        between, known = self._asked(rays, near, (jnp.where(near, vertex, between), known))
+        return _interleaved(at, between), _interleaved(weight, known)
+
+    def _asked(self, rays: Piercing, wanted: Array, places: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Places, and the field there: known, or asked for where it is wanted."""
+        place, known = places
+        asked = lax.cond(wanted.any(), lambda: rays.weights(place), lambda: known)
+        return place, jnp.where(wanted, asked, known)
+
+    def _lit(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Float[Array, "tasks 7 rays"]:
+        """The depth of the crossing, relative to the middle; colour, and normal."""
+
+        def goes_on(carry: _Search) -> Array:
+            return (carry.number < STEPS) & carry.active.any()
+
+        def step(carry: _Search) -> _Search:
+            ends, active = carry.ends, carry.active
+            place = ends.secant()
+            here = rays.weights(place[:, None])[:, 0] - self.level
+            behind = (here >= 0) == (ends.at_low >= 0)  # the crossing lies behind
+            side = jnp.where(behind, 1, -1).astype(carry.side.dtype)
+            kept = jnp.where(side == carry.side, 0.5, 1).astype(here.dtype)  # an end that stays twice weighs half
+            moving = Bracket(
+                jnp.where(behind, place, ends.low),
+                jnp.where(behind, ends.high, place),
+                jnp.where(behind, here, kept * ends.at_low),
+                jnp.where(behind, kept * ends.at_high, here),
+            )
+            ends = jax.tree.map(lambda old, new: jnp.where(active, new, old), ends, moving)  # whatever other rays take
+            return _Search(ends, side, active & (jnp.abs(here) > enough), carry.number + 1)
+
+        enough = self.level * float(jnp.finfo(self.level.dtype).eps) ** ENOUGH
+        ends = lax.while_loop(goes_on, step, _Search(bracket, jnp.zeros(met.shape, jnp.int32), met, jnp.int32(0))).ends
+        place = ends.secant()
+        found = rays.found(place)
+        ray = rays.lines.slope_u, rays.lines.slope_v, jnp.ones_like(place)
+        slope = sum(of * along for of, along in zip(found.gradient, ray, strict=True))
+        step_on = jnp.where(slope != 0, (self.level - found.weight) / jnp.where(slope != 0, slope, 1), 0)
+        place = jnp.clip(place + step_on, ends.low, ends.high)
+        steepest = jnp.maximum(jnp.maximum(abs(found.gradient[0]), abs(found.gradient[1])), abs(found.gradient[2]))
+        gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
+        length = jnp.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
+        normal = [-of / jnp.where(length > 0, length, 1) for of in gradient]
+        light = headlight(normal, ray, self.ambient)
+        colors = [color * light for color in self._colors(rays.task, found.weight, found.weighted[0])]
+        return jnp.where(met[:, None], jnp.stack([place, *colors, *normal], 1), 0)
+
+    def _colors(self, task: SlabTask, weight: Array, weighted: Array) -> list[Float[Array, "..."]]:
+        """Red, green and blue before they are lit."""
+        if self.segments is None:
+            return list(self.color)
+        quantity = task.entry.references[0][:, None] + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
+        return read(self.segments, find(self.segments, quantity), COLORS)
+
+    def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
+        """Opaque where the surface is."""
+        path = task.path()
+        each = jnp.arange(path.shape[1], dtype=jnp.int32)[:, None]
+        opaque = (gathered.interval[:, None] == each) & (path > 0)
+        return jnp.where(opaque, OPAQUE / jnp.where(path > 0, path, 1), 0), gathered
+
+    def colors(self, samples: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """Of the surface, lit."""
+        shape = task.between_shape
+        return [jnp.broadcast_to(samples.color[:, k, None], shape) for k in range(3)[channels]]
+
+    def intervals(self, gathered: Hit, task: SlabTask) -> Hit:
+        """What was gathered is of intervals."""
+        return gathered
+
+    def means(self, intervals: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+        """See `Medium.means`."""
+        extinction, _ = self.extinction(intervals, task)
+        return [*(color * extinction for color in self.colors(intervals, task, COLORS)), extinction][channels]
+
+    def every_other(self, gathered: Hit) -> Hit:
+        """See `Medium.every_other`."""
+        return gathered._replace(interval=jnp.where(gathered.interval >= 0, gathered.interval // 2, -1))
+
+    def stops(self, gathered: Hit, task: SlabTask) -> Float[Array, "tasks rays"]:
+        """See `Medium.stops`."""
+        return gathered.depth
+
+
+def _first(crossed: Bool[Array, "tasks places rays"], *of_places: Array) -> list[Float[Array, "tasks rays"]]:
+    """Of the first crossing of each ray; of the last place, where there is none."""
+    found = [one[:, -1] for one in of_places]
+    for k in range(crossed.shape[1] - 2, -1, -1):
+        found = [jnp.where(crossed[:, k], one[:, k], so_far) for one, so_far in zip(of_places, found, strict=True)]
+    return found
+
+
+def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Where the parabola through three points is highest, between the outer two, and how high; the middle one where it is not."""
+    (begin, middle, end), (first, value, last) = places, values
+    before, behind = middle - begin, end - middle
+    rise, fall = (value - first) * behind, (value - last) * before
+    bent = (before > 0) & (behind > 0) & (rise + fall > 0)
+    total = jnp.where(bent, rise + fall, 1)
+    move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
+    curve = jnp.where(bent, total / jnp.where(bent, before * behind * (end - begin), 1), 0)
+    return jnp.clip(middle + move, begin, end), value + curve * move**2
+
+
+def _interleaved(borders: Float[Array, "tasks borders rays"], between: Float[Array, "tasks intervals rays"]) -> Array:
+    """A border, what is between it and the next, and so on."""
+    tasks, intervals, rays = between.shape
+    pairs = jnp.stack([borders[:, :-1], between], 2).reshape(tasks, 2 * intervals, rays)
+    return jnp.concatenate([pairs, borders[:, -1:]], 1)

@@ -1,0 +1,204 @@
+"""The surface of particles is where their coverage first crosses its level: in its place, without holes, lit by its gradient."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import QUICKLY
+from hypothesis import given
+from hypothesis import strategies as st
+from surfaced import crossing
+
+import jaxsph as js
+
+WIDTH, HEIGHT, SPACING, AMBIENT = 16, 14, 0.1, 0.2
+SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
+CLOSE = 1e-5  # of the least support, what a depth may be off in float32
+GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
+NEAR, FAR = 1.2, 3.2
+
+
+def camera(projection="perspective", eye=(0.35, 0.45, -2.1), near=NEAR, **more):
+    where = {"eye": eye, "target": (0.0, 0.0, 0.0), "width": WIDTH, "height": HEIGHT, "near": near, "far": FAR} | more
+    if projection == "orthographic":
+        return js.Camera.orthographic(**where, view_height=1.3)
+    return js.Camera.look_at(**where, fov_degrees=35.0)
+
+
+def ball(kernel="cubic_spline", dtype=np.float32, spread=0.2, seed=3):
+    """Jittered particles in a ball, with supports that vary."""
+    rng = np.random.default_rng(seed)
+    steps = (np.arange(9) - 4) * SPACING
+    position = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    position = position[np.linalg.norm(position, axis=1) < 0.4]
+    position = position + rng.uniform(-0.01, 0.01, position.shape)
+    support = 0.2 * rng.uniform(1 - spread, 1 + spread, len(position))
+    columns = (one.astype(dtype) for one in (position, support, position[:, 0], np.full(len(position), SPACING**3)))
+    return js.Particles.from_arrays(*columns, kernel)
+
+
+def check(scene, view, settings=SETTINGS, close=CLOSE, within=None):
+    """Depths of all pixels against those by definition; pixels that the field nearly reaches may be on either side."""
+    image, truth = js.render(scene, view, settings), crossing(scene, view, within)
+    depth = np.asarray(image.depth, np.float64)
+    sure = truth.clearance > GRAZED
+    met = np.isfinite(truth.depth)
+    assert met.sum() > 40
+    np.testing.assert_array_equal(np.isfinite(depth)[sure], met[sure])
+    np.testing.assert_array_equal(np.asarray(image.alpha), np.isfinite(depth))
+    both = sure & met
+    steep = np.abs(truth.facing) > 0.02
+    assert np.abs(depth[both & steep] - truth.depth[both & steep]).max() <= close * float(np.min(scene.particles.support))
+    return image, truth, both
+
+
+@pytest.mark.parametrize(
+    ("projection", "integrator", "kernel", "smoothing"),
+    [
+        ("perspective", "samples", "cubic_spline", 1.0),
+        pytest.param("orthographic", "segments", "wendland_c2", 1.4, marks=pytest.mark.slow),
+        pytest.param("orthographic", "samples", "poly6", 0.9, marks=pytest.mark.slow),
+    ],
+)
+def test_a_ball_is_in_its_place_without_holes_and_lit_by_its_gradient(projection, integrator, kernel, smoothing):
+    look = js.TransferFunction.from_points([-0.5, 0.5], [[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]], [1.0, 1.0])
+    surface = js.Surface(0.45, smoothing=smoothing, ambient=AMBIENT)
+    scene = js.Scene(particles=ball(kernel), transfer=look, surface=surface)
+    image, truth, both = check(scene, camera(projection), dataclasses.replace(SETTINGS, integrator=integrator))
+    share = (truth.quantity + 0.5)[..., None]
+    wanted = np.array([0.1, 0.5, 0.9]) * (1 - share) + np.array([0.9, 0.5, 0.1]) * share
+    wanted = wanted * (AMBIENT + (1 - AMBIENT) * truth.facing)[..., None]
+    np.testing.assert_allclose(np.asarray(image.color)[both], wanted[both], atol=1e-3)
+    np.testing.assert_array_equal(np.asarray(image.color)[np.isinf(truth.depth)], 0)
+    assert image.stats["evaluations"] > 0
+
+
+def test_in_double_precision_depths_are_good_to_many_digits(x64):
+    scene = js.Scene(particles=ball(dtype=np.float64), surface=js.Surface(0.45))
+    view = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera())
+    image, *_ = check(scene, view, close=1e-7)
+    assert image.depth.dtype == jnp.float64
+
+
+def test_jit_and_vmap_give_the_eager_picture_and_a_level_changes_without_compiling():
+    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45)), camera()
+    plan = js.plan(scene, view, SETTINGS)
+
+    def draw(level):
+        return js.render(dataclasses.replace(scene, surface=js.Surface(level)), view, SETTINGS, plan=plan)
+
+    eager = js.render(scene, view, SETTINGS, plan=plan)
+    levels = jnp.asarray([0.45, 0.3], jnp.float32)
+    jitted = jax.jit(draw, compiler_options=QUICKLY)
+    alone, both = jitted(levels[0]), jax.jit(jax.vmap(draw), compiler_options=QUICKLY)(levels)
+    for image in (alone, jax.tree.map(lambda leaf: leaf[0], both)):
+        np.testing.assert_allclose(image.color, eager.color, atol=1e-5)
+        np.testing.assert_allclose(np.asarray(image.depth), eager.depth, atol=1e-6)
+    assert (np.asarray(both.depth[1]) <= np.asarray(both.depth[0])).all()  # the lower level lies farther out
+    assert int(both.faults[0]) == 0
+    assert jitted(jnp.asarray(jnp.nan, jnp.float32)).fault_messages[0].startswith("a surface must have a level")
+
+
+@pytest.mark.slow
+def test_from_within_the_fluid_the_first_crossing_is_where_a_ray_leaves_it():
+    scene = js.Scene(particles=ball(), surface=js.Surface(0.45))
+    check(scene, camera(eye=(0.0, 0.02, -0.05), near=0.01))
+
+
+CLIPS = {
+    "plane": (js.Plane((0.05, 0.0, -0.05), (-0.3, 0.2, 1.0)), lambda x: (x - [0.05, 0, -0.05]) @ [-0.3, 0.2, 1.0] >= 0),
+    "~sphere": (~js.Sphere((0.1, 0.1, -0.4), 0.3), lambda x: np.linalg.norm(x - [0.1, 0.1, -0.4], axis=-1) >= 0.3),
+}
+
+
+@pytest.mark.parametrize("name", ["plane", pytest.param("~sphere", marks=pytest.mark.slow)])
+def test_a_clip_cuts_the_surface_and_closes_nothing(name):
+    """At a face of the clip by the very ray; what lies behind is seen through the cut."""
+    clip, inside = CLIPS[name]
+    scene = js.Scene(particles=ball(), surface=js.Surface(0.45), within=clip)
+    _, truth, both = check(scene, camera(), within=inside)
+    whole = crossing(dataclasses.replace(scene, within=None), camera()).depth
+    assert (truth.depth[both] > whole[both] + 0.05).sum() > 20
+
+
+def test_what_lies_in_front_is_seen_and_what_lies_behind_is_hidden():
+    """Points of even extinction, in front of the ball and behind it."""
+    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45, color=(0.0, 0.0, 0.0))), camera(eye=(0.0, 0.0, -2.1))
+    grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 5)), -1).reshape(-1, 2)
+
+    def sheet(z):
+        position = np.concatenate([grid, np.full((25, 1), z)], 1).astype(np.float32)
+        return js.Points.from_arrays(position, np.full(25, 0.1), np.ones((25, 3)), np.full(25, 20.0))
+
+    alone = js.render(scene, view, SETTINGS)
+    front, behind = (js.render(dataclasses.replace(scene, points=sheet(z)), view, SETTINGS) for z in (-0.7, 0.7))
+    hit = np.isfinite(np.asarray(alone.depth))
+    assert np.asarray(front.color)[hit].max() > 0.05 and not np.asarray(behind.color)[hit].any()
+    through = hit & (np.asarray(front.color).max(-1) < 0.45)
+    np.testing.assert_array_equal(np.asarray(front.depth)[through], np.asarray(alone.depth)[through])
+    assert (np.asarray(front.depth)[hit] <= np.asarray(alone.depth)[hit]).all() and through.sum() < hit.sum()
+
+
+def droplets(seed, share):
+    """Twelve particles here and there, and a level that each reaches alone."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-0.4, 0.4, (12, 3)).astype(np.float32)
+    particles = js.Particles.from_arrays(position, rng.uniform(0.06, 0.12, 12), np.zeros(12), rng.uniform(1e-4, 2e-4, 12))
+    real = np.asarray(particles.valid)
+    support, volume = (np.asarray(column, np.float64)[real] for column in (particles.support, particles.volume))
+    peak = 315 / (64 * np.pi) * volume / support**3
+    return js.Scene(particles=particles, surface=js.Surface(float(share * peak.min()))), peak, support
+
+
+@functools.cache
+def plan_for_droplets():
+    return js.plan(droplets(0, 0.5)[0], camera(), COARSE, headroom=8)
+
+
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.2, 0.9))
+def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, share):
+    """Eight samples a ray, two to four supports apart: every ray on which one particle reaches the level meets a surface."""
+    (scene, peak, support), view = droplets(seed, share), camera()
+    depth = np.asarray(js.render(scene, view, COARSE, plan=plan_for_droplets()).depth)
+    u, v = np.meshgrid(np.asarray(view.column(np.arange(WIDTH) + 0.5)), np.asarray(view.row(np.arange(HEIGHT) + 0.5)))
+    way = np.stack([u, v, np.ones_like(u)], -1).astype(np.float64)
+    way /= np.linalg.norm(way, axis=-1, keepdims=True)
+    center = np.asarray(view.to_view(scene.particles.position), np.float64)[np.asarray(scene.particles.valid)]
+    foot = way @ center.T
+    square = np.maximum((center**2).sum(1) - foot**2, 0) / support**2
+    most = peak * np.maximum(1 - square, 0) ** 3
+    alone = (most >= (1 + GRAZED) * float(scene.surface.level)).any(-1)
+    assert alone.any() and np.isfinite(depth[alone]).all()
+    nothing = most.sum(-1) < (1 - GRAZED) * float(scene.surface.level)
+    assert np.isinf(depth[nothing]).all()
+
+
+def test_a_derivative_is_refused_by_name():
+    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45)), camera()
+    plan = js.plan(scene, view, SETTINGS)
+
+    def light(position):
+        moved = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, position=position))
+        return js.render(moved, view, SETTINGS, plan=plan).color.sum()
+
+    with pytest.raises(NotImplementedError, match=r"Scene\(surface=\.\.\.\).*has no derivatives yet; leave the surface out"):
+        jax.eval_shape(jax.grad(light), scene.particles.position)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        (js.Settings(samples=8, integrator="step_doubling"), "asks media for points"),
+        (js.Settings(samples=8, tolerance=0.01), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)` yet"),
+        (js.Settings(samples=8, tolerance=0.01, integrator="segments"), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)`"),
+    ],
+)
+def test_what_cannot_march_a_surface_is_refused_by_name(settings, match):
+    scene = js.Scene(particles=ball(), surface=js.Surface(0.45))
+    with pytest.raises(ValueError, match=match):
+        js.render(scene, camera(), settings)

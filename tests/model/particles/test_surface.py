@@ -1,0 +1,90 @@
+"""What is asked of a surface is checked when it is made, and a level that no ray meets is told with the range of the field."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsph as js
+from jaxsph.model.particles import kernels
+from jaxsph.model.particles.surface import coverage_at_centers
+from jaxsph.model.scene import widened
+
+SETTINGS = js.Settings(samples=12)
+
+
+def some(number=30, support=0.4, kernel="wendland_c2"):
+    rng = np.random.default_rng(1)
+    return js.Particles.from_arrays(rng.uniform(-0.5, 0.5, (number, 3)), support, rng.uniform(0, 1, number), 0.01, kernel)
+
+
+def camera():
+    return js.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), width=8, height=8, near=1.5, far=4.5, fov_degrees=30.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({"level": 0.0}, "`level` must be > 0, but level = 0.0; coverage is 0 away from a fluid"),
+        ({"level": np.nan}, "`level` must be finite"),
+        ({"level": (1.0, 2.0)}, r"`level` must have shape \(\), got \(2,\); give one number"),
+        ({"smoothing": -1.0}, "`smoothing` must be > 0"),
+        ({"of": "density"}, "`of` must be one of 'coverage', got 'density'"),
+        ({"color": (1.0, 0.5, 2.0)}, r"`color` must lie in \[0, 1\]"),
+        ({"ambient": -0.1}, r"`ambient` must lie in \[0, 1\]"),
+    ],
+)
+def test_a_surface_that_is_none_is_refused_by_name(given, match):
+    with pytest.raises(ValueError, match=match):
+        js.Surface(**given)
+
+
+def test_a_scene_with_a_surface_needs_particles_and_no_transfer_function():
+    js.Scene(particles=some(), surface=js.Surface()).check()
+    with pytest.raises(ValueError, match="`surface` is that of `particles`, got None"):
+        js.Scene(surface=js.Surface()).check()
+    with pytest.raises(ValueError, match=r"`surface` must be a `jaxsph.Surface`, got float"):
+        js.Scene(particles=some(), surface=0.5)
+    for refused in (js.reference.render, js.reference.integral):
+        with pytest.raises(ValueError, match="`surface` is unknown to the reference"):
+            refused(js.Scene(particles=some(), surface=js.Surface()), camera())
+
+
+def test_smoothing_widens_supports_once_and_keeps_volumes():
+    scene = js.Scene(particles=some(), surface=js.Surface(0.3, smoothing=1.5))
+    wide = widened(widened(scene))
+    np.testing.assert_allclose(wide.particles.support, 1.5 * np.asarray(scene.particles.support), rtol=1e-6)
+    np.testing.assert_array_equal(wide.particles.volume, scene.particles.volume)
+    assert float(wide.surface.smoothing) == 1 and jax.tree.structure(wide) == jax.tree.structure(widened(scene))
+
+
+def test_coverage_at_centers_is_that_of_the_definition():
+    particles = some()
+    real = np.asarray(particles.valid)
+    position, support = np.asarray(particles.position, np.float64)[real], np.asarray(particles.support, np.float64)[real]
+    apart = np.linalg.norm(position[:, None] - position, axis=-1)
+    wanted = (np.asarray(kernels.evaluate("wendland_c2", apart, support[None])) * 0.01).sum(1)
+    np.testing.assert_allclose(coverage_at_centers(particles), wanted, rtol=1e-5)
+    assert len(coverage_at_centers(particles, 10)) == 10
+
+
+def test_a_level_that_no_ray_meets_is_an_empty_picture_and_told_with_the_range():
+    scene = js.Scene(particles=some(), surface=js.Surface(50.0))
+    with pytest.warns(
+        UserWarning, match=r"no ray meets the surface of level 50: the coverage by particles is 0\.\d+ to [\d.]+ at"
+    ):
+        image = js.render(scene, camera(), SETTINGS)
+    assert not np.any(image.color) and np.isinf(np.asarray(image.depth)).all() and (np.asarray(image.transmittance) == 1).all()
+    nobody = dataclasses.replace(scene.particles, valid=np.zeros_like(scene.particles.valid))
+    with pytest.warns(UserWarning, match="0, as there are no particles"):
+        js.render(dataclasses.replace(scene, particles=nobody), camera(), SETTINGS)
+
+
+def test_a_camera_is_fitted_to_a_surface_without_a_transfer_function_as_to_an_even_fog():
+    particles = some(200, 0.2)
+    even = js.TransferFunction.from_points([0.0, 1.0], np.ones((2, 3)), [1.0, 1.0])
+    fog = js.Camera.fitted(js.Scene(particles=particles, transfer=even))
+    assert js.Camera.fitted(js.Scene(particles=particles, surface=js.Surface())).describe() == fog.describe()

@@ -1,0 +1,93 @@
+"""The surface of particles in float64 NumPy, from nothing but its definition: dense samples, then bisection."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsph.model.particles import kernels
+
+SAMPLES, HALVINGS = 1200, 40
+
+
+class Crossing(NamedTuple):
+    """Where the rays of all pixels first cross.
+
+    Depth (inf for none); how far the field is from the level, as a share of it: at least in front of the crossing, and at most
+    behind it, such that little is grazed; unit normal out of the fluid, its cosine to the ray, and the interpolated quantity.
+    """
+
+    depth: np.ndarray
+    clearance: np.ndarray
+    normal: np.ndarray
+    facing: np.ndarray
+    quantity: np.ndarray
+
+
+def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES) -> Crossing:
+    """Of a scene's surface; `within` tells of places (..., 3) in the world whether they are shown."""
+    surface, p = scene.surface, scene.particles
+    real, level = np.asarray(p.valid), float(surface.level)
+    view = (np.asarray(p.position, np.float64)[real] - np.asarray(camera.eye, np.float64)) @ np.asarray(camera.axes, np.float64).T
+    reach = np.asarray(p.support, np.float64)[real] * float(surface.smoothing)
+    strength = np.asarray(p.volume, np.float64)[real] / reach**3
+    quantity, kernel = np.asarray(p.quantity, np.float64)[real], kernels.by_name(p.kernel)
+
+    def weights(place: np.ndarray) -> np.ndarray:
+        square = ((place[..., None, :] - view) ** 2).sum(-1) / reach**2
+        return strength * kernel.norm * kernel.of_square(square, np)
+
+    u, v = (np.asarray(axis, np.float64) for axis in _axes(camera))
+    rays = np.stack(np.broadcast_arrays(u[None, :], v[:, None], np.ones((len(v), len(u)))), -1).reshape(-1, 3)
+    depths = np.linspace(float(camera.near), float(camera.far), samples)
+
+    def at(ray: np.ndarray, depth: Any) -> np.ndarray:
+        depth = np.asarray(depth)[..., None]
+        return (
+            ray * depth
+            if camera.is_perspective
+            else np.concatenate([np.broadcast_to(ray[:2], (*depth.shape[:-1], 2)), depth], -1)
+        )
+
+    found = [_of_ray(at, ray, depths, weights, level, within, camera) for ray in rays]
+    depth, clearance = (np.array([one[k] for one in found]) for k in (0, 1))
+    normal, facing, carried = np.zeros((len(rays), 3)), np.ones(len(rays)), np.zeros(len(rays))
+    for k, (ray, t) in enumerate(zip(rays, depth, strict=True)):
+        if not np.isfinite(t):
+            continue
+        place, step = at(ray, t), 1e-5 * reach.min()
+        slopes = [(weights(place + e).sum() - weights(place - e).sum()) / (2 * step) for e in step * np.eye(3)]
+        normal[k] = -np.array(slopes) / np.linalg.norm(slopes)
+        way = ray if camera.is_perspective else np.array([0.0, 0.0, 1.0])
+        facing[k] = abs(normal[k] @ way) / np.linalg.norm(way)
+        carried[k] = (weights(place) * quantity).sum() / weights(place).sum()
+    shape = len(v), len(u)
+    return Crossing(*(one.reshape(*shape, *one.shape[1:]) for one in (depth, clearance, normal, facing, carried)))
+
+
+def _of_ray(at: Any, ray: Any, depths: Any, weights: Any, level: float, within: Any, camera: Any) -> tuple[float, float]:
+    places = at(ray, depths)
+    field = weights(places).sum(-1) - level
+    crossed = (field[1:] >= 0) != (field[:-1] >= 0)
+    if within is not None:
+        world = places @ np.asarray(camera.axes, np.float64) + np.asarray(camera.eye, np.float64)
+        crossed &= within(0.5 * (world[1:] + world[:-1]))
+    (where,) = np.nonzero(crossed)
+    near = np.abs(field[: where[0]] if len(where) else field).min(initial=np.inf) / level
+    if not len(where):
+        return np.inf, near
+    end = where[1] if len(where) > 1 else len(field)
+    near = min(near, np.abs(field[where[0] + 1 : end + 1]).max(initial=0) / level)
+    low, high, sign = depths[where[0]], depths[where[0] + 1], field[where[0]] >= 0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        behind = (weights(at(ray, middle)).sum() - level >= 0) == sign
+        low, high = (middle, high) if behind else (low, middle)
+    return 0.5 * (low + high), near
+
+
+def _axes(camera: Any) -> tuple[np.ndarray, np.ndarray]:
+    half, aspect = float(camera.half_height), camera.width / camera.height
+    columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    return half * aspect * (2 * columns / camera.width - 1), half * (1 - 2 * rows / camera.height)
