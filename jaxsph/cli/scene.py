@@ -130,7 +130,7 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
         scene = dataclasses.replace(scene, within=both(scene.within, clip))
         if looked:
             scene = exposed(scene, camera, options)
-    if getattr(options, "surface", None) is not None:
+    if getattr(options, "surface", None) not in (None, False):
         scene = dataclasses.replace(scene, surface=Surface(options.surface))
         say("surface", f"where the coverage by particles is {options.surface:g}")
     return Opened(scene, camera, labels, ()), [(options.source, particles)]

@@ -20,6 +20,8 @@ from jaxsph.model.settings import Settings
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
 
+NO_SURFACE = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
+
 
 class Request(NamedTuple):
     """A picture that is asked for.
@@ -108,10 +110,10 @@ def _require_marched(scene: Scene, settings: Settings) -> None:
     if registry.integrator_class(settings.integrator).asks_points:
         raise ValueError(
             f"`integrator={settings.integrator!r}` asks media for points, and `Scene(surface=...)` lies between them; give "
-            "`integrator='samples'`, or leave the surface out"
+            f"`integrator='samples'`, or {NO_SURFACE}"
         )
     if settings.is_refined:
-        raise ValueError("`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or leave that out")
+        raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {NO_SURFACE}")
 
 
 def _require_points(scene: Scene, integrator: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -74,3 +75,53 @@ def test_a_surface_of_nothing_is_wrong_usage(words, code, match, asked, capsys):
     np.save("drop.npy", np.zeros((4, 4, 4), np.float32))
     got, _, err = run(capsys, "render", *words, *TINY)
     assert got == code and match in err[-1]
+
+
+def of_lattice():
+    """Particles that lie evenly in a ball, and how fast they are."""
+    places = np.stack(np.meshgrid(*[np.arange(-3.0, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    places = places[(places**2).sum(1) < 10]
+    return places, np.linspace(0, 1, len(places))
+
+
+@pytest.fixture
+def liquid():
+    """A file of points and nothing more, as tools for liquids write them."""
+    rows = [f"{x} {y} {z} {speed}" for (x, y, z), speed in zip(*of_lattice(), strict=True)]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z", "speed")]
+    return lambda: Path("liquid.ply").write_text("\n".join([*header, "end_header", *rows, ""]))
+
+
+def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, liquid, capsys):
+    liquid()
+    code, out, err = run(capsys, "render", "liquid.ply", *TINY)
+    assert (code, err) == (0, []) and "where the coverage by particles is 0.5, as of a liquid" in " ".join(out.split())
+    ((scene, camera),) = asked
+    own, own_camera = io.read_scene("liquid.ply", size=(8, 8))
+    assert scene.surface == js.Surface() == own.surface and camera.describe() == own_camera.describe()
+    assert io.read_scene("liquid.ply", surface=False)[0].surface is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--surface", "none"),
+        ("--surface=none",),
+        ("--tolerance", "0.1"),
+        ("--opacity-by", "speed"),
+        ("--exposure", "1"),
+        ("--support", "1.5"),
+    ],
+)
+def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, capsys):
+    liquid()
+    assert run(capsys, "render", "liquid.ply", *words, *TINY)[0] == 0
+    assert asked[-1][0].surface is None
+
+
+def test_even_particles_of_other_kinds_of_files_are_a_medium(asked, capsys):
+    places, speed = of_lattice()
+    np.savez("even.npz", position=places, speed=speed)
+    assert run(capsys, "render", "even.npz", *TINY)[0] == 0
+    assert asked[-1][0].surface is None

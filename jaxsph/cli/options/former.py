@@ -78,7 +78,7 @@ def rewritten(command: str, words: Sequence[str], offered: Callable[[str, str], 
         name, equals, value = word.partition("=")
         of_words = name in COUNTS or (name in LISTS and made.command == "sweep")
         if not name.startswith("--") or (offered(made.command, name) and not of_words):
-            alone = name in ALONE and not equals and not (left and _is_number(left[0]))
+            alone = name in ALONE and not equals and not (left and (left[0] == "none" or _is_number(left[0])))
             made.words.append(f"{name}={ALONE[name]}" if alone else word)
             continue
         given = [value] if equals else _taken(name, left, made.command)

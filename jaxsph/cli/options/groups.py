@@ -273,7 +273,7 @@ class Look(opening.Look):
         float | None,
         option("--optical-depth", "DEPTH", values.number, LOOK, "of typical rays, instead of what is chosen", show=False),
     ] = None
-    surface: Annotated[Any, NOT_HERE] = None
+    surface: Annotated[Any, NOT_HERE] = False
 
     def __post_init__(self) -> None:
         """What Python checks, and a depth that numbers can hold."""
@@ -289,7 +289,11 @@ class SurfaceLook(Look):
     surface: Annotated[
         float | None,
         option(
-            "--surface", "[LEVEL]", values.number, LOOK, f"of particles, where they cover so much (default {Surface().level})"
+            "--surface",
+            "[LEVEL|none]",
+            values.level,
+            LOOK,
+            f"of particles, where they cover so much (of liquids {Surface().level})",
         ),
     ] = None
 

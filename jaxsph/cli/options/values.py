@@ -30,6 +30,11 @@ def number(text: str) -> float:
         raise ValueError(f"must be a number, got {text!r}") from None
 
 
+def level(text: str) -> float | bool:
+    """A number, or False for `none`."""
+    return False if text == "none" else number(text)
+
+
 def whole(text: str) -> int:
     """A whole number."""
     try:

@@ -36,6 +36,8 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
 NEEDS_ROWS = ("face-on", "edge-on")
+OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY"
+"""Formats that liquids are kept in, by tools that draw their surface."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +135,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
-    surface = _surface_of(loaded.shown, look)
+    surface = _surface_of(loaded, look, source)
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
@@ -147,20 +149,34 @@ def staged(
     else:
         scene = dataclasses.replace(scene, surface=surface)
         smoothed = "" if surface.smoothing == 1 else f", supports times {surface.smoothing:g}"
-        said = [("surface", f"where the coverage by particles is {surface.level:g}{smoothed}"), *said]
+        chosen = "" if look.surface is not None else ", as of a liquid; --surface none shows a medium"
+        said = [("surface", f"where the coverage by particles is {surface.level:g}{smoothed}{chosen}"), *said]
     transfer = scene.looks[0]
     span = f"{float(transfer.values[0]):.6g} .. {float(transfer.values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or _labels(loaded), tuple(said))
 
 
-def _surface_of(shown: Particles | Volume, look: Look) -> Surface | None:
-    """The surface that is asked for; that of a volume is another."""
+def _surface_of(loaded: Loaded, look: Look, source: Source | None) -> Surface | None:
+    """The surface that is asked for, or that of a liquid; that of a volume is another."""
     if look.surface is None:
+        return Surface() if _is_liquid(loaded) and not _of_medium(look, source) else None
+    if look.surface is False:
         return None
-    if isinstance(shown, Volume):
+    if isinstance(loaded.shown, Volume):
         raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
     return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
+
+
+def _is_liquid(loaded: Loaded) -> bool:
+    """Whether particles lie evenly, without supports of their own, in a file of a kind that liquids are kept in."""
+    return loaded.report is not None and loaded.report.evenly and loaded.report.source in OF_LIQUIDS
+
+
+def _of_medium(look: Look, source: Source | None) -> bool:
+    """Whether anything was asked for that only a medium has."""
+    own = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
+    return any(one is not None for one in own)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

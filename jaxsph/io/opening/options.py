@@ -88,7 +88,8 @@ class Look:
         exposure: stops by which extinction is larger (2 to this power) than what is fitted to the picture.
         optical_depth: of typical columns, > 0, instead of what is fitted to the picture.
         surface: particles are shown by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of
-            a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. None shows them as a medium.
+            a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. False shows them as a medium. None is
+            the surface of liquids, unless their opacity was asked for, and a medium of all else.
 
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
@@ -104,7 +105,7 @@ class Look:
     surface: Any = None
 
     def __post_init__(self) -> None:
-        if self.surface is not None and not isinstance(self.surface, Surface):
+        if self.surface not in (None, False) and not isinstance(self.surface, Surface):
             Surface(self.surface)  # which checks its level
         for name, known in (("norm", DOMAINS), ("preset", PRESETS)):
             value = getattr(self, name)

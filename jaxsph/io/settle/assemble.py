@@ -33,6 +33,7 @@ ROUNDING_REFUSED = 0.25
 AUTO = "auto"
 SETTLED = "support =", "kernel ="
 """How conventions begin that are told where supports and kernels are."""
+EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
 DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
 """Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
@@ -54,6 +55,7 @@ class Report:
         volume: one sentence on where the volumes come from.
         kernel: the smoothing kernel, and why it is that one.
         notes: further sentences: what was left out, periodic boxes, rounding.
+        evenly: whether supports are chosen, as those of particles that lie about evenly.
     """
 
     source: str
@@ -67,6 +69,7 @@ class Report:
     notes: tuple[str, ...]
     opacity_by: str | None = None
     kernel: str = ""
+    evenly: bool = False
 
     def __str__(self) -> str:
         lines = [
@@ -190,6 +193,7 @@ def _assemble(
         notes=tuple(notes),
         opacity_by=opacity_by,
         kernel=kernel_origin,
+        evenly=support_origin.endswith(EVENLY),
     )
     return particles, report
 
@@ -256,7 +260,7 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
         return table.support.astype(np.float64), sentence
     spacing = even_spacing(table.position, box=table.box_size)
     if spacing is not None:
-        return np.full(len(table), SPACINGS * spacing), f"{SPACINGS:g} spacings of {spacing:.4g}, as particles lie evenly"
+        return np.full(len(table), SPACINGS * spacing), f"{SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
     origin = f"distance to neighbour {NEIGHBOURS}"
     if len(table) == 1:
         origin = "1, as a single particle has no neighbours"
