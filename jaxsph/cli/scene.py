@@ -17,6 +17,7 @@ from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, refuse, say_notes, say_report, span, wrong_usage
+from jaxsph.cli.options import groups
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.options.values import file_and_options
 from jaxsph.cli.voice import report, say
@@ -142,7 +143,8 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     labels = labels_of(loaded, options)
     cli_where.framed(loaded.shown, options)  # refuses clips that leave nothing
     with wrong_usage():
-        opened = staged(loaded, options, options, source=options, beside=beside, labels=labels)
+        look = options if isinstance(options, groups.SurfaceLook) else dataclasses.replace(options, surface=False)
+        opened = staged(loaded, look, options, source=options, beside=beside, labels=labels)
     for what, text in opened.said:
         say(what, text)
     if getattr(options, "iso", None) is not None:

@@ -273,7 +273,7 @@ class Look(opening.Look):
         float | None,
         option("--optical-depth", "DEPTH", values.number, LOOK, "of typical rays, instead of what is chosen", show=False),
     ] = None
-    surface: Annotated[Any, NOT_HERE] = False
+    surface: Annotated[Any, NOT_HERE] = None
 
     def __post_init__(self) -> None:
         """What Python checks, and a depth that numbers can hold."""
