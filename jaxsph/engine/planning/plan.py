@@ -208,6 +208,7 @@ class FrameShape:
         headroom: factor that the number of particles may yet grow by within those entries, and pairs with it.
         number: bytes of a number.
         tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
+        bands: that there are to be, or more where memory needs it.
     """
 
     width: int
@@ -220,6 +221,7 @@ class FrameShape:
     tuning: Tuning = CPU
     memory: int = MEMORY
     integrator: str = "samples"
+    bands: int = 1
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
@@ -257,7 +259,7 @@ def fitting(measures: Measures, shape: FrameShape, settings: Settings, choices: 
 
     Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
     """
-    tile_rows, bands, batch = -(-shape.height // TILE), 1, None
+    tile_rows, bands, batch = -(-shape.height // TILE), shape.bands, None
     while True:
         made = in_bands(measures, shape, settings, choices, bands, batch)
         if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:

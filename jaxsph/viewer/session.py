@@ -1,0 +1,369 @@
+"""A view: its newest state, threads that render it, and those who are told of frames.
+
+Flow: inputs -> [session: state -> stages] -> Frame -> listeners (server, widget).
+
+Inputs are done at once and cost nothing; pictures are made of the newest state only. One thread makes drafts, another what comes
+after them once nothing has moved for a moment: it leaves what it does at the next band as soon as something moves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.viewer.explained import place_seen, told_of_pixel
+from jaxsph.viewer.frame import Frame, described
+from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit, number
+from jaxsph.viewer.look import Look, Steps, first_look, looking
+from jaxsph.viewer.pose import Pose
+from jaxsph.viewer.stages import DEFAULT, Abandoned, Stage, stages_of
+
+REST_SECONDS = 0.2
+"""How long nothing moves before more than drafts are made."""
+Listener = Callable[[Any], None]
+
+
+class Snapshot(NamedTuple):
+    """A state: everything that a picture is made of."""
+
+    version: int
+    scene: Scene
+    camera: Camera
+    pose: Pose
+
+
+class Session:
+    """An interactive view of a scene, without anybody who shows it.
+
+    Use it as a context, or call `start` and `close`. Methods may be called from any thread.
+
+    Attributes:
+        scene: with the look that is shown.
+        settings: of the last picture of a state.
+        stages: how pictures are made, the draft first.
+        told: a reason why there is no picture of the settings, for people; empty where there is.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, settings: Settings | None = None) -> None:
+        """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
+
+        Raises:
+            ValueError: a scene with nothing in it, or a camera that is none.
+        """
+        if not isinstance(scene, Scene) or not isinstance(camera, Camera):
+            kinds = type(scene).__name__, type(camera).__name__
+            raise ValueError(f"`view` takes a `jaxsph.Scene` and a `jaxsph.Camera`, got {kinds[0]} and {kinds[1]}")
+        scene.check()
+        self.settings, self.told = DEFAULT if settings is None else settings, ""
+        self.stages = stages_of(self.settings, camera)
+        look = first_look(scene)
+        self._given, self._first = camera, Pose.of(camera, scene)
+        self._pose, self._moved = self._first, False
+        self._steps = None if look is None else Steps(Look.of(look))
+        self._base = scene
+        self.scene = self._looked()
+        self._version, self._changed = 1, 0.0
+        self._lock = threading.Condition()
+        self._frames: dict[str, Frame] = {}
+        self._histogram: Any = None
+        self._listeners: list[Listener] = []
+        self._threads: list[threading.Thread] = []
+        self._closed, self._wide = False, jax.config.read("jax_enable_x64")
+
+    def __enter__(self) -> Session:
+        return self.start()
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def start(self) -> Session:
+        """Begin to render."""
+        for work in (self._draft, self._finish):
+            thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        return self
+
+    def close(self) -> None:
+        """End the threads, after what they cannot leave."""
+        with self._lock:
+            self._closed = True
+            self._lock.notify_all()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+
+    # What is seen.
+
+    @property
+    def version(self) -> int:
+        """Of the newest state."""
+        return self._version
+
+    @property
+    def frame(self) -> Frame | None:
+        """The best frame of the newest state that there is any of."""
+        with self._lock:
+            frames = sorted(self._frames.values(), key=lambda one: (one.version, self._names.index(one.stage)))
+            return frames[-1] if frames else None
+
+    def snapshot(self) -> Snapshot:
+        """The newest state."""
+        with self._lock:
+            return Snapshot(self._version, self.scene, self._camera(), self._pose)
+
+    def state(self) -> dict[str, Any]:
+        """The newest state for a page, as JSON has it."""
+        with self._lock:
+            pose, camera = self._pose, self._camera()
+            look = None if self._steps is None else self._steps.look.told()
+            return {
+                "is": "state",
+                "version": self._version,
+                "pose": pose.told(),
+                "size": [camera.width, camera.height],
+                "height": pose.height,
+                "axes": pose.axes.tolist(),
+                "look": look,
+                "edited": self._steps is not None and self._steps.look.points is not None,
+                "moved": self._moved,
+                "told": self.told,
+            }
+
+    @property
+    def histogram(self) -> dict[str, Any] | None:
+        """What rays of the last view that stood still met, by place on the axis of the look."""
+        return self._histogram
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Call somebody with every frame, and every histogram (a dict), from the threads that made them; until undone."""
+        with self._lock:
+            self._listeners.append(listener)
+
+        def undo() -> None:
+            with self._lock:
+                if listener in self._listeners:
+                    self._listeners.remove(listener)
+
+        return undo
+
+    def wait(self, stage: str | None = None, seconds: float = 600.0) -> Frame:
+        """The frame of the newest state from a stage, by default the last, as soon as there is one.
+
+        Raises:
+            TimeoutError: there is none after so long.
+            RuntimeError: it cannot be made.
+        """
+        end = time.monotonic() + seconds
+        with self._lock:
+            while True:
+                found = self._frames.get(stage or self._names[-1])
+                if found is not None and found.version == self._version:
+                    return found
+                if self.told and found is None:
+                    raise RuntimeError(self.told)
+                if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
+                    raise TimeoutError(f"no frame of {stage or self._names[-1]!r} within {seconds:g} s")
+
+    # What is done.
+
+    def do(self, message: Any) -> dict[str, Any] | None:
+        """Do what a message asks for.
+
+        Args:
+            message: `{"do": NAME, ...}`, see `inputs`; also `fit`, `home`, `center`, `pick`, `restore`.
+
+        Returns:
+            An answer for who asked, where there is one.
+
+        Raises:
+            InputError: what cannot be understood or done; nothing has changed.
+        """
+        if not isinstance(message, dict) or not isinstance(message.get("do"), str):
+            raise InputError('a message must be an object such as {"do": "orbit", "right": 0.1, "down": 0}')
+        name = message["do"]
+        try:
+            if name == "pick":
+                return self._picked(message)
+            with self._lock:
+                self._do(name, message)
+                self._version += 1
+                self._changed = time.monotonic()
+                self._lock.notify_all()
+        except InputError:
+            raise
+        except (ValueError, ArithmeticError) as error:
+            raise InputError(str(error)) from error
+        return None
+
+    def _do(self, name: str, message: dict[str, Any]) -> None:
+        if name in MOTIONS:
+            self._move(MOTIONS[name](self._pose, message))
+        elif name in KNOWN_EDITS:
+            if self._steps is None:
+                raise InputError("this scene has no transfer function to edit")
+            edit(self._steps, message)
+            self.scene = self._looked()
+        elif name == "fit":
+            lower, upper = self._bounds()
+            self._move(self._pose.fitted(lower, upper, self._given.width / self._given.height))
+        elif name == "home":
+            self._pose, self._moved = self._first, False
+        elif name == "center":
+            self._move(self._pose.centred(self._seen(message)))
+        elif name == "restore":
+            if not isinstance(message.get("pose"), dict):
+                raise InputError("`pose` of 'restore' must be an object")
+            self._move(self._first.read(message["pose"]))
+            if message.get("points") is not None and self._steps is not None:
+                edit(self._steps, {"do": "points", "points": message["points"]})
+                self.scene = self._looked()
+        else:
+            known = ", ".join((*MOTIONS, *KNOWN_EDITS, "fit", "home", "center", "restore", "pick"))
+            raise InputError(f"there is no {name[:40]!r}; there are {known}")
+
+    def _move(self, pose: Pose) -> None:
+        pose.camera(1, 1)  # refuses what is none
+        self._pose, self._moved = pose, True
+
+    def _camera(self) -> Camera:
+        if not self._moved:
+            return self._given
+        camera = self._pose.camera(self._given.width, self._given.height)
+        if self._base.media:  # which do not say how large they are
+            camera = dataclasses.replace(camera, near=self._given.near, far=self._given.far)
+        return camera
+
+    def _looked(self) -> Scene:
+        return self._base if self._steps is None else looking(self._base, self._steps.look.transfer())
+
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        if not self._base.parts:
+            raise InputError("this scene does not say how large it is")
+        return BoundingBox.around(self._base.parts).bounds()
+
+    def _seen(self, message: dict[str, Any]) -> np.ndarray:
+        """The place at half light under a place of the picture."""
+        frame = self.frame
+        right, down = (number(message, name, -10, 10) for name in ("right", "down"))
+        if frame is None:
+            raise InputError("there is no picture yet")
+        place = place_seen(frame, right, down)
+        if place is None:
+            raise InputError("nothing is seen there: less than half of the light is absorbed")
+        return place
+
+    def _picked(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Numbers of a pixel."""
+        frame = self.frame
+        right, down = (number(message, name, -10, 10) for name in ("right", "down"))
+        if frame is None:
+            raise InputError("there is no picture yet")
+        return {"is": "picked", **told_of_pixel(frame, right, down)}
+
+    # Threads.
+
+    @property
+    def _names(self) -> list[str]:
+        return [stage.name for stage in self.stages]
+
+    def _run(self, work: Callable[[], None]) -> None:
+        with jax.enable_x64(self._wide):  # which a thread does not inherit
+            work()
+
+    def _draft(self) -> None:
+        """A draft of every state that is still the newest when the one before is done."""
+        stage, drawn = self.stages[0], 0
+        while (state := self._next(drawn)) is not None:
+            drawn = state.version
+            self._show(stage, state, lambda: False)
+
+    def _finish(self) -> None:
+        """All after the draft, of states that stand still."""
+        done = 0
+        while (state := self._next(done, rest=True)) is not None:
+            moved = self._is_old(state)
+            for stage in self.stages[1:]:
+                if moved() or not self._show(stage, state, moved):
+                    break
+            if not moved():
+                self._describe(state)
+                done = state.version
+
+    def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
+        """The newest state as soon as there is one after `done`, and it rests if it has to; None at the end."""
+        with self._lock:
+            while not self._closed:
+                still = REST_SECONDS - (time.monotonic() - self._changed) if rest else 0.0
+                if self._version > done and still <= 0:
+                    return Snapshot(self._version, self.scene, self._camera(), self._pose)
+                self._lock.wait(still if self._version > done else None)
+        return None
+
+    def _is_old(self, state: Snapshot) -> Callable[[], bool]:
+        return lambda: self._closed or self._version != state.version
+
+    def _show(self, stage: Stage, state: Snapshot, stop: Callable[[], bool]) -> bool:
+        """Make a picture and tell of it; False where it was left, or cannot be made."""
+        started = time.perf_counter()
+        try:
+            if not stage.made:
+                stage.prepare(state.scene, self._around(state))
+            image = stage.image(state.scene, state.camera, stop)
+        except Abandoned:
+            return False
+        except Exception as error:  # a view goes on: what is wrong is told
+            self._tell(stage, error)
+            return False
+        words, facts = described(stage, image, state.camera, time.perf_counter() - started)
+        final = stage is self.stages[-1]
+        frame = Frame(
+            state.version, stage.name, words, final, image, state.scene, stage.camera(state.camera), stage.settings, state.pose, facts
+        )
+        with self._lock:
+            newer = any(other.version > frame.version for other in self._frames.values())
+            if not newer:
+                self._frames[stage.name] = frame
+            self.told = "" if final else self.told
+            self._lock.notify_all()
+        if not newer:
+            self._send(frame)
+        return True
+
+    def _around(self, state: Snapshot) -> list[Camera]:
+        """The view, and some around it, for which there is to be room."""
+        size, pose = (self._given.width, self._given.height), self._pose
+        poses = [pose.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [pose.orbited(0, tilt) for tilt in (0.4, -0.4)]
+        poses += [pose.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
+        around = [] if self._base.media else [one.camera(*size) for one in poses]
+        return [state.camera, *around]
+
+    def _tell(self, stage: Stage, error: Exception) -> None:
+        with self._lock:
+            self.told = f"{stage.name}: {error}" if isinstance(error, ValueError) else f"{stage.name}: {type(error).__name__}: {error}"
+            self._lock.notify_all()
+        self._send({"is": "error", "text": self.told})
+
+    def _describe(self, state: Snapshot) -> None:
+        """Tell what rays of a view that stands met."""
+        from jaxsph.viewer.explained import histogram_of
+
+        found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
+        if found is not None and not self._is_old(state)():
+            self._histogram = {"is": "histogram", "version": state.version, **found}
+            self._send(self._histogram)
+
+    def _send(self, what: Any) -> None:
+        with self._lock:
+            listeners = list(self._listeners)
+        for listener in listeners:
+            listener(what)
