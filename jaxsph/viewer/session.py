@@ -20,12 +20,14 @@ import numpy as np
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.viewer.explained import place_seen, told_of_pixel
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.viewer.code import Source, command_of, python_of
+from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
 from jaxsph.viewer.frame import Frame, described
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit, number
 from jaxsph.viewer.look import Look, Steps, first_look, looking
 from jaxsph.viewer.pose import Pose
-from jaxsph.viewer.stages import DEFAULT, Abandoned, Stage, stages_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
 
 REST_SECONDS = 0.2
 """How long nothing moves before more than drafts are made."""
@@ -53,8 +55,15 @@ class Session:
         told: a reason why there is no picture of the settings, for people; empty where there is.
     """
 
-    def __init__(self, scene: Scene, camera: Camera, settings: Settings | None = None) -> None:
+    def __init__(
+        self, scene: Scene, camera: Camera, settings: Settings | None = None, source: Source | None = None
+    ) -> None:
         """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
+
+        Args:
+            scene, camera: what is looked at, and from where.
+            settings: of the last picture of a state; None is `stages.DEFAULT`.
+            source: where the scene comes from, for the code that makes it again.
 
         Raises:
             ValueError: a scene with nothing in it, or a camera that is none.
@@ -64,7 +73,7 @@ class Session:
             raise ValueError(f"`view` takes a `jaxsph.Scene` and a `jaxsph.Camera`, got {kinds[0]} and {kinds[1]}")
         scene.check()
         self.settings, self.told = DEFAULT if settings is None else settings, ""
-        self.stages = stages_of(self.settings, camera)
+        self.stages, self._source = stages_of(self.settings, camera), source or Source()
         look = first_look(scene)
         self._given, self._first = camera, Pose.of(camera, scene)
         self._pose, self._moved = self._first, False
@@ -93,13 +102,13 @@ class Session:
             thread.start()
         return self
 
-    def close(self) -> None:
-        """End the threads, after what they cannot leave."""
+    def close(self, seconds: float | None = None) -> None:
+        """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given."""
         with self._lock:
             self._closed = True
             self._lock.notify_all()
         for thread in self._threads:
-            thread.join()
+            thread.join(seconds)
         self._threads.clear()
 
     # What is seen.
@@ -140,6 +149,22 @@ class Session:
             }
 
     @property
+    def transfer(self) -> TransferFunction | None:
+        """The look that is shown, where there is one."""
+        return first_look(self.scene)
+
+    def code(self) -> dict[str, str]:
+        """The Python and the command that make the newest state again."""
+        with self._lock:
+            pose = self._pose if self._moved else None
+            edited = self._steps is not None and self._steps.look.points is not None
+            camera, look = self._camera(), self.transfer if edited else None
+        return {
+            "python": python_of(self._source, camera, pose, look, self.settings),
+            "command": command_of(self._source, camera, pose, edited, self.settings),
+        }
+
+    @property
     def histogram(self) -> dict[str, Any] | None:
         """What rays of the last view that stood still met, by place on the axis of the look."""
         return self._histogram
@@ -173,6 +198,11 @@ class Session:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
                     raise TimeoutError(f"no frame of {stage or self._names[-1]!r} within {seconds:g} s")
+
+    def whole(self, seconds: float = 600.0) -> Frame:
+        """The best frame of all pixels of the newest state; waits where there is but a draft."""
+        frame = self.frame
+        return frame if frame is not None and frame.version == self._version and frame.stage != DRAFT else self.wait(FULL, seconds)
 
     # What is done.
 
@@ -326,16 +356,16 @@ class Session:
             return False
         words, facts = described(stage, image, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
-        frame = Frame(
-            state.version, stage.name, words, final, image, state.scene, stage.camera(state.camera), stage.settings, state.pose, facts
-        )
+        made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
+        frame = Frame(state.version, stage.name, words, final, *made, facts)
         with self._lock:
-            newer = any(other.version > frame.version for other in self._frames.values())
-            if not newer:
+            rank = frame.version, self._names.index(frame.stage)
+            is_best = all((other.version, self._names.index(name)) <= rank for name, other in self._frames.items())
+            if is_best:
                 self._frames[stage.name] = frame
             self.told = "" if final else self.told
             self._lock.notify_all()
-        if not newer:
+        if is_best:
             self._send(frame)
         return True
 
@@ -349,14 +379,13 @@ class Session:
 
     def _tell(self, stage: Stage, error: Exception) -> None:
         with self._lock:
-            self.told = f"{stage.name}: {error}" if isinstance(error, ValueError) else f"{stage.name}: {type(error).__name__}: {error}"
+            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+            self.told = f"{stage.name}: {kind}{error}"
             self._lock.notify_all()
         self._send({"is": "error", "text": self.told})
 
     def _describe(self, state: Snapshot) -> None:
         """Tell what rays of a view that stands met."""
-        from jaxsph.viewer.explained import histogram_of
-
         found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
         if found is not None and not self._is_old(state)():
             self._histogram = {"is": "histogram", "version": state.version, **found}

@@ -35,7 +35,7 @@ DRAFT_PIXELS = 50_000
 DRAFT_SAMPLES = 4
 """Samples of a picture over those of its draft."""
 BANDS = 4
-"""A full picture is made in so many, so that it can be left between them; a pilot's in one, as its bands have pilots of their own."""
+"""A full picture is made in so many, so that it can be left between them; one for a tolerance in one, as bands have a say in how it is kept."""
 HEADROOM = 1.5
 DRAFT, FULL, TOLERANCE = "draft", "full", "tolerance"
 DEFAULT = Settings(integrator="segments", tolerance=0.01)
@@ -59,8 +59,7 @@ class Stage:
     def __init__(self, name: str, settings: Settings, shrink: int = 1) -> None:
         self.name, self.settings, self.shrink, self.made = name, settings, shrink, 0
         self._plans: dict[Any, Plan] = {}
-        has_pilot = settings.tolerance is not None and settings.estimator == "pilot" and settings.integrator == "samples"
-        self._bands = 1 if name == DRAFT or has_pilot or settings.screen != "pixels" else BANDS
+        self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
 
     def camera(self, camera: Camera) -> Camera:
         """The camera with the pixels of this stage."""

@@ -28,6 +28,7 @@ RUNS = {
               ["movie", "FILE", "FILE", *SMALL], ["movie", "FILE", "--points", "FILE", "--volume", "VOLUME", "--orbit", "9"],
               ["movie", SCENE, "--orbit", "9"], ["movie", "VOLUME", "--iso", "0.5", "--orbit", "9", *SMALL]),
     "transfer": (["transfer", "FILE", *SMALL], ["transfer", "VOLUME", *SMALL], ["transfer", SCENE]),
+    "view": (["view", "FILE", *SMALL], ["view", "VOLUME", *SMALL], ["view", SCENE, *SMALL]),
     "info": (["info", "FILE"], ["info", "VOLUME"], ["info", SCENE], ["info", "--points", "FILE", "--volume", "VOLUME"]),
     "project": (["project", "FILE", *SMALL], ["project", "FILE", "--of", "volume", *SMALL],
                 ["project", "FILE", "--eye", "0,0,9", *SMALL], ["project", "FILE", "--center", "mass", *SMALL]),

@@ -62,7 +62,7 @@ def plan(
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
             There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
         bands: that the image is to be made in, as far as it has rows for them: more is done where memory needs it. Bands change
-            no bit of images without a pilot, and `progress` of `jaxsph.render` may leave an image between two of them.
+            no bit of images without a tolerance, and `progress` of `jaxsph.render` may leave an image between two of them.
 
     Raises:
         ValueError: under a trace; for less headroom or fewer bands than 1; when even a band of one row of tiles exceeds
