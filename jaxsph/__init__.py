@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from jaxsph.sequence.frames import render_frames
     from jaxsph.sequence.snapshots import Snapshots
     from jaxsph.trade.sweep import sweep
+    from jaxsph.viewer.widget import view
 
 __all__ = [
     "Bounds",
@@ -82,6 +83,7 @@ __all__ = [
     "sequence",
     "slice",
     "sweep",
+    "view",
     "visibility_histogram",
 ]
 
@@ -113,6 +115,7 @@ NAMES = {
     "emission_measure": "jaxsph.model.particles.held:emission_measure",
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
+    "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",
     "Samples": "jaxsph.model.strategies:Samples",

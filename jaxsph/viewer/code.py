@@ -43,8 +43,8 @@ def python_of(source: Source, camera: Camera, pose: Pose | None, edited: Transfe
     if pose is not None:
         lines.append(_camera(camera, pose))
     if edited is not None:
-        named = [f"    {name}={_listed(getattr(edited, name))}," for name in ("values", "colors", "extinction", "extinction_values")
-                 if getattr(edited, name) is not None]  # fmt: skip
+        given = {name: getattr(edited, name) for name in ("values", "colors", "extinction", "extinction_values")}
+        named = [f"    {name}={_listed(value)}," for name, value in given.items() if value is not None]
         lines += ["transfer = js.TransferFunction.from_points(", *named, ")"]
         lines.append("scene = dataclasses.replace(scene, transfer=transfer)")
     lines += [f"image = js.render(scene, camera, js.{settings!r})", 'image.save("view.png")']
@@ -57,7 +57,7 @@ def command_of(source: Source, camera: Camera, pose: Pose | None, edited: bool, 
         return "# a scene of Python's has no command"
     if pose is not None and not pose.perspective:
         return "# a moved parallel view has no command: its rays are parallel; use the Python"
-    words = [word for word in _kept(source.words, drop_look=edited, drop_view=pose is not None)]
+    words = _kept(source.words, drop_look=edited, drop_view=pose is not None)
     if pose is not None:
         for name, place in (("--eye", pose.eye), ("--target", pose.target), ("--up", pose.axes[1])):
             words.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")

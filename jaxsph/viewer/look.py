@@ -9,7 +9,6 @@ does not move: that of the function that the view began with.
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -97,10 +96,10 @@ class Look:
         """With the colours of a map; extinction stays."""
         fine = colormap(name, 256)
         at = np.linspace(0, 1, len(fine))
-        made = [
-            dataclasses.replace(point, color=tuple(float(np.interp(point.place, at, channel)) for channel in fine.T))
-            for point in self.shown
-        ]
+        made = []
+        for point in self.shown:
+            red, green, blue = (float(np.interp(point.place, at, channel)) for channel in fine.T)
+            made.append(dataclasses.replace(point, color=(red, green, blue)))
         return self.edited(made)
 
     def exposed(self, stops: float) -> Look:
@@ -112,24 +111,23 @@ class Look:
     def transfer(self) -> TransferFunction:
         """The function, with room."""
         if self.points is None:
-            return self._with_room(self.first)
+            return self._with_room()
         values = self.scale.value(np.array([point.place for point in self.points]))
         extinction = np.array([point.extinction for point in self.points])
-        dtype = self.first.extinction.dtype
         if self.is_split:
-            more = {"extinction_values": jnp.asarray(values, dtype), "extinction": jnp.asarray(extinction, dtype)}
-            return self._with_room(dataclasses.replace(self.first, **more))
-        colors = np.array([point.color for point in self.points])
-        return self._with_room(TransferFunction(*(jnp.asarray(one, dtype) for one in (values, colors, extinction))))
+            return self._with_room(extinction_values=values, extinction=extinction)
+        return self._with_room(values=values, extinction=extinction, colors=np.array([point.color for point in self.points]))
 
-    def _with_room(self, transfer: TransferFunction) -> TransferFunction:
+    def _with_room(self, **given: np.ndarray) -> TransferFunction:
+        """The function with those control points; host arrays become the device's once they are of one shape."""
         names = ("extinction_values", "extinction") if self.is_split else ("values", "colors", "extinction")
-        padded = {}
+        padded: dict[str, Any] = {}
         for name in names:
-            given = np.asarray(getattr(transfer, name))
-            spare = self.capacity - len(given)
-            padded[name] = jnp.asarray(np.concatenate([given, np.repeat(given[-1:], spare, 0)])) if spare > 0 else given
-        return dataclasses.replace(transfer, **padded)
+            own = np.asarray(getattr(self.first, name))
+            rows = np.asarray(given.get(name, own), own.dtype)
+            spare = np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)
+            padded[name] = jnp.asarray(np.concatenate([rows, spare]))
+        return dataclasses.replace(self.first, **padded)
 
     def told(self) -> dict[str, Any]:
         """For the page: points with their values, and the axis."""
@@ -195,8 +193,3 @@ def everywhere(scene: Scene) -> Scene:
 
     look = first_look(scene)
     return scene if look is None else looking(scene, seen(look))
-
-
-def is_finite(*numbers: float) -> bool:
-    """Whether all are numbers that can be calculated with."""
-    return all(math.isfinite(number) for number in numbers)

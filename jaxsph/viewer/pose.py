@@ -163,7 +163,12 @@ class Pose:
         if min(np.linalg.norm(np.cross(forward, up)), np.linalg.norm(pole), np.linalg.norm(forward)) < 1e-9:
             raise ValueError("a pose needs directions that span a view")
         axes = _looking(forward / np.linalg.norm(forward), up)
-        changed = {"target": target, "pole": pole / np.linalg.norm(pole), "distance": distance, "tangent": tangent}
+        changed: dict[str, Any] = {
+            "target": target,
+            "pole": pole / np.linalg.norm(pole),
+            "distance": distance,
+            "tangent": tangent,
+        }
         return dataclasses.replace(self, axes=axes, perspective=perspective, **changed)
 
 

@@ -34,7 +34,8 @@ NAMES = (HOST, "localhost")
 MAX_MESSAGE, MAX_RECEIVED = 1 << 16, 1 << 20  # bytes of an input; and of what closes the connection
 MAX_TABS, MAX_REPLIES = 16, 64
 SAVE_SECONDS = 120.0
-TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".png": "image/png", ".exr": "image/x-exr", ".json": "application/json"}  # fmt: skip
+TEXTS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+TYPES = {**TEXTS, ".png": "image/png", ".exr": "image/x-exr", ".json": "application/json"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'self'; form-action 'none'; frame-ancestors 'none'",
@@ -88,7 +89,7 @@ class Server:
         self.session, self.port, self.token = session, port, secrets.token_urlsafe(24)
         self._tabs: set[Tab] = set()
         folder = importlib.resources.files("jaxsph.viewer") / "page"
-        self._files = {file.name: file.read_bytes() for file in folder.iterdir() if Path(file.name).suffix in TYPES}
+        self._files = {file.name: file.read_bytes() for file in folder.iterdir() if Path(file.name).suffix in TEXTS}
 
     @property
     def url(self) -> str:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxsph.engine.asked import require_asked
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -55,9 +56,7 @@ class Session:
         told: a reason why there is no picture of the settings, for people; empty where there is.
     """
 
-    def __init__(
-        self, scene: Scene, camera: Camera, settings: Settings | None = None, source: Source | None = None
-    ) -> None:
+    def __init__(self, scene: Scene, camera: Camera, settings: Settings | None = None, source: Source | None = None) -> None:
         """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
 
         Args:
@@ -68,9 +67,7 @@ class Session:
         Raises:
             ValueError: a scene with nothing in it, or a camera that is none.
         """
-        if not isinstance(scene, Scene) or not isinstance(camera, Camera):
-            kinds = type(scene).__name__, type(camera).__name__
-            raise ValueError(f"`view` takes a `jaxsph.Scene` and a `jaxsph.Camera`, got {kinds[0]} and {kinds[1]}")
+        require_asked(scene, camera, DEFAULT if settings is None else settings)
         scene.check()
         self.settings, self.told = DEFAULT if settings is None else settings, ""
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
@@ -80,7 +77,7 @@ class Session:
         self._steps = None if look is None else Steps(Look.of(look))
         self._base = scene
         self.scene = self._looked()
-        self._version, self._changed = 1, 0.0
+        self._version, self._failed, self._changed = 1, 0, 0.0
         self._lock = threading.Condition()
         self._frames: dict[str, Frame] = {}
         self._histogram: Any = None
@@ -102,14 +99,19 @@ class Session:
             thread.start()
         return self
 
-    def close(self, seconds: float | None = None) -> None:
-        """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given."""
+    def close(self, seconds: float | None = None) -> bool:
+        """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given.
+
+        Returns:
+            Whether they have ended: a compiler may take longer.
+        """
         with self._lock:
             self._closed = True
             self._lock.notify_all()
         for thread in self._threads:
             thread.join(seconds)
-        self._threads.clear()
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        return not self._threads
 
     # What is seen.
 
@@ -194,7 +196,7 @@ class Session:
                 found = self._frames.get(stage or self._names[-1])
                 if found is not None and found.version == self._version:
                     return found
-                if self.told and found is None:
+                if self.told and self._failed == self._version:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
                     raise TimeoutError(f"no frame of {stage or self._names[-1]!r} within {seconds:g} s")
@@ -202,7 +204,9 @@ class Session:
     def whole(self, seconds: float = 600.0) -> Frame:
         """The best frame of all pixels of the newest state; waits where there is but a draft."""
         frame = self.frame
-        return frame if frame is not None and frame.version == self._version and frame.stage != DRAFT else self.wait(FULL, seconds)
+        return (
+            frame if frame is not None and frame.version == self._version and frame.stage != DRAFT else self.wait(FULL, seconds)
+        )
 
     # What is done.
 
@@ -320,6 +324,8 @@ class Session:
     def _finish(self) -> None:
         """All after the draft, of states that stand still."""
         done = 0
+        with self._lock:  # the first draft comes sooner alone
+            self._lock.wait_for(lambda: self._closed or self._frames or self.told)
         while (state := self._next(done, rest=True)) is not None:
             moved = self._is_old(state)
             for stage in self.stages[1:]:
@@ -352,7 +358,7 @@ class Session:
         except Abandoned:
             return False
         except Exception as error:  # a view goes on: what is wrong is told
-            self._tell(stage, error)
+            self._tell(stage, state, error)
             return False
         words, facts = described(stage, image, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
@@ -377,8 +383,9 @@ class Session:
         around = [] if self._base.media else [one.camera(*size) for one in poses]
         return [state.camera, *around]
 
-    def _tell(self, stage: Stage, error: Exception) -> None:
+    def _tell(self, stage: Stage, state: Snapshot, error: Exception) -> None:
         with self._lock:
+            self._failed = state.version
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
             self.told = f"{stage.name}: {kind}{error}"
             self._lock.notify_all()

@@ -35,7 +35,7 @@ DRAFT_PIXELS = 50_000
 DRAFT_SAMPLES = 4
 """Samples of a picture over those of its draft."""
 BANDS = 4
-"""A full picture is made in so many, so that it can be left between them; one for a tolerance in one, as bands have a say in how it is kept."""
+"""A full picture is made in so many, so that it can be left between them; not one for a tolerance, in which they have a say."""
 HEADROOM = 1.5
 DRAFT, FULL, TOLERANCE = "draft", "full", "tolerance"
 DEFAULT = Settings(integrator="segments", tolerance=0.01)

@@ -27,7 +27,7 @@ from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
 
 MAX_PORT = 65535
-SECONDS = 2.0
+SECONDS = 1.0
 """How long the end waits for a picture that is being made."""
 
 
@@ -53,8 +53,8 @@ def view(
     /,
     *,
     asked: View = VIEW,
-) -> None:
-    """Look around in the browser."""
+) -> bool:
+    """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
     options = dataclasses.replace(asked, source=file)
     if not 0 <= options.port <= MAX_PORT:
         raise UsageError(f"--port must lie from 0 to {MAX_PORT}, got {options.port}; 0 takes any that is free")
@@ -75,10 +75,12 @@ def view(
         if not options.no_browser:
             webbrowser.open(server.url)
 
+    ended = True
     try:
         run(server, ready)
     finally:
-        session.close(SECONDS)
+        ended = session.close(SECONDS)
+    return not ended
 
 
 def _settings(options: Any) -> Settings:
@@ -97,8 +99,21 @@ def _source(options: Any) -> Source:
         name, *_ = options.source.removeprefix(SCENE).split(":")
         python = f"scene, camera = js.scenes.load({name!r}, width={width}, height={height})"
     else:
-        names = ("color_by", "opacity_by", "center", "width", "view", "where", "colormap", "norm", "range", "preset", "eye", "target")
+        names = (
+            "color_by",
+            "opacity_by",
+            "center",
+            "width",
+            "view",
+            "where",
+            "colormap",
+            "norm",
+            "range",
+            "preset",
+            "eye",
+            "target",
+        )
         given = {name: getattr(options, name) for name in names}
         said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
         python = f"scene, camera = js.io.read_scene({options.source!r}{said}, size=({width}, {height}))"
-    return Source(python, options.source, options.words)
+    return Source(python, options.source, tuple(word for word in options.words if word != options.source))

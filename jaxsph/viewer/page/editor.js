@@ -3,9 +3,11 @@ import { drawn, made, short } from "./made.js";
 
 const WIDTH = 320, HEIGHT = 150, STRIP = 14, PAD = 9;
 const STEP = 0.01;
+let strips = 0; // of all editors of a page
 const FINE = 16; // pieces of a line: extinction is linear, its height here is a root
 
 export function editor(send) {
+  const gradient = `jaxsph-strip-${strips++}`;
   let look = null, points = [], chosen = 0, held = null, histogram = null;
   const svg = drawn("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT + STRIP + 20}`, class: "editor", role: "group",
     "aria-label": "control points of colour and opacity" });
@@ -89,8 +91,8 @@ export function editor(send) {
     strip.replaceChildren();
     if (!look.split) {
       const stops = points.map((row) => drawn("stop", { offset: `${100 * Math.max(0, Math.min(1, row[0]))}%`, "stop-color": css(row) }));
-      strip.append(drawn("defs", {}, drawn("linearGradient", { id: "jaxsph-strip" }, ...stops)));
-      strip.append(drawn("rect", { x: PAD, y: HEIGHT, width: WIDTH - 2 * PAD, height: STRIP, fill: "url(#jaxsph-strip)" }));
+      strip.append(drawn("defs", {}, drawn("linearGradient", { id: gradient }, ...stops)));
+      strip.append(drawn("rect", { x: PAD, y: HEIGHT, width: WIDTH - 2 * PAD, height: STRIP, fill: `url(#${gradient})` }));
     }
     ticks.replaceChildren(...look.ticks.filter((_, i) => i % 2 === 0).map((one, i) =>
       drawn("text", { x: [PAD, WIDTH / 2, WIDTH - PAD][i], y: HEIGHT + STRIP + 14, "text-anchor": ["start", "middle", "end"][i] }, short(one))));
@@ -138,10 +140,11 @@ export function editor(send) {
       else if (event.key === "ArrowRight") move(place + size, opaque);
       else if (event.key === "ArrowUp") move(place, look.top * (tall + size) ** 2);
       else if (event.key === "ArrowDown") move(place, look.top * Math.max(0, tall - size) ** 2);
-      else if (event.key === "Delete" || event.key === "Backspace") { event.preventDefault(); return drop(); }
-      else if (event.key === "Enter") { event.preventDefault(); return beside(); }
+      else if (event.key === "Delete" || event.key === "Backspace") { event.preventDefault(); event.stopPropagation(); return drop(); }
+      else if (event.key === "Enter") { event.preventDefault(); event.stopPropagation(); return beside(); }
       else return;
       event.preventDefault();
+      event.stopPropagation();
       tell(true);
     });
     return one;

@@ -83,7 +83,9 @@ export function moves(picture, send, doing) {
   );
   picture.addEventListener("keydown", (event) => {
     if (event.altKey || ((event.ctrlKey || event.metaKey) && event.key !== "z")) return;
-    if (byKey(event)) event.preventDefault();
+    if (!byKey(event)) return;
+    event.preventDefault();
+    event.stopPropagation(); // notebooks have keys of their own
   });
   function byKey(event) {
     const { key, shiftKey } = event;

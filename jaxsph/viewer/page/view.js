@@ -118,6 +118,7 @@ export function mount(root, link) {
       } else row("depth", "less than half of the light is absorbed");
     }
     numbers.replaceChildren(...rows);
+    numbers.classList.remove("stale");
   }
   function complain(text) {
     told.textContent = text;
@@ -126,6 +127,7 @@ export function mount(root, link) {
   link.on((message, blob) => {
     if (message.is === "frame") show(message, blob);
     else if (message.is === "state") {
+      if (state && state.version !== message.version) numbers.classList.add("stale");
       state = message;
       complain(message.told);
       edit.show(message.look);
