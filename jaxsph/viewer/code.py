@@ -65,8 +65,10 @@ def command_of(source: Source, camera: Camera, pose: Pose | None, edited: bool, 
     words.append(f"--size={camera.width}x{camera.height}")
     if edited:
         words.append(f"--transfer={LOOK_FILE}")
-    if settings.tolerance is not None and not any(word.startswith("--tolerance") for word in words):
-        words += [f"--integrator={settings.integrator}", f"--tolerance={settings.tolerance:g}"]
+    said = {word.partition("=")[0] for word in words}
+    if settings.tolerance is not None:
+        chosen = {"--integrator": settings.integrator, "--tolerance": f"{settings.tolerance:g}"}
+        words += [f"{name}={value}" for name, value in chosen.items() if name not in said]
     return shlex.join(["jaxsph", "render", source.file, *words, "-o", "view.png"])
 
 

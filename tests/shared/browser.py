@@ -28,7 +28,8 @@ class Page:
         request = urllib.request.Request(f"http://127.0.0.1:{browser.port}/json/new?about:blank", method="PUT")
         with urllib.request.urlopen(request, timeout=SECONDS) as answer:
             told = json.load(answer)
-        self.socket = connect(told["webSocketDebuggerUrl"], max_size=None, open_timeout=SECONDS)
+        self.opened = contextlib.ExitStack()
+        self.socket = self.opened.enter_context(connect(told["webSocketDebuggerUrl"], max_size=None, open_timeout=SECONDS))
         self.number, self.said = 0, []
         self.call("Page.enable")
         self.call("Runtime.enable")
@@ -102,7 +103,7 @@ class Page:
     def close(self):
         with contextlib.suppress(Exception):
             self.call("Page.close")
-        self.socket.close()
+        self.opened.close()
 
 
 class Browser:

@@ -80,7 +80,9 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(home):
     home.wait(seconds=SECONDS)
     compiled = []
     event = "/jax/core/compile/backend_compile_duration"
-    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **more: compiled.append(more) if name == event else None)
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **more: compiled.append(more) if name == event else None
+    )
     for turn in range(4):
         home.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
         home.do({"do": "points", "points": [*rows, [0.3, turn, 0.1, 0.2, 0.3]][turn % 2 :]})

@@ -85,11 +85,11 @@ def view(
 
 def _settings(options: Any) -> Settings:
     """Those that are asked for; where nothing says how well, those of a view."""
-    how = ("tolerance", "integrator", "estimator", "relax", "screen")
     made = settings_of(options)
-    if any(getattr(options, name) is not None for name in how):
+    if any(getattr(options, name) is not None for name in ("integrator", "estimator", "relax", "screen")):
         return made
-    return dataclasses.replace(made, integrator=DEFAULT.integrator, tolerance=DEFAULT.tolerance)
+    tolerance = DEFAULT.tolerance if made.tolerance is None else made.tolerance
+    return dataclasses.replace(made, integrator=DEFAULT.integrator, tolerance=tolerance)
 
 
 def _source(options: Any) -> Source:

@@ -43,14 +43,14 @@ export function editor(send) {
     const part = (place - low[0]) / (high[0] - low[0]);
     return low.map((one, i) => one + part * (high[i] - one));
   }
-  function insert(place, extinction) {
+  function insert(place, extinction, done = true) {
     const row = between(place);
     row[0] = place;
     if (extinction != null) row[1] = extinction;
     points.push(row);
     points.sort((one, other) => one[0] - other[0]);
     chosen = points.indexOf(row);
-    tell(true);
+    tell(done);
     focus();
   }
   function drop() {
@@ -157,8 +157,11 @@ export function editor(send) {
   ground.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
     const [across, down] = within(event);
-    insert(placeAt(across), opaqueAt(down));
+    insert(placeAt(across), opaqueAt(down), false);
+    held = marks.children[chosen]; // and dragged on, if one likes
+    held.setPointerCapture(event.pointerId);
   });
+  ground.addEventListener("mousedown", (event) => event.preventDefault()); // which would take the focus away again
   color.addEventListener("input", () => {
     const parts = [1, 3, 5].map((i) => parseInt(color.value.slice(i, i + 2), 16) / 255);
     points[chosen].splice(2, 3, ...parts);
