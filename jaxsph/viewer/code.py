@@ -19,7 +19,7 @@ from jaxsph.viewer.pose import Pose
 LOOK_FILE = "look.json"
 REPLACED = ("--eye", "--target", "--up", "--fov", "--view", "--center", "--width", "--size", "--port", "--range", "--preset")
 LOOKS = ("--colormap", "--norm", "--range", "--preset", "--transfer", "--exposure", "--optical-depth")
-FLAGS = ("--no-browser", "--frame-all", "--quiet", "--verbose", "-q", "-v")
+FLAGS = ("--no-browser", "--picture-all", "--quiet", "--verbose", "-q", "-v")
 
 
 @dataclasses.dataclass(frozen=True)

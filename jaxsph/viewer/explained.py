@@ -1,6 +1,6 @@
 """What a place of a picture is: colours, depth, the quantity there; and what all rays meet.
 
-Flow: Frame, place -> [explained] -> numbers for the page.
+Flow: Picture, place -> [explained] -> numbers for the page.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import Scale
-from jaxsph.viewer.frame import Frame
+from jaxsph.viewer.picture import Picture
 
 RAYS, BINS = 300, 64
 """Of a histogram: a quarter of a second."""
 
 
-def pixel_at(frame: Frame, right: float, down: float) -> tuple[int, int] | None:
+def pixel_at(picture: Picture, right: float, down: float) -> tuple[int, int] | None:
     """Row and column at a place in shares of the picture's height from its middle; None outside."""
-    height, width = frame.image.shape
+    height, width = picture.image.shape
     row, column = int(np.floor((down + 0.5) * height)), int(np.floor(right * height + width / 2))
     return (row, column) if 0 <= row < height and 0 <= column < width else None
 
 
-def place_seen(frame: Frame, right: float, down: float) -> np.ndarray | None:
+def place_seen(picture: Picture, right: float, down: float) -> np.ndarray | None:
     """(3,) where light is half absorbed on the ray there, length units; None where it never is."""
-    found = pixel_at(frame, right, down)
+    found = pixel_at(picture, right, down)
     if found is None:
         return None
-    depth = float(np.asarray(frame.image.depth)[found])
-    height, width = frame.image.shape
+    depth = float(np.asarray(picture.image.depth)[found])
+    height, width = picture.image.shape
     middle = (found[1] + 0.5 - width / 2) / height, (found[0] + 0.5) / height - 0.5
-    return frame.pose.place_at(*middle, depth) if np.isfinite(depth) else None
+    return picture.pose.place_at(*middle, depth) if np.isfinite(depth) else None
 
 
-def told_of_pixel(frame: Frame, right: float, down: float) -> dict[str, Any]:
+def told_of_pixel(picture: Picture, right: float, down: float) -> dict[str, Any]:
     """Numbers of the pixel there, as JSON has them: what is not known is left out."""
-    found = pixel_at(frame, right, down)
+    found = pixel_at(picture, right, down)
     if found is None:
         return {"text": "outside of the picture"}
-    image = frame.image
+    image = picture.image
     told: dict[str, Any] = {
         "row": found[0],
         "column": found[1],
         "of": list(image.shape),
-        "stage": frame.stage,
+        "stage": picture.stage,
         "color": np.asarray(image.color)[found].tolist(),
         "transmittance": float(np.asarray(image.transmittance)[found]),
     }
-    if frame.settings.tolerance is not None:
+    if picture.settings.tolerance is not None:
         told["error"] = _plain(np.asarray(image.error_bound)[found])
-    place = place_seen(frame, right, down)
+    place = place_seen(picture, right, down)
     if place is not None:
         told["depth"] = float(np.asarray(image.depth)[found])
         told["place"] = place.tolist()
-        if frame.scene.particles is not None:
-            told["quantity"], told["neighbours"] = quantity_at(frame.scene.particles, place)
+        if picture.scene.particles is not None:
+            told["quantity"], told["neighbours"] = quantity_at(picture.scene.particles, place)
     return told
 
 

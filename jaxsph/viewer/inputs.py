@@ -1,6 +1,6 @@
 """Inputs of a view as they come from a page: checked, and done to the pose or to the look.
 
-Flow: message (a JSON object) -> [inputs] -> Pose, Steps of looks.
+Flow: message (a JSON object) -> [inputs] -> Pose, Steps of control points.
 
 A message is `{"do": NAME, ...numbers}`. Lengths on the screen are shares of the picture's height, places are shares of it from
 its middle, right and down.
@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from jaxsph.viewer.look import Look, Point, Steps
+from jaxsph.viewer.control_points import ControlPoints, Point, Steps
 from jaxsph.viewer.pose import Pose
 
 MAX_SHARE, MAX_FACTOR, MAX_DEGREES = 100.0, 100.0, 3600.0
@@ -72,18 +72,18 @@ MOTIONS: dict[str, Callable[[Pose, dict[str, Any]], Pose]] = {
 """What moves the camera, and needs nothing but the pose."""
 
 
-def _points(look: Look, said: dict[str, Any]) -> Look:
+def _points(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
     return look.edited(points_of(said))
 
 
-def _colormap(look: Look, said: dict[str, Any]) -> Look:
+def _colormap(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
     name = said.get("name")
     if not isinstance(name, str) or len(name) > 100:
         raise InputError("`name` of 'colormap' must be the name of a colour map, such as viridis")
     return look.recoloured(name)
 
 
-EDITS: dict[str, Callable[[Look, dict[str, Any]], Look]] = {
+EDITS: dict[str, Callable[[ControlPoints, dict[str, Any]], ControlPoints]] = {
     "points": _points,
     "colormap": _colormap,
     "exposure": lambda look, said: look.exposed(number(said, "stops", -10, 10)),

@@ -1,6 +1,6 @@
 """Where a view is seen from, and how it moves: around what it looks at, across it, nearer to it.
 
-Flow: Camera, motions of a pointer -> [pose] -> Camera of each frame.
+Flow: Camera, motions of a pointer -> [pose] -> Camera of each picture.
 
 Everything is float64 on the host. Near and far are left to the scene as soon as a camera has moved.
 """

@@ -1,9 +1,9 @@
-"""A server of a view for browsers of this machine: a page, its modules, pictures to keep, and a socket for inputs and frames.
+"""A server of a view for browsers of this machine: a page, its modules, pictures to keep, and a socket for inputs and pictures.
 
-Flow: Session -> frames -> [server, 127.0.0.1 alone] <-> pages.
+Flow: Session -> pictures -> [server, 127.0.0.1 alone] <-> pages.
 
 Nobody gets anything without the token of the address, from another origin, or by another name of this machine: such requests are
-answered with 403. A tab that is slow gets the newest frame and misses others. All tabs show the same view.
+answered with 403. A tab that is slow gets the newest picture and misses others. All tabs show the same view.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from jaxsph.io.libraries import require
-from jaxsph.viewer.frame import Frame
 from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
 
 HOST = "127.0.0.1"
@@ -177,8 +177,8 @@ class Server:
         sending = asyncio.create_task(tab.send())
         try:
             tab.show("state", json.dumps(self.session.state()))
-            if (frame := self.session.frame) is not None:
-                tab.show("frame", await asyncio.to_thread(packed, frame))
+            if (picture := self.session.picture) is not None:
+                tab.show("picture", await asyncio.to_thread(packed, picture))
             if self.session.histogram is not None:
                 tab.show("histogram", json.dumps(self.session.histogram))
             async for message in socket:
@@ -209,8 +209,8 @@ class Server:
         return {"is": "code", **self.session.code()} if said["do"] == "code" else self.session.do(said)
 
     def _told(self, loop: asyncio.AbstractEventLoop, what: Any) -> None:
-        """A frame, or something else, from a thread of the session."""
-        kind, packet = ("frame", packed(what)) if isinstance(what, Frame) else (what["is"], json.dumps(what))
+        """A picture, or something else, from a thread of the session."""
+        kind, packet = ("picture", packed(what)) if isinstance(what, Picture) else (what["is"], json.dumps(what))
         with contextlib.suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(self._broadcast, kind, packet)
 
@@ -219,10 +219,10 @@ class Server:
             tab.show(kind, what)
 
 
-def packed(frame: Frame) -> bytes:
-    """A frame in one message: the length of its header in 4 bytes, big-endian; the header, JSON; the picture's file."""
-    header = json.dumps(frame.header()).encode()
-    return struct.pack(">I", len(header)) + header + frame.encoded
+def packed(picture: Picture) -> bytes:
+    """A picture in one message: the length of its header in 4 bytes, big-endian; the header, JSON; the picture's file."""
+    header = json.dumps(picture.header()).encode()
+    return struct.pack(">I", len(header)) + header + picture.encoded
 
 
 def read(message: Any) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""A view: its newest state, threads that render it, and those who are told of frames.
+"""A view: its newest state, threads that render it, and those who are told of pictures.
 
-Flow: inputs -> [session: state -> stages] -> Frame -> listeners (server, widget).
+Flow: inputs -> [session: state -> stages] -> Picture -> listeners (server, widget).
 
 Inputs are done at once and cost nothing; pictures are made of the newest state only. One thread makes drafts, another what comes
 after them once nothing has moved for a moment: it leaves what it does at the next band as soon as something moves.
@@ -23,10 +23,10 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source, command_of, python_of
+from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, looking
 from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
-from jaxsph.viewer.frame import Frame, described
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit, number
-from jaxsph.viewer.look import Look, Steps, first_look, looking
+from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
 
@@ -74,12 +74,12 @@ class Session:
         look = first_look(scene)
         self._given, self._first = camera, Pose.of(camera, scene)
         self._pose, self._moved = self._first, False
-        self._steps = None if look is None else Steps(Look.of(look))
+        self._steps = None if look is None else Steps(ControlPoints.of(look))
         self._base = scene
         self.scene = self._looked()
         self._version, self._failed, self._changed = 1, 0, 0.0
         self._lock = threading.Condition()
-        self._frames: dict[str, Frame] = {}
+        self._pictures: dict[str, Picture] = {}
         self._histogram: Any = None
         self._listeners: list[Listener] = []
         self._threads: list[threading.Thread] = []
@@ -121,11 +121,11 @@ class Session:
         return self._version
 
     @property
-    def frame(self) -> Frame | None:
-        """The best frame of the newest state that there is any of."""
+    def picture(self) -> Picture | None:
+        """The best picture of the newest state that there is any of."""
         with self._lock:
-            frames = sorted(self._frames.values(), key=lambda one: (one.version, self._names.index(one.stage)))
-            return frames[-1] if frames else None
+            pictures = sorted(self._pictures.values(), key=lambda one: (one.version, self._names.index(one.stage)))
+            return pictures[-1] if pictures else None
 
     def snapshot(self) -> Snapshot:
         """The newest state."""
@@ -172,7 +172,7 @@ class Session:
         return self._histogram
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call somebody with every frame, and every histogram (a dict), from the threads that made them; until undone."""
+        """Call somebody with every picture, and every histogram (a dict), from the threads that made them; until undone."""
         with self._lock:
             self._listeners.append(listener)
 
@@ -183,8 +183,8 @@ class Session:
 
         return undo
 
-    def wait(self, stage: str | None = None, seconds: float = 600.0) -> Frame:
-        """The frame of the newest state from a stage, by default the last, as soon as there is one.
+    def wait(self, stage: str | None = None, seconds: float = 600.0) -> Picture:
+        """The picture of the newest state from a stage, by default the last, as soon as there is one.
 
         Raises:
             TimeoutError: there is none after so long.
@@ -193,19 +193,21 @@ class Session:
         end = time.monotonic() + seconds
         with self._lock:
             while True:
-                found = self._frames.get(stage or self._names[-1])
+                found = self._pictures.get(stage or self._names[-1])
                 if found is not None and found.version == self._version:
                     return found
                 if self.told and self._failed == self._version:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
-                    raise TimeoutError(f"no frame of {stage or self._names[-1]!r} within {seconds:g} s")
+                    raise TimeoutError(f"no picture of {stage or self._names[-1]!r} within {seconds:g} s")
 
-    def whole(self, seconds: float = 600.0) -> Frame:
-        """The best frame of all pixels of the newest state; waits where there is but a draft."""
-        frame = self.frame
+    def whole(self, seconds: float = 600.0) -> Picture:
+        """The best picture of all pixels of the newest state; waits where there is but a draft."""
+        picture = self.picture
         return (
-            frame if frame is not None and frame.version == self._version and frame.stage != DRAFT else self.wait(FULL, seconds)
+            picture
+            if picture is not None and picture.version == self._version and picture.stage != DRAFT
+            else self.wait(FULL, seconds)
         )
 
     # What is done.
@@ -287,22 +289,22 @@ class Session:
 
     def _seen(self, message: dict[str, Any]) -> np.ndarray:
         """The place at half light under a place of the picture."""
-        frame = self.frame
+        picture = self.picture
         right, down = (number(message, name, -10, 10) for name in ("right", "down"))
-        if frame is None:
+        if picture is None:
             raise InputError("there is no picture yet")
-        place = place_seen(frame, right, down)
+        place = place_seen(picture, right, down)
         if place is None:
             raise InputError("nothing is seen there: less than half of the light is absorbed")
         return place
 
     def _picked(self, message: dict[str, Any]) -> dict[str, Any]:
         """Numbers of a pixel."""
-        frame = self.frame
+        picture = self.picture
         right, down = (number(message, name, -10, 10) for name in ("right", "down"))
-        if frame is None:
+        if picture is None:
             raise InputError("there is no picture yet")
-        return {"is": "picked", **told_of_pixel(frame, right, down)}
+        return {"is": "picked", **told_of_pixel(picture, right, down)}
 
     # Threads.
 
@@ -325,7 +327,7 @@ class Session:
         """All after the draft, of states that stand still."""
         done = 0
         with self._lock:  # the first draft comes sooner alone
-            self._lock.wait_for(lambda: self._closed or self._frames or self.told)
+            self._lock.wait_for(lambda: self._closed or self._pictures or self.told)
         while (state := self._next(done, rest=True)) is not None:
             moved = self._is_old(state)
             for stage in self.stages[1:]:
@@ -363,16 +365,16 @@ class Session:
         words, facts = described(stage, image, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
         made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
-        frame = Frame(state.version, stage.name, words, final, *made, facts)
+        picture = Picture(state.version, stage.name, words, final, *made, facts)
         with self._lock:
-            rank = frame.version, self._names.index(frame.stage)
-            is_best = all((other.version, self._names.index(name)) <= rank for name, other in self._frames.items())
+            rank = picture.version, self._names.index(picture.stage)
+            is_best = all((other.version, self._names.index(name)) <= rank for name, other in self._pictures.items())
             if is_best:
-                self._frames[stage.name] = frame
+                self._pictures[stage.name] = picture
             self.told = "" if final else self.told
             self._lock.notify_all()
         if is_best:
-            self._send(frame)
+            self._send(picture)
         return True
 
     def _around(self, state: Snapshot) -> list[Camera]:

@@ -28,7 +28,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.viewer.look import everywhere
+from jaxsph.viewer.control_points import everywhere
 
 DRAFT_PIXELS = 50_000
 """Most pixels of a draft: on two cores one of 40,000 particles takes a tenth of a second."""
@@ -107,7 +107,7 @@ class Stage:
         return None if self._is_draft or needed is None else needed.choices
 
     def _planned(self, scene: Scene, camera: Camera, grow: Plan | None = None) -> Plan:
-        """A kept plan with room for a frame, or more room."""
+        """A kept plan with room for a picture, or more room."""
         needed = plan(scene, camera, self.settings, bands=self._bands)
         key = self._choice(needed)
         kept = self._plans.get(key) if grow is None else grow

@@ -1,6 +1,6 @@
 """A view in a notebook: the page's own modules in a widget, with the kernel in the place of the server.
 
-Flow: Session -> frames -> [widget, through the kernel] <-> Jupyter, VS Code, marimo.
+Flow: Session -> pictures -> [widget, through the kernel] <-> Jupyter, VS Code, marimo.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jaxsph.io.libraries import require
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.viewer.frame import Frame
 from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
 
 MODULES = ("made", "moves", "editor", "view", "notebook")
@@ -28,7 +28,7 @@ MAX_UNSEEN = 2
 
 
 def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
-    """Look around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
+    """ControlPoints around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
 
     `jaxsph view FILE` shows the same in a browser. A draft comes while something moves; then every pixel gets its ray; then the
     tolerance is kept. The widget always says which of these is seen, and how far it may be off.
@@ -90,24 +90,24 @@ def _widget_class() -> Any:
 
 
 class _Sender:
-    """Sends what is newest, and no more frames than are seen."""
+    """Sends what is newest, and no more pictures than are seen."""
 
     def __init__(self, send: Any) -> None:
         self._send, self._unseen = send, 0
-        self._newest: Frame | None = None
+        self._newest: Picture | None = None
         self._lock = threading.RLock()
 
     def show(self, what: Any) -> None:
-        """A frame, or something else."""
-        if not isinstance(what, Frame):
+        """A picture, or something else."""
+        if not isinstance(what, Picture):
             self._send(what)
             return
         with self._lock:
             self._newest = what
             self._more()
 
-    def seen(self, *, anew: Frame | None = None) -> None:
-        """A frame has arrived; `anew`: there is somebody new, who has seen nothing."""
+    def seen(self, *, anew: Picture | None = None) -> None:
+        """A picture has arrived; `anew`: there is somebody new, who has seen nothing."""
         with self._lock:
             self._unseen = 0 if anew is not None else max(self._unseen - 1, 0)
             self._newest = anew or self._newest
@@ -115,9 +115,9 @@ class _Sender:
 
     def _more(self) -> None:
         if self._newest is not None and self._unseen < MAX_UNSEEN:
-            frame, self._newest = self._newest, None
+            picture, self._newest = self._newest, None
             self._unseen += 1
-            self._send(frame.header(), [frame.encoded])
+            self._send(picture.header(), [picture.encoded])
 
 
 def answered(session: Session, sender: _Sender, message: Any) -> None:
@@ -128,7 +128,7 @@ def answered(session: Session, sender: _Sender, message: Any) -> None:
             sender.seen()
         elif name == "hello":
             sender.show(session.state())
-            sender.seen(anew=session.frame)
+            sender.seen(anew=session.picture)
             if session.histogram is not None:
                 sender.show(session.histogram)
         elif name == "code":

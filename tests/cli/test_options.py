@@ -12,7 +12,7 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import movie, project, render, sweep, transfer
+from jaxsph.cli.commands import movie, project, render, sweep, transfer, view
 from jaxsph.cli.commands import slice as slices
 from jaxsph.cli.options import groups
 from jaxsph.cli.options.table import COMMANDS
@@ -75,6 +75,7 @@ def asked(tmp_path, monkeypatch):
         (sweep, "measured"),
         (transfer, "transfer_figure"),
         (slices, "slice_of"),
+        (view, "run"),
     ):
         monkeypatch.setattr(module, name, enough)
     return names

@@ -132,9 +132,9 @@ def test_inputs_become_frames_with_words(server):
         state, _ = heard(page, "state")
         assert state["size"] == [WIDTH, HEIGHT] and len(state["look"]["points"]) == 4
         page.send(json.dumps({"do": "orbit", "right": 0.1, "down": 0}))
-        told, picture = heard(page, "frame")
+        told, picture = heard(page, "picture")
         while not told["final"] or told["version"] != server.session.version:
-            told, picture = heard(page, "frame")
+            told, picture = heard(page, "picture")
         assert told["format"] == "png" and picture[:4] == b"\x89PNG" and "full: 48 x 32" in told["words"]
         histogram, _ = heard(page, "histogram")
         assert len(histogram["edges"]) == len(histogram["absorbed"]) + 1 and max(histogram["absorbed"]) == 1
@@ -182,7 +182,7 @@ def test_tabs_show_one_view_and_may_be_closed_and_opened_again(server):
             while version != server.session.version:
                 version = heard(other, "state")[0]["version"]
         one.send(json.dumps({"do": "roll", "degrees": 7}))
-        while heard(one, "frame")[0]["version"] != server.session.version:
+        while heard(one, "picture")[0]["version"] != server.session.version:
             pass
     with tab(server) as again:
         assert heard(again, "state")[0]["version"] == server.session.version
@@ -205,7 +205,7 @@ def test_pictures_and_looks_can_be_kept(server, tmp_path):
     assert status == 200 and "attachment" in headers["Content-Disposition"]
     (tmp_path / "view.exr").write_bytes(content)
     image = js.io.read_image(tmp_path / "view.exr")
-    assert np.allclose(np.asarray(image.color), np.asarray(server.session.frame.image.color), atol=1e-5)
+    assert np.allclose(np.asarray(image.color), np.asarray(server.session.picture.image.color), atol=1e-5)
     (tmp_path / "look.json").write_bytes(got(server, f"/{server.token}/look.json")[2])
     assert np.array_equal(js.TransferFunction.load(tmp_path / "look.json").values, server.session.transfer.values)
 
@@ -254,7 +254,7 @@ def test_an_interrupt_ends_it_with_exit_code_0(late):
         assert found, line
         if late:
             with connect(f"ws://127.0.0.1:{found[1]}/{found[2]}/socket", max_size=None) as page:
-                while not heard(page, "frame")[0]["final"]:
+                while not heard(page, "picture")[0]["final"]:
                     pass
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0

@@ -36,29 +36,29 @@ def home(session):
 
 
 def test_the_last_picture_of_a_view_is_that_of_render_bit_for_bit(home):
-    frame = home.wait(seconds=SECONDS)
-    assert frame.final and frame.stage == FULL and frame.image.shape == (HEIGHT, WIDTH)
-    assert same(frame.image, js.render(scene(), camera(), SETTINGS))
+    picture = home.wait(seconds=SECONDS)
+    assert picture.final and picture.stage == FULL and picture.image.shape == (HEIGHT, WIDTH)
+    assert same(picture.image, js.render(scene(), camera(), SETTINGS))
     for message in (
         {"do": "orbit", "right": 0.2, "down": -0.1},
         {"do": "zoom", "factor": 1.7, "right": 0.2},
         {"do": "roll", "degrees": 20},
     ):
         home.do(message)
-    frame, state = home.wait(seconds=SECONDS), home.snapshot()
-    assert frame.version == state.version and frame.camera.near is None
-    assert same(frame.image, js.render(state.scene, state.camera, SETTINGS))
-    assert not same(frame.image, js.render(scene(), camera(), SETTINGS))
+    picture, state = home.wait(seconds=SECONDS), home.snapshot()
+    assert picture.version == state.version and picture.camera.near is None
+    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
+    assert not same(picture.image, js.render(scene(), camera(), SETTINGS))
 
 
 def test_every_frame_says_what_it_is_and_how_wrong(home):
-    frames = []
-    undo = home.listen(frames.append)
+    pictures = []
+    undo = home.listen(pictures.append)
     home.do({"do": "orbit", "right": 0.01, "down": 0})
     home.wait(seconds=SECONDS)
     undo()
-    told = [frame for frame in frames if not isinstance(frame, dict) and frame.version == home.version]
-    assert [frame.stage for frame in told] == [DRAFT, FULL]
+    told = [picture for picture in pictures if not isinstance(picture, dict) and picture.version == home.version]
+    assert [picture.stage for picture in told] == [DRAFT, FULL]
     draft, full = told
     height, width = draft.image.shape
     assert width * height < WIDTH * HEIGHT / 3
@@ -117,10 +117,10 @@ def test_a_drag_of_points_is_one_step_back(home):
 
 
 def test_a_pixel_is_told_in_numbers_and_what_is_seen_there_becomes_the_middle(home):
-    frame = home.wait(seconds=SECONDS)
+    picture = home.wait(seconds=SECONDS)
     told = home.do({"do": "pick", "right": 0.0, "down": 0.0})
     assert (told["row"], told["column"]) == (HEIGHT // 2, WIDTH // 2)
-    assert np.allclose(told["color"], np.asarray(frame.image.color)[HEIGHT // 2, WIDTH // 2])
+    assert np.allclose(told["color"], np.asarray(picture.image.color)[HEIGHT // 2, WIDTH // 2])
     assert np.isclose(told["depth"], 4, atol=1.2) and -0.7 < told["quantity"] < 0.7 and told["neighbours"] > 3
     home.do({"do": "center", "right": 0.0, "down": 0.0})
     assert np.allclose(home.snapshot().pose.target, told["place"])

@@ -66,13 +66,13 @@ def view(
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
     session = Session(scene, camera, settings, _source(options))
-    server = Server(session, options.port)
+    server, opens = Server(session, options.port), not options.no_browser
 
     def ready() -> None:
         voice.release()
         print(server.url, flush=True)
         session.start()
-        if not options.no_browser:
+        if opens:
             webbrowser.open(server.url)
 
     ended = True

@@ -4,7 +4,7 @@ import { mount } from "./view.js";
 export function render({ model, el }) {
   const heard = [];
   const receive = (message, buffers) => {
-    const picture = message.is === "frame" ? new Blob([buffers[0]], { type: `image/${message.format}` }) : undefined;
+    const picture = message.is === "picture" ? new Blob([buffers[0]], { type: `image/${message.format}` }) : undefined;
     heard.forEach((one) => one(message, picture));
     if (picture) model.send({ do: "seen" });
   };

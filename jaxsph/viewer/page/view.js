@@ -125,7 +125,7 @@ export function mount(root, link) {
     told.hidden = !text;
   }
   link.on((message, blob) => {
-    if (message.is === "frame") show(message, blob);
+    if (message.is === "picture") show(message, blob);
     else if (message.is === "state") {
       if (state && state.version !== message.version) numbers.classList.add("stale");
       state = message;

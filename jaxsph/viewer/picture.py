@@ -1,6 +1,6 @@
-"""A frame: a picture with what it is in words, as bytes for a page.
+"""A picture: a picture with what it is in words, as bytes for a page.
 
-Flow: Image of a stage -> [frame] -> header and JPEG, or PNG of what stands still -> server, widget.
+Flow: Image of a stage -> [picture] -> header and JPEG, or PNG of what stands still -> server, widget.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ JPEG_QUALITY = 85
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Frame:
+class Picture:
     """A picture of a view.
 
     Attributes:
@@ -65,7 +65,7 @@ class Frame:
         """What goes before the picture, as JSON has it."""
         height, width = self.image.shape
         return {
-            "is": "frame",
+            "is": "picture",
             "version": self.version,
             "stage": self.stage,
             "words": self.words,

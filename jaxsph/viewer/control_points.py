@@ -38,7 +38,7 @@ class Point:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Look:
+class ControlPoints:
     """Control points, on an axis.
 
     Attributes:
@@ -54,7 +54,7 @@ class Look:
     capacity: int = 0
 
     @classmethod
-    def of(cls, transfer: TransferFunction) -> Look:
+    def of(cls, transfer: TransferFunction) -> ControlPoints:
         """That of a function."""
         values = transfer.values if transfer.extinction_values is None else transfer.extinction_values
         return cls(transfer, Scale.of(np.asarray(values, np.float64)), None, room_for(len(values) + SPARE))
@@ -81,7 +81,7 @@ class Look:
         rows = zip(places.tolist(), extinction.tolist(), colors.tolist(), strict=True)
         return tuple(Point(place, opaque, (red, green, blue)) for place, opaque, (red, green, blue) in rows)
 
-    def edited(self, points: list[Point]) -> Look:
+    def edited(self, points: list[Point]) -> ControlPoints:
         """With other points, in any order.
 
         Raises:
@@ -92,7 +92,7 @@ class Look:
         ordered = tuple(sorted(points, key=lambda point: point.place))
         return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
 
-    def recoloured(self, name: str) -> Look:
+    def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
         fine = colormap(name, 256)
         at = np.linspace(0, 1, len(fine))
@@ -102,7 +102,7 @@ class Look:
             made.append(dataclasses.replace(point, color=(red, green, blue)))
         return self.edited(made)
 
-    def exposed(self, stops: float) -> Look:
+    def exposed(self, stops: float) -> ControlPoints:
         """More, or less, opaque by powers of two."""
         if not abs(stops) <= MAX_STOPS:
             raise ValueError(f"stops must lie within {MAX_STOPS:g}, got {stops:g}")
@@ -141,10 +141,10 @@ class Look:
 class Steps:
     """Looks that one can go back to, and forward again."""
 
-    def __init__(self, look: Look) -> None:
-        self.look, self._done, self._undone = look, [look], []  # type: tuple[Look, list[Look], list[Look]]
+    def __init__(self, look: ControlPoints) -> None:
+        self.look, self._done, self._undone = look, [look], []  # type: tuple[ControlPoints, list[ControlPoints], list[ControlPoints]]
 
-    def show(self, look: Look, *, done: bool) -> None:
+    def show(self, look: ControlPoints, *, done: bool) -> None:
         """Another look; `done`: a step that one can go back from, which every move of a drag is not."""
         self.look = look
         if done:
