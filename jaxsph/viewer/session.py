@@ -395,7 +395,11 @@ class Session:
 
     def _describe(self, state: Snapshot) -> None:
         """Tell what rays of a view that stands met."""
-        found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
+        try:
+            found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
+        except Exception as error:  # a view goes on without it
+            self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
+            return
         if found is not None and not self._is_old(state)():
             self._histogram = {"is": "histogram", "version": state.version, **found}
             self._send(self._histogram)

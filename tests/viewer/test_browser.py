@@ -78,7 +78,6 @@ def rendered(page):
     page.ask("document.querySelector('button[title=\"Python and command\"]').click()")
     code = page.until("document.querySelector('.code').textContent").partition("\n\n")[2]
     page.ask("document.querySelector('dialog[open] button').click(), document.querySelector('.code').textContent = ''")
-    code = code.replace("js.scenes.load('radial'", f"js.scenes.load('radial', particles={PARTICLES}")
     space = {}
     exec(code.replace('image.save("view.png")', ""), space)
     return space["image"].to_uint8()

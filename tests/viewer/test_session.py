@@ -9,6 +9,9 @@ import pytest
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
+from jaxsph.model.transfer.domains import Scale
+from jaxsph.viewer import session as views
+from jaxsph.viewer.explained import histogram_of
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
@@ -167,6 +170,14 @@ def test_what_makes_no_sense_is_refused_and_changes_nothing(session, message):
     assert session.version == version
 
 
+@pytest.mark.parametrize("within", [None, js.Sphere((0, 0, 0), 0.5)], ids=["everywhere", "in a clip"])
+def test_a_histogram_says_what_there_is(within):
+    shown = dataclasses.replace(scene(), within=within)
+    found = histogram_of(shown, camera(), Scale.of(np.asarray(shown.transfer.values)))
+    assert len(found["edges"]) == len(found["there"]) + 1 and max(found["there"]) == 1
+    assert (max(found["absorbed"]) == 1) == (within is None)
+
+
 class Slow:
     """A stage that is held up between bands, for as long as a test likes."""
 
@@ -233,6 +244,7 @@ def test_a_stage_that_fails_is_told_and_the_view_goes_on(slow, monkeypatch):
     slow.listen(lambda what: told.append(what) if isinstance(what, dict) else None)
     slow.wait(seconds=60)
     monkeypatch.setattr(full, "image", lambda *_: 1 / 0)
+    monkeypatch.setattr(views, "histogram_of", lambda *_: {}["nothing"])
     slow.do({"do": "pan", "right": 0.1, "down": 0})
     with pytest.raises(RuntimeError, match="full: ZeroDivisionError"):
         slow.wait(FULL, 60)

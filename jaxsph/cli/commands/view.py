@@ -96,8 +96,9 @@ def _source(options: Any) -> Source:
     """How the scene is opened in Python, and by the command."""
     width, height = options.size
     if options.source.startswith(SCENE):
-        name, *_ = options.source.removeprefix(SCENE).split(":")
-        python = f"scene, camera = js.scenes.load({name!r}, width={width}, height={height})"
+        name, behind = values.file_and_options(options.source)
+        more = "".join(f"{key}={value}, " for key, value in behind.items())
+        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more}width={width}, height={height})"
     else:
         names = (
             "color_by",

@@ -50,7 +50,6 @@ export function moves(picture, send, doing) {
   }
   picture.addEventListener("pointerdown", (event) => {
     picture.setPointerCapture(event.pointerId);
-    picture.focus({ preventScroll: true });
     const does = event.button === 0 && !event.shiftKey ? "orbit" : "pan";
     held = { does, at: share(event), x: event.clientX, y: event.clientY, far: false, button: event.button };
   });

@@ -127,7 +127,7 @@ export function mount(root, link) {
   link.on((message, blob) => {
     if (message.is === "picture") show(message, blob);
     else if (message.is === "state") {
-      if (state && state.version !== message.version) numbers.classList.add("stale");
+      if (numbers.children.length > 2 && state?.version !== message.version) numbers.classList.add("stale");
       state = message;
       complain(message.told);
       edit.show(message.look);
