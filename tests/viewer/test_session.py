@@ -265,6 +265,13 @@ def test_stages_lead_to_what_was_asked_for():
     assert [stage.settings.screen for stage in stages_of(quadtree, camera())] == ["pixels", "pixels", "quadtree"]
 
 
+def test_a_full_picture_is_planned_in_bands_between_which_it_can_be_left():
+    assert js.plan(scene(), camera(), SETTINGS).bands == 1
+    assert js.plan(scene(), camera(), SETTINGS, bands=9).bands == 2  # of 16 rows each
+    with pytest.raises(ValueError, match="`bands` must be at least 1, got 0"):
+        js.plan(scene(), camera(), SETTINGS, bands=0)
+
+
 def test_what_is_no_scene_is_refused():
     with pytest.raises(ValueError, match="scene"):
         Session(camera(), scene())
