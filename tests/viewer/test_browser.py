@@ -118,6 +118,12 @@ def test_drag_zoom_edit_and_click(page):
     page.click(x, y)
     said = page.until("document.querySelectorAll('.numbers dt').length > 3 && document.querySelector('.numbers').innerText")
     assert "depth at half light" in said and "quantity" in said
+    row, column = 20, 60  # of a picture that is as wide as its element, and lower
+    wide = page.ask("document.querySelector('.picture').getBoundingClientRect().width")
+    scale = wide / SIZE[0]
+    assert scale * SIZE[1] < page.ask("document.querySelector('.picture').getBoundingClientRect().height") - 10
+    page.click(x + (column + 0.5 - SIZE[0] / 2) * scale, y + (row + 0.5 - SIZE[1] / 2) * scale)
+    page.until(f"document.querySelector('.numbers').innerText.includes('row {row}, column {column} of')")
     changed(page, lambda: page.click(x, y, clicks=2))
 
 

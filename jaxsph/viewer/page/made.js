@@ -19,6 +19,14 @@ function filled(element, attributes, children) {
   return element;
 }
 
+// Where a canvas shows its picture, which is as large as its element allows.
+export function boxOf(picture) {
+  const box = picture.getBoundingClientRect();
+  const scale = Math.min(box.width / picture.width, box.height / picture.height) || 1;
+  const [width, height] = [scale * picture.width, scale * picture.height];
+  return { width, height, left: box.left + (box.width - width) / 2, top: box.top + (box.height - height) / 2 };
+}
+
 export function short(value) {
   if (value == null) return "unknown";
   const size = Math.abs(value);

@@ -1,4 +1,6 @@
 // Pointer and keys on the picture: what is dragged is sent once a frame of the screen.
+import { boxOf } from "./made.js";
+
 const CLICK = 4; // pixels that a click may move
 const STEP = 0.03; // of the picture's height, by a key
 const WHEEL = 0.0015;
@@ -25,7 +27,7 @@ export function moves(picture, send, doing) {
   let waiting = null;
   let due = 0;
   const share = (event) => {
-    const box = picture.getBoundingClientRect();
+    const box = boxOf(picture);
     return {
       right: (event.clientX - box.left - box.width / 2) / box.height,
       down: (event.clientY - box.top - box.height / 2) / box.height,

@@ -1,6 +1,6 @@
 // A view: the picture with what it is in words, and beside it all that changes it.
 import { editor } from "./editor.js";
-import { drawn, made, short } from "./made.js";
+import { boxOf, drawn, made, short } from "./made.js";
 import { KEYS, moves } from "./moves.js";
 
 const MAPS = ["viridis", "heat", "ice", "coolwarm", "gray", "magma", "inferno", "plasma", "cividis", "turbo",
@@ -75,7 +75,10 @@ export function mount(root, link) {
     if (turn < (shown?.turn ?? 0)) return bitmap.close();
     shown = { ...header, turn };
     const [width, height] = state ? state.size : [header.width, header.height];
-    if (picture.width !== width || picture.height !== height) Object.assign(picture, { width, height });
+    if (picture.width !== width || picture.height !== height) {
+      Object.assign(picture, { width, height });
+      place();
+    }
     const brush = picture.getContext("2d");
     brush.imageSmoothingEnabled = true;
     brush.imageSmoothingQuality = "high";
@@ -91,8 +94,8 @@ export function mount(root, link) {
   }
   function place() {
     if (!state) return;
-    const tall = picture.getBoundingClientRect().height || 1, wide = picture.getBoundingClientRect().width;
-    const unit = state.height / tall, most = (wide / 5) * unit;
+    const box = boxOf(picture);
+    const unit = state.height / box.height, most = (box.width / 5) * unit;
     const power = 10 ** Math.floor(Math.log10(most));
     const nice = power * NICE.filter((one) => one * power <= most).pop();
     rule.style.width = `${nice / unit}px`;
