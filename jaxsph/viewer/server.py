@@ -15,6 +15,7 @@ import hmac
 import http
 import importlib.resources
 import json
+import logging
 import secrets
 import signal
 import struct
@@ -44,6 +45,9 @@ HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+
+LOG = logging.getLogger(__name__)
+LOG.addHandler(logging.NullHandler())  # what garbage does to its own connection is nobody's news, unless somebody asks
 
 
 class Tab:
@@ -109,6 +113,7 @@ class Server:
         try:
             async with library.serve(
                 self._connected, HOST, self.port, process_request=self._requested, compression=None, max_size=MAX_RECEIVED,
+                logger=LOG,
                 server_header=None, close_timeout=1,
             ) as served:  # fmt: skip
                 self.port = served.sockets[0].getsockname()[1]

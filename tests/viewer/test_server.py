@@ -159,7 +159,7 @@ def test_garbage_is_answered_and_ends_nothing(server, message):
     assert server.session.version == version
 
 
-def test_what_is_much_too_long_closes_its_own_tab_alone(server):
+def test_what_is_much_too_long_closes_its_own_tab_alone(server, capfd):
     with tab(server) as other, tab(server) as page:
         page.send("x" * (MAX_RECEIVED + 1))
         with pytest.raises(ConnectionClosed):
@@ -167,10 +167,13 @@ def test_what_is_much_too_long_closes_its_own_tab_alone(server):
                 page.recv(timeout=SECONDS)
         other.send(json.dumps({"do": "code"}))
         heard(other, "code")
+    with contextlib.suppress(http.client.RemoteDisconnected, ConnectionResetError):
+        assert got(server, f"/?token={server.token}", method="POST")[0] == 405
     broken = socket.create_connection(("127.0.0.1", server.port))
     broken.sendall(b"\x00\xff\x17 nothing of HTTP\r\n\r\n")
     broken.close()
     assert got(server, f"/?token={server.token}")[0] == 200
+    assert capfd.readouterr().err == ""
 
 
 def test_tabs_show_one_view_and_may_be_closed_and_opened_again(server):
