@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from jaxsph.numerics.faults import CapacityError
     from jaxsph.sequence.frames import render_frames
     from jaxsph.trade.sweep import sweep
+    from jaxsph.viewer.widget import view
 
 __all__ = [
     "Bounds",
@@ -80,6 +81,7 @@ __all__ = [
     "sequence",
     "slice",
     "sweep",
+    "view",
     "visibility_histogram",
 ]
 
@@ -112,6 +114,7 @@ NAMES = {
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
     "explain": "jaxsph.analysis.explanation.explain:explain",
+    "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",
     "Samples": "jaxsph.model.strategies:Samples",

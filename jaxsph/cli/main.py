@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 class _Run:
     """A command, its files, and its options."""
 
-    function: Callable[..., None]
+    function: Callable[..., bool | None]
     files: tuple[str, ...]
     options: Any
 
@@ -93,11 +93,15 @@ def _work(run: _Run, entries: Sequence[Entry], *, own_process: bool) -> None:
     if own_process:
         cache.begin(keep=not options.no_cache)
     with warnings_in_lines(options.command, cache.mended):
-        run.function(*run.files, asked=options)
+        left = run.function(*run.files, asked=options)
         if options.save_config is not None:
             options.save_config.write_text(saved(entries), encoding="utf-8")
             voice.say("saved", f"{options.save_config}: the options, for --config")
         voice.end(options.command)
+    if left and own_process:  # threads that nothing can end: the interpreter would wait for them
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(DONE)
 
 
 def _rewritten(command: str, words: list[str]) -> Rewritten:

@@ -12,7 +12,7 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import explain, movie, project, render, sweep, transfer
+from jaxsph.cli.commands import explain, movie, project, render, sweep, transfer, view
 from jaxsph.cli.commands import slice as slices
 from jaxsph.cli.options import groups
 from jaxsph.cli.options.table import COMMANDS
@@ -28,6 +28,7 @@ RUNS = {
               ["movie", "FILE", "FILE", *SMALL], ["movie", "FILE", "--points", "FILE", "--volume", "VOLUME", "--orbit", "9"],
               ["movie", SCENE, "--orbit", "9"], ["movie", "VOLUME", "--iso", "0.5", "--orbit", "9", *SMALL]),
     "transfer": (["transfer", "FILE", *SMALL], ["transfer", "VOLUME", *SMALL], ["transfer", SCENE]),
+    "view": (["view", "FILE", *SMALL], ["view", "VOLUME", *SMALL], ["view", SCENE, *SMALL]),
     "info": (["info", "FILE"], ["info", "VOLUME"], ["info", SCENE], ["info", "--points", "FILE", "--volume", "VOLUME"]),
     "project": (["project", "FILE", *SMALL], ["project", "FILE", "--of", "volume", *SMALL],
                 ["project", "FILE", "--eye", "0,0,9", *SMALL], ["project", "FILE", "--center", "mass", *SMALL]),
@@ -78,6 +79,7 @@ def asked(tmp_path, monkeypatch):
         (transfer, "transfer_figure"),
         (slices, "slice_of"),
         (explain, "explained"),
+        (view, "run"),
     ):
         monkeypatch.setattr(module, name, enough)
     return names

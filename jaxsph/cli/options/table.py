@@ -59,6 +59,12 @@ COMMANDS = {
         "make a movie of a file, or of a sequence of files",
         ("jaxsph movie snap_042.hdf5 --orbit 360", "jaxsph movie snap_*.hdf5 -o run.mp4"),
     ),
+    "view": Command(
+        PICTURES,
+        "view",
+        "look around in the browser, and change colours and opacity",
+        ("jaxsph view snap_042.hdf5", "jaxsph view scene:mixer --size 800x600 --port 8765 --no-browser"),
+    ),
     "info": Command(DATA, "info", "say what a file holds, and what `render` would show of it", ("jaxsph info snap_042.hdf5",)),
     "sort": Command(
         DATA,

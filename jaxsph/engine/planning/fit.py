@@ -48,6 +48,7 @@ def plan(
     slab_samples: int | None = None,
     tuning: Tuning | None = None,
     headroom: float = 1.0,
+    bands: int = 1,
 ) -> Plan:
     """Measure the room that a frame needs (host side; values must be concrete).
 
@@ -60,17 +61,21 @@ def plan(
         tuning: of another kind of machine (`jaxsph.engine.runtime.tuning`) than is at hand: to compile for it, or to compare.
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
             There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
+        bands: that the image is to be made in, as far as it has rows for them: more is done where memory needs it. Bands change
+            no bit of images without a tolerance, and `progress` of `jaxsph.render` may leave an image between two of them.
 
     Raises:
-        ValueError: under a trace; for less headroom than 1; when even a band of one row of tiles exceeds
+        ValueError: under a trace; for less headroom or fewer bands than 1; when even a band of one row of tiles exceeds
             `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
     if is_traced(scene, camera):
         raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
     if not headroom >= 1:
         raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
+    if not bands >= 1:
+        raise ValueError(f"`bands` must be at least 1, got {bands}; 1 is as few as memory allows")
     asked = Request.of(scene, camera, Settings() if settings is None else settings)
-    settings, shape = asked.along, dataclasses.replace(shape_of(asked), headroom=1.0)
+    settings, shape = asked.along, dataclasses.replace(shape_of(asked), headroom=1.0, bands=bands)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:

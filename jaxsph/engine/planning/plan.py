@@ -215,6 +215,7 @@ class FrameShape:
         number: bytes of a number.
         opaque: whether rays end at a surface: the light of so many slabs is held that few behind it are marched.
         tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
+        bands: that there are to be, or more where memory needs it.
     """
 
     width: int
@@ -228,6 +229,7 @@ class FrameShape:
     memory: int = MEMORY
     integrator: str = "samples"
     opaque: bool = False
+    bands: int = 1
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
@@ -265,7 +267,7 @@ def fitting(measures: Measures, shape: FrameShape, settings: Settings, choices: 
 
     Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
     """
-    tile_rows, bands, batch = -(-shape.height // TILE), 1, None
+    tile_rows, bands, batch = -(-shape.height // TILE), shape.bands, None
     while True:
         made = in_bands(measures, shape, settings, choices, bands, batch)
         if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:

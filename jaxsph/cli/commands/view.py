@@ -1,0 +1,120 @@
+"""The command `view`: an interactive view in the browser, served on this machine alone.
+
+Flow: options -> Scene, Camera, Settings -> [view] -> Session -> server, browser; the address on stdout.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+import webbrowser
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
+from jaxsph.cli.console import UsageError, camera_line
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
+from jaxsph.cli.options.settings import SCENE, settings_of
+from jaxsph.cli.voice import say
+from jaxsph.io.libraries import require
+from jaxsph.model import Settings
+from jaxsph.viewer.code import Source
+from jaxsph.viewer.server import Server, run
+from jaxsph.viewer.session import Session
+from jaxsph.viewer.stages import DEFAULT
+
+MAX_PORT = 65535
+SECONDS = 1.0
+"""How long the end waits for a picture that is being made."""
+
+
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View(groups.Options, groups.Control, groups.Look, groups.View, groups.Mixed, groups.Source):
+    """Options of the command."""
+
+    size: Annotated[tuple[int, int], option("--size", "WxH", values.size, CAMERA, "pixels (default 960x720)")] = (960, 720)
+    tolerance: Annotated[
+        float | None,
+        option("--tolerance", "T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"),
+    ] = None
+    port: Annotated[int, option("--port", "N", values.whole, OWN, "of 127.0.0.1 (default 0: any that is free)")] = 0
+    no_browser: Annotated[bool, flag("--no-browser", OWN, "print the address alone")] = False
+
+
+VIEW = View()
+
+
+def view(
+    file: Annotated[str, Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")],
+    /,
+    *,
+    asked: View = VIEW,
+) -> bool:
+    """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
+    options = dataclasses.replace(asked, source=file)
+    if not 0 <= options.port <= MAX_PORT:
+        raise UsageError(f"--port must lie from 0 to {MAX_PORT}, got {options.port}; 0 takes any that is free")
+    if options.json:
+        raise UsageError("--json is for commands that end by themselves; the one line of stdout is the address")
+    require("websockets", "an interactive view", "view")
+    settings = _settings(options)
+    scene, camera, _ = cli_scene.scene_of(options)
+    say("camera", camera_line(camera, options))
+    warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
+    session = Session(scene, camera, settings, _source(options))
+    server, opens = Server(session, options.port), not options.no_browser
+
+    def ready() -> None:
+        voice.release()
+        print(server.url, flush=True)
+        session.start()
+        if opens:
+            webbrowser.open(server.url)
+
+    ended = True
+    try:
+        run(server, ready)
+    finally:
+        ended = session.close(SECONDS)
+    return not ended
+
+
+def _settings(options: Any) -> Settings:
+    """Those that are asked for; where nothing says how well, those of a view."""
+    made = settings_of(options)
+    if any(getattr(options, name) is not None for name in ("integrator", "estimator", "relax", "screen")):
+        return made
+    tolerance = DEFAULT.tolerance if made.tolerance is None else made.tolerance
+    return dataclasses.replace(made, integrator=DEFAULT.integrator, tolerance=tolerance)
+
+
+def _source(options: Any) -> Source:
+    """How the scene is opened in Python, and by the command."""
+    width, height = options.size
+    if options.source.startswith(SCENE):
+        name, behind = values.file_and_options(options.source)
+        more = "".join(f"{key}={value}, " for key, value in behind.items())
+        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more}width={width}, height={height})"
+    else:
+        names = (
+            "color_by",
+            "opacity_by",
+            "center",
+            "width",
+            "view",
+            "where",
+            "colormap",
+            "norm",
+            "range",
+            "preset",
+            "eye",
+            "target",
+        )
+        given = {name: getattr(options, name) for name in names}
+        said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+        python = f"scene, camera = js.io.read_scene({options.source!r}{said}, size=({width}, {height}))"
+    return Source(python, options.source, tuple(word for word in options.words if word != options.source))

@@ -1,0 +1,195 @@
+"""What a view looks like: control points that can be dragged, added and removed, and steps back.
+
+Flow: TransferFunction, edits -> [look] -> TransferFunction of as many points, so that no edit compiles anything.
+
+A function with room is padded by its last point: equal neighbours change no picture. Points lie at places 0 to 1 of an axis that
+does not move: that of the function that the view began with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import colormap
+
+ROOMS = (8, 16, 32, 64, 128, 256)
+SPARE = 3
+"""Points that can be added before there is a larger room, whose programs are compiled once."""
+MAX_STEPS = 200
+TOP = 4.0
+"""Largest extinction of an editor, over the largest that the view began with."""
+MAX_STOPS = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A control point: place on the axis, extinction per unit length, and colour in [0, 1]."""
+
+    place: float
+    extinction: float
+    color: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Control points, on an axis.
+
+    Attributes:
+        first: the function that the view began with.
+        scale: of its values (of those of extinction, where these are others: colours then stay as they are).
+        points: ascending by place, at least one; None is the function as it was given.
+        capacity: points that there is room for.
+    """
+
+    first: TransferFunction
+    scale: Scale
+    points: tuple[Point, ...] | None = None
+    capacity: int = 0
+
+    @classmethod
+    def of(cls, transfer: TransferFunction) -> ControlPoints:
+        """That of a function."""
+        values = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+        return cls(transfer, Scale.of(np.asarray(values, np.float64)), None, room_for(len(values) + SPARE))
+
+    @property
+    def is_split(self) -> bool:
+        """Whether extinction has points of its own."""
+        return self.first.extinction_values is not None
+
+    @property
+    def top(self) -> float:
+        """Largest extinction of an editor, per unit length."""
+        return TOP * float(np.max(np.asarray(self.first.extinction), initial=0)) or 1.0
+
+    @property
+    def shown(self) -> tuple[Point, ...]:
+        """The points, also of a function as it was given."""
+        if self.points is not None:
+            return self.points
+        values = np.asarray(self.first.extinction_values if self.is_split else self.first.values, np.float64)
+        places = np.clip(np.nan_to_num(self.scale.place(values), neginf=0.0), -1.0, 2.0)
+        colors = np.full((len(values), 3), 0.75) if self.is_split else np.asarray(self.first.colors, np.float64)
+        extinction = np.asarray(self.first.extinction, np.float64)
+        rows = zip(places.tolist(), extinction.tolist(), colors.tolist(), strict=True)
+        return tuple(Point(place, opaque, (red, green, blue)) for place, opaque, (red, green, blue) in rows)
+
+    def edited(self, points: list[Point]) -> ControlPoints:
+        """With other points, in any order.
+
+        Raises:
+            ValueError: none, or more than there is ever room for.
+        """
+        if not 1 <= len(points) <= ROOMS[-1]:
+            raise ValueError(f"a look has 1 to {ROOMS[-1]} control points, got {len(points)}")
+        ordered = tuple(sorted(points, key=lambda point: point.place))
+        return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
+
+    def recoloured(self, name: str) -> ControlPoints:
+        """With the colours of a map; extinction stays."""
+        fine = colormap(name, 256)
+        at = np.linspace(0, 1, len(fine))
+        made = []
+        for point in self.shown:
+            red, green, blue = (float(np.interp(point.place, at, channel)) for channel in fine.T)
+            made.append(dataclasses.replace(point, color=(red, green, blue)))
+        return self.edited(made)
+
+    def exposed(self, stops: float) -> ControlPoints:
+        """More, or less, opaque by powers of two."""
+        if not abs(stops) <= MAX_STOPS:
+            raise ValueError(f"stops must lie within {MAX_STOPS:g}, got {stops:g}")
+        return self.edited([dataclasses.replace(point, extinction=point.extinction * 2**stops) for point in self.shown])
+
+    def transfer(self) -> TransferFunction:
+        """The function, with room."""
+        if self.points is None:
+            return self._with_room()
+        values = self.scale.value(np.array([point.place for point in self.points]))
+        extinction = np.array([point.extinction for point in self.points])
+        if self.is_split:
+            return self._with_room(extinction_values=values, extinction=extinction)
+        return self._with_room(values=values, extinction=extinction, colors=np.array([point.color for point in self.points]))
+
+    def _with_room(self, **given: np.ndarray) -> TransferFunction:
+        """The function with those control points; host arrays become the device's once they are of one shape."""
+        names = ("extinction_values", "extinction") if self.is_split else ("values", "colors", "extinction")
+        padded: dict[str, Any] = {}
+        for name in names:
+            own = np.asarray(getattr(self.first, name))
+            rows = np.asarray(given.get(name, own), own.dtype)
+            spare = np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)
+            padded[name] = jnp.asarray(np.concatenate([rows, spare]))
+        return dataclasses.replace(self.first, **padded)
+
+    def told(self) -> dict[str, Any]:
+        """For the page: points with their values, and the axis."""
+        shown = self.shown
+        values = self.scale.value(np.array([point.place for point in shown])).tolist()
+        rows = [[point.place, point.extinction, *point.color, value] for point, value in zip(shown, values, strict=True)]
+        ends = self.scale.value(np.linspace(0, 1, 5)).tolist()
+        return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, "split": self.is_split}
+
+
+class Steps:
+    """Looks that one can go back to, and forward again."""
+
+    def __init__(self, look: ControlPoints) -> None:
+        self.look, self._done, self._undone = look, [look], []  # type: tuple[ControlPoints, list[ControlPoints], list[ControlPoints]]
+
+    def show(self, look: ControlPoints, *, done: bool) -> None:
+        """Another look; `done`: a step that one can go back from, which every move of a drag is not."""
+        self.look = look
+        if done:
+            self._done = [*self._done, look][-MAX_STEPS:]
+            self._undone.clear()
+
+    def undo(self) -> None:
+        """The look before."""
+        if len(self._done) > 1:
+            self._undone.append(self._done.pop())
+        self.look = self._done[-1]
+
+    def redo(self) -> None:
+        """The look after."""
+        if self._undone:
+            self._done.append(self._undone.pop())
+            self.look = self._done[-1]
+
+
+def room_for(points: int) -> int:
+    """The smallest room."""
+    return next((room for room in ROOMS if room >= points), points)
+
+
+def first_look(scene: Scene) -> TransferFunction | None:
+    """What is edited of a scene: the look of its particles, else that of its first volume."""
+    return scene.looks[0] if scene.looks else None
+
+
+def looking(scene: Scene, transfer: TransferFunction | None) -> Scene:
+    """The scene with what is edited in its place."""
+    if transfer is None:
+        return scene
+    if scene.transfer is not None:
+        return dataclasses.replace(scene, transfer=transfer)
+    looks = scene.volume_transfer
+    return dataclasses.replace(scene, volume_transfer=(transfer, *looks[1:]) if isinstance(looks, tuple) else transfer)
+
+
+def everywhere(scene: Scene) -> Scene:
+    """The scene with nothing that its looks hide: what any look may show, to make room for."""
+
+    def seen(transfer: TransferFunction) -> TransferFunction:
+        least = 1e-3 * float(np.max(np.asarray(transfer.extinction), initial=0)) or 1e-3
+        return dataclasses.replace(transfer, extinction=jnp.maximum(transfer.extinction, least))
+
+    look = first_look(scene)
+    return scene if look is None else looking(scene, seen(look))

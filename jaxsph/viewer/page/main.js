@@ -1,0 +1,70 @@
+// The page: a socket to the server of this machine, and the view.
+import { mount } from "./view.js";
+
+const RETRY = 1000; // milliseconds
+const KEEP = 400;
+
+function link() {
+  const heard = [];
+  let socket = null;
+  const waiting = [];
+  const tell = (message, picture) => heard.forEach((one) => one(message, picture));
+  function open() {
+    const at = new URL("socket", document.baseURI);
+    at.protocol = "ws:";
+    socket = new WebSocket(at);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      tell({ is: "linked" });
+      waiting.splice(0).forEach((text) => socket.send(text));
+    };
+    socket.onmessage = ({ data }) => {
+      if (typeof data === "string") return tell(JSON.parse(data));
+      const length = new DataView(data).getUint32(0);
+      const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+      tell(header, new Blob([new Uint8Array(data, 4 + length)], { type: `image/${header.format}` }));
+    };
+    socket.onclose = () => {
+      tell({ is: "unlinked" });
+      setTimeout(open, RETRY);
+    };
+  }
+  return {
+    files: true,
+    open,
+    on: (one) => heard.push(one),
+    send: (message) => {
+      const text = JSON.stringify(message);
+      if (socket && socket.readyState === WebSocket.OPEN) socket.send(text);
+      else if (waiting.length < 100) waiting.push(text);
+    },
+  };
+}
+
+// The address holds the view: what is behind # is restored, and follows what is seen.
+function kept(one) {
+  let timer = 0;
+  if (location.hash.length > 1) {
+    try {
+      const { pose, points } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+      one.send({ do: "restore", pose, points });
+    } catch {
+      history.replaceState(null, "", location.pathname + location.search);
+    }
+  }
+  one.on((message) => {
+    if (message.is !== "state") return;
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      const view = { pose: message.pose };
+      if (message.edited) view.points = message.look.points.map((row) => row.slice(0, 5));
+      const hash = message.moved || message.edited ? `#${encodeURIComponent(JSON.stringify(view))}` : "";
+      history.replaceState(null, "", location.pathname + location.search + hash);
+    }, KEEP);
+  });
+}
+
+const one = link();
+mount(document.body, one);
+kept(one);
+one.open();

@@ -1,0 +1,16 @@
+// A notebook: messages of the kernel, and the view.
+import { mount } from "./view.js";
+
+export function render({ model, el }) {
+  const heard = [];
+  const receive = (message, buffers) => {
+    const picture = message.is === "picture" ? new Blob([buffers[0]], { type: `image/${message.format}` }) : undefined;
+    heard.forEach((one) => one(message, picture));
+    if (picture) model.send({ do: "seen" });
+  };
+  model.on("msg:custom", receive);
+  el.classList.add("inside");
+  mount(el, { files: false, on: (one) => heard.push(one), send: (message) => model.send(message) });
+  model.send({ do: "hello" });
+  return () => model.off("msg:custom", receive);
+}

@@ -1,0 +1,184 @@
+"""Where a view is seen from, and how it moves: around what it looks at, across it, nearer to it.
+
+Flow: Camera, motions of a pointer -> [pose] -> Camera of each picture.
+
+Everything is float64 on the host. Near and far are left to the scene as soon as a camera has moved.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.path import middle
+from jaxsph.model.scene import Scene
+
+HALF_TURN = 180.0
+"""Degrees that a pointer's way over the height of the picture turns the view by."""
+MIN_ZOOM, MAX_ZOOM = 1e-3, 1e3
+"""Of the distance that a view begins at, how far it may come near or go away."""
+OBLIQUE = (-0.45, -0.35, -1.0)
+NARROWEST, WIDEST = 1.0, 150.0  # degrees of perspective that a parallel view is given back as
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pose:
+    """A camera that knows what it looks at.
+
+    Attributes:
+        target: (3,) what it turns around, length units.
+        axes: (3, 3) rows right, up and forward, orthonormal.
+        distance: from the eye to the target, length units.
+        tangent: of half the vertical field of view, of parallel views the one that they would be given.
+        perspective: whether rays spread from the eye; else half the visible height is `distance * tangent`.
+        pole: (3,) axis that a sideways motion turns about.
+        start: distance of the first view, by which zooming is bounded.
+    """
+
+    target: np.ndarray
+    axes: np.ndarray
+    distance: float
+    tangent: float
+    perspective: bool
+    pole: np.ndarray
+    start: float
+
+    @classmethod
+    def of(cls, camera: Camera, scene: Scene) -> Pose:
+        """The pose of a camera: it looks at the middle of the scene as far as that is straight ahead, else of its depths."""
+        axes, eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
+        lower, upper = BoundingBox.around(scene.parts).bounds() if scene.parts else (eye, eye)
+        ahead = float(axes[2] @ ((lower + upper) / 2 - eye))
+        if camera.near is not None and camera.far is not None:  # what is seen is between them
+            ahead = float(axes[2] @ (np.array(middle(camera)) - eye))
+        reach = float(np.linalg.norm(upper - lower)) or 1.0
+        distance = ahead if ahead > 0 else reach
+        half = float(camera.half_height)
+        tangent = half if camera.is_perspective else half / distance
+        return cls(eye + distance * axes[2], axes, distance, tangent, camera.is_perspective, axes[1].copy(), distance)
+
+    @property
+    def eye(self) -> np.ndarray:
+        """(3,) where from, length units."""
+        return self.target - self.distance * self.axes[2]
+
+    @property
+    def height(self) -> float:
+        """Visible height at the depth of the target, length units."""
+        return 2 * self.distance * self.tangent
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera of so many pixels, with near and far of whatever scene it is shown."""
+        eye, target, up = self.eye, self.target, self.axes[1]
+        if self.perspective:
+            return Camera.look_at(eye, target, up, 2 * math.degrees(math.atan(self.tangent)), width, height)
+        return Camera.orthographic(eye, target, up, self.height, width, height)
+
+    def orbited(self, right: float, down: float) -> Pose:
+        """Turned as if the target was dragged: by shares of the picture's height."""
+        around = self.pole if self.pole @ self.axes[1] >= 0 else -self.pole
+        turn = Rotation.from_rotvec(-math.radians(HALF_TURN * right) * around)
+        tilt = Rotation.from_rotvec(-math.radians(HALF_TURN * down) * self.axes[0])
+        return dataclasses.replace(self, axes=_orthonormal((turn * tilt).apply(self.axes)))
+
+    def panned(self, right: float, down: float) -> Pose:
+        """Moved across, as if the target was dragged by shares of the picture's height."""
+        step = -right * self.axes[0] + down * self.axes[1]
+        return dataclasses.replace(self, target=self.target + step * self.height)
+
+    def zoomed(self, factor: float, right: float = 0.0, down: float = 0.0) -> Pose:
+        """Nearer by a factor > 1; what is at a place, in shares of the height from the middle, stays there."""
+        least, most = (limit * self.start for limit in (MIN_ZOOM, MAX_ZOOM))
+        distance = min(max(self.distance / factor, least), most)
+        share = 1 - distance / self.distance
+        step = share * self.height * (right * self.axes[0] - down * self.axes[1])
+        return dataclasses.replace(self, distance=distance, target=self.target + step)
+
+    def rolled(self, degrees: float) -> Pose:
+        """Turned about the line of sight, the picture counterclockwise."""
+        axes = _orthonormal(Rotation.from_rotvec(math.radians(degrees) * self.axes[2]).apply(self.axes))
+        return dataclasses.replace(self, axes=axes, pole=axes[1].copy())
+
+    def along(self, name: str) -> Pose:
+        """Seen along an axis, `"x"`, `"y"` or `"z"`, from the other side with a minus before it; or `"iso"`."""
+        forward, up = VIEWS[name.lstrip("-")] if name != "iso" else (OBLIQUE, (0.0, 1.0, 0.0))
+        ahead = np.asarray(forward, np.float64) * (-1 if name.startswith("-") else 1)
+        axes = _looking(ahead / np.linalg.norm(ahead), np.asarray(up, np.float64))
+        return dataclasses.replace(self, axes=axes, pole=axes[1].copy())
+
+    def fitted(self, lower: np.ndarray, upper: np.ndarray, aspect: float) -> Pose:
+        """Such that a box fills the picture, of which the width is `aspect` times the height, from the same side."""
+        radius = float(np.linalg.norm(upper - lower)) / 2 or 0.5
+        narrow = self.tangent * min(aspect, 1.0)
+        sine = narrow / math.hypot(1, narrow) if self.perspective else narrow
+        return dataclasses.replace(self, target=(lower + upper) / 2, distance=radius / sine)
+
+    def centred(self, place: np.ndarray) -> Pose:
+        """Such that a place is the target, seen from the same side and no nearer or farther than it was."""
+        depth = float(self.axes[2] @ (place - self.eye))
+        if not self.perspective or not depth > 0:
+            return dataclasses.replace(self, target=place)
+        least, most = (limit * self.start for limit in (MIN_ZOOM, MAX_ZOOM))
+        return dataclasses.replace(self, target=place, distance=min(max(depth, least), most))
+
+    def projected(self, perspective: bool) -> Pose:
+        """With rays that spread from the eye, or parallel ones; what is at the target keeps its size."""
+        return dataclasses.replace(self, perspective=perspective)
+
+    def place_at(self, right: float, down: float, depth: float) -> np.ndarray:
+        """(3,) the place at a view depth, on the ray of a place of the picture in shares of the height from its middle."""
+        scale = 2 * self.tangent * (depth if self.perspective else self.distance)
+        return self.eye + depth * self.axes[2] + scale * (right * self.axes[0] - down * self.axes[1])
+
+    def told(self) -> dict[str, Any]:
+        """As numbers for JSON, from which `read` makes it again."""
+        vectors = {name: getattr(self, name).tolist() for name in ("target", "pole")}
+        forward, up = self.axes[2].tolist(), self.axes[1].tolist()
+        numbers = {"distance": self.distance, "tangent": self.tangent, "perspective": self.perspective}
+        return {**vectors, "forward": forward, "up": up, **numbers}
+
+    def read(self, told: dict[str, Any]) -> Pose:
+        """What `told` said, of a view that began as this did.
+
+        Raises:
+            ValueError: numbers that make no pose.
+        """
+        try:
+            target, pole, forward, up = (np.asarray(told[name], np.float64) for name in ("target", "pole", "forward", "up"))
+            distance, tangent, perspective = float(told["distance"]), float(told["tangent"]), bool(told["perspective"])
+            for vector in (target, pole, forward, up):
+                if vector.shape != (3,) or not np.isfinite(vector).all():
+                    raise ValueError("vectors are three finite numbers")
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"a pose needs target, pole, forward, up, distance, tangent and perspective: {error}") from None
+        fov = 2 * math.degrees(math.atan(tangent))
+        if not (MIN_ZOOM <= distance / self.start <= MAX_ZOOM and NARROWEST / 10 <= fov <= WIDEST):
+            raise ValueError(f"a pose with distance {distance:g} and field of view {fov:g} degrees is out of reach")
+        if min(np.linalg.norm(np.cross(forward, up)), np.linalg.norm(pole), np.linalg.norm(forward)) < 1e-9:
+            raise ValueError("a pose needs directions that span a view")
+        axes = _looking(forward / np.linalg.norm(forward), up)
+        changed: dict[str, Any] = {
+            "target": target,
+            "pole": pole / np.linalg.norm(pole),
+            "distance": distance,
+            "tangent": tangent,
+        }
+        return dataclasses.replace(self, axes=axes, perspective=perspective, **changed)
+
+
+def _looking(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Rows right, up and forward."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, forward), forward])
+
+
+def _orthonormal(axes: np.ndarray) -> np.ndarray:
+    """The same without what rounding has added over many motions."""
+    return _looking(axes[2] / np.linalg.norm(axes[2]), axes[1])

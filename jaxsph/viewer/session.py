@@ -1,0 +1,411 @@
+"""A view: its newest state, threads that render it, and those who are told of pictures.
+
+Flow: inputs -> [session: state -> stages] -> Picture -> listeners (server, widget).
+
+Inputs are done at once and cost nothing; pictures are made of the newest state only. One thread makes drafts, another what comes
+after them once nothing has moved for a moment: it leaves what it does at the next band as soon as something moves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsph.engine.asked import require_asked
+from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.viewer.code import Source, command_of, python_of
+from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, looking
+from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
+from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit, number
+from jaxsph.viewer.picture import Picture, described
+from jaxsph.viewer.pose import Pose
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
+
+REST_SECONDS = 0.2
+"""How long nothing moves before more than drafts are made."""
+Listener = Callable[[Any], None]
+
+
+class Snapshot(NamedTuple):
+    """A state: everything that a picture is made of."""
+
+    version: int
+    scene: Scene
+    camera: Camera
+    pose: Pose
+
+
+class Session:
+    """An interactive view of a scene, without anybody who shows it.
+
+    Use it as a context, or call `start` and `close`. Methods may be called from any thread.
+
+    Attributes:
+        scene: with the look that is shown.
+        settings: of the last picture of a state.
+        stages: how pictures are made, the draft first.
+        told: a reason why there is no picture of the settings, for people; empty where there is.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, settings: Settings | None = None, source: Source | None = None) -> None:
+        """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
+
+        Args:
+            scene, camera: what is looked at, and from where.
+            settings: of the last picture of a state; None is `stages.DEFAULT`.
+            source: where the scene comes from, for the code that makes it again.
+
+        Raises:
+            ValueError: a scene with nothing in it, or a camera that is none.
+        """
+        require_asked(scene, camera, DEFAULT if settings is None else settings)
+        scene.check()
+        self.settings, self.told = DEFAULT if settings is None else settings, ""
+        self.stages, self._source = stages_of(self.settings, camera), source or Source()
+        look = first_look(scene)
+        self._given, self._first = camera, Pose.of(camera, scene)
+        self._pose, self._moved = self._first, False
+        self._steps = None if look is None else Steps(ControlPoints.of(look))
+        self._base = scene
+        self.scene = self._looked()
+        self._version, self._failed, self._changed = 1, 0, 0.0
+        self._lock = threading.Condition()
+        self._pictures: dict[str, Picture] = {}
+        self._histogram: Any = None
+        self._listeners: list[Listener] = []
+        self._threads: list[threading.Thread] = []
+        self._closed, self._wide = False, jax.config.read("jax_enable_x64")
+
+    def __enter__(self) -> Session:
+        return self.start()
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def start(self) -> Session:
+        """Begin to render."""
+        for work in (self._draft, self._finish):
+            thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        return self
+
+    def close(self, seconds: float | None = None) -> bool:
+        """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given.
+
+        Returns:
+            Whether they have ended: a compiler may take longer.
+        """
+        with self._lock:
+            self._closed = True
+            self._lock.notify_all()
+        for thread in self._threads:
+            thread.join(seconds)
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        return not self._threads
+
+    # What is seen.
+
+    @property
+    def version(self) -> int:
+        """Of the newest state."""
+        return self._version
+
+    @property
+    def picture(self) -> Picture | None:
+        """The best picture of the newest state that there is any of."""
+        with self._lock:
+            pictures = sorted(self._pictures.values(), key=lambda one: (one.version, self._names.index(one.stage)))
+            return pictures[-1] if pictures else None
+
+    def snapshot(self) -> Snapshot:
+        """The newest state."""
+        with self._lock:
+            return Snapshot(self._version, self.scene, self._camera(), self._pose)
+
+    def state(self) -> dict[str, Any]:
+        """The newest state for a page, as JSON has it."""
+        with self._lock:
+            pose, camera = self._pose, self._camera()
+            look = None if self._steps is None else self._steps.look.told()
+            return {
+                "is": "state",
+                "version": self._version,
+                "pose": pose.told(),
+                "size": [camera.width, camera.height],
+                "height": pose.height,
+                "axes": pose.axes.tolist(),
+                "look": look,
+                "edited": self._steps is not None and self._steps.look.points is not None,
+                "moved": self._moved,
+                "told": self.told,
+            }
+
+    @property
+    def transfer(self) -> TransferFunction | None:
+        """The look that is shown, where there is one."""
+        return first_look(self.scene)
+
+    def code(self) -> dict[str, str]:
+        """The Python and the command that make the newest state again."""
+        with self._lock:
+            pose = self._pose if self._moved else None
+            edited = self._steps is not None and self._steps.look.points is not None
+            camera, look = self._camera(), self.transfer if edited else None
+        return {
+            "python": python_of(self._source, camera, pose, look, self.settings),
+            "command": command_of(self._source, camera, pose, edited, self.settings),
+        }
+
+    @property
+    def histogram(self) -> dict[str, Any] | None:
+        """What rays of the last view that stood still met, by place on the axis of the look."""
+        return self._histogram
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Call somebody with every picture, and every histogram (a dict), from the threads that made them; until undone."""
+        with self._lock:
+            self._listeners.append(listener)
+
+        def undo() -> None:
+            with self._lock:
+                if listener in self._listeners:
+                    self._listeners.remove(listener)
+
+        return undo
+
+    def wait(self, stage: str | None = None, seconds: float = 600.0) -> Picture:
+        """The picture of the newest state from a stage, by default the last, as soon as there is one.
+
+        Raises:
+            TimeoutError: there is none after so long.
+            RuntimeError: it cannot be made.
+        """
+        end = time.monotonic() + seconds
+        with self._lock:
+            while True:
+                found = self._pictures.get(stage or self._names[-1])
+                if found is not None and found.version == self._version:
+                    return found
+                if self.told and self._failed == self._version:
+                    raise RuntimeError(self.told)
+                if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
+                    raise TimeoutError(f"no picture of {stage or self._names[-1]!r} within {seconds:g} s")
+
+    def whole(self, seconds: float = 600.0) -> Picture:
+        """The best picture of all pixels of the newest state; waits where there is but a draft."""
+        picture = self.picture
+        return (
+            picture
+            if picture is not None and picture.version == self._version and picture.stage != DRAFT
+            else self.wait(FULL, seconds)
+        )
+
+    # What is done.
+
+    def do(self, message: Any) -> dict[str, Any] | None:
+        """Do what a message asks for.
+
+        Args:
+            message: `{"do": NAME, ...}`, see `inputs`; also `fit`, `home`, `center`, `pick`, `restore`.
+
+        Returns:
+            An answer for who asked, where there is one.
+
+        Raises:
+            InputError: what cannot be understood or done; nothing has changed.
+        """
+        if not isinstance(message, dict) or not isinstance(message.get("do"), str):
+            raise InputError('a message must be an object such as {"do": "orbit", "right": 0.1, "down": 0}')
+        name = message["do"]
+        try:
+            if name == "pick":
+                return self._picked(message)
+            with self._lock:
+                self._do(name, message)
+                self._version += 1
+                self._changed = time.monotonic()
+                self._lock.notify_all()
+        except InputError:
+            raise
+        except (ValueError, ArithmeticError) as error:
+            raise InputError(str(error)) from error
+        return None
+
+    def _do(self, name: str, message: dict[str, Any]) -> None:
+        if name in MOTIONS:
+            self._move(MOTIONS[name](self._pose, message))
+        elif name in KNOWN_EDITS:
+            if self._steps is None:
+                raise InputError("this scene has no transfer function to edit")
+            edit(self._steps, message)
+            self.scene = self._looked()
+        elif name == "fit":
+            lower, upper = self._bounds()
+            self._move(self._pose.fitted(lower, upper, self._given.width / self._given.height))
+        elif name == "home":
+            self._pose, self._moved = self._first, False
+        elif name == "center":
+            self._move(self._pose.centred(self._seen(message)))
+        elif name == "restore":
+            if not isinstance(message.get("pose"), dict):
+                raise InputError("`pose` of 'restore' must be an object")
+            self._move(self._first.read(message["pose"]))
+            if message.get("points") is not None and self._steps is not None:
+                edit(self._steps, {"do": "points", "points": message["points"]})
+                self.scene = self._looked()
+        else:
+            known = ", ".join((*MOTIONS, *KNOWN_EDITS, "fit", "home", "center", "restore", "pick"))
+            raise InputError(f"there is no {name[:40]!r}; there are {known}")
+
+    def _move(self, pose: Pose) -> None:
+        pose.camera(1, 1)  # refuses what is none
+        self._pose, self._moved = pose, True
+
+    def _camera(self) -> Camera:
+        if not self._moved:
+            return self._given
+        camera = self._pose.camera(self._given.width, self._given.height)
+        if self._base.media:  # which do not say how large they are
+            camera = dataclasses.replace(camera, near=self._given.near, far=self._given.far)
+        return camera
+
+    def _looked(self) -> Scene:
+        return self._base if self._steps is None else looking(self._base, self._steps.look.transfer())
+
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        if not self._base.parts:
+            raise InputError("this scene does not say how large it is")
+        return BoundingBox.around(self._base.parts).bounds()
+
+    def _seen(self, message: dict[str, Any]) -> np.ndarray:
+        """The place at half light under a place of the picture."""
+        picture = self.picture
+        right, down = (number(message, name, -10, 10) for name in ("right", "down"))
+        if picture is None:
+            raise InputError("there is no picture yet")
+        place = place_seen(picture, right, down)
+        if place is None:
+            raise InputError("nothing is seen there: less than half of the light is absorbed")
+        return place
+
+    def _picked(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Numbers of a pixel."""
+        picture = self.picture
+        right, down = (number(message, name, -10, 10) for name in ("right", "down"))
+        if picture is None:
+            raise InputError("there is no picture yet")
+        return {"is": "picked", **told_of_pixel(picture, right, down)}
+
+    # Threads.
+
+    @property
+    def _names(self) -> list[str]:
+        return [stage.name for stage in self.stages]
+
+    def _run(self, work: Callable[[], None]) -> None:
+        with jax.enable_x64(self._wide):  # which a thread does not inherit
+            work()
+
+    def _draft(self) -> None:
+        """A draft of every state that is still the newest when the one before is done."""
+        stage, drawn = self.stages[0], 0
+        while (state := self._next(drawn)) is not None:
+            drawn = state.version
+            self._show(stage, state, lambda: False)
+
+    def _finish(self) -> None:
+        """All after the draft, of states that stand still."""
+        done = 0
+        with self._lock:  # the first draft comes sooner alone
+            self._lock.wait_for(lambda: self._closed or self._pictures or self.told)
+        while (state := self._next(done, rest=True)) is not None:
+            moved = self._is_old(state)
+            for stage in self.stages[1:]:
+                if moved() or not self._show(stage, state, moved):
+                    break
+            if not moved():
+                self._describe(state)
+                done = state.version
+
+    def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
+        """The newest state as soon as there is one after `done`, and it rests if it has to; None at the end."""
+        with self._lock:
+            while not self._closed:
+                still = REST_SECONDS - (time.monotonic() - self._changed) if rest else 0.0
+                if self._version > done and still <= 0:
+                    return Snapshot(self._version, self.scene, self._camera(), self._pose)
+                self._lock.wait(still if self._version > done else None)
+        return None
+
+    def _is_old(self, state: Snapshot) -> Callable[[], bool]:
+        return lambda: self._closed or self._version != state.version
+
+    def _show(self, stage: Stage, state: Snapshot, stop: Callable[[], bool]) -> bool:
+        """Make a picture and tell of it; False where it was left, or cannot be made."""
+        started = time.perf_counter()
+        try:
+            if not stage.made:
+                stage.prepare(state.scene, self._around(state))
+            image = stage.image(state.scene, state.camera, stop)
+        except Abandoned:
+            return False
+        except Exception as error:  # a view goes on: what is wrong is told
+            self._tell(stage, state, error)
+            return False
+        words, facts = described(stage, image, state.camera, time.perf_counter() - started)
+        final = stage is self.stages[-1]
+        made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
+        picture = Picture(state.version, stage.name, words, final, *made, facts)
+        with self._lock:
+            rank = picture.version, self._names.index(picture.stage)
+            is_best = all((other.version, self._names.index(name)) <= rank for name, other in self._pictures.items())
+            if is_best:
+                self._pictures[stage.name] = picture
+            self.told = "" if final else self.told
+            self._lock.notify_all()
+        if is_best:
+            self._send(picture)
+        return True
+
+    def _around(self, state: Snapshot) -> list[Camera]:
+        """The view, and some around it, for which there is to be room."""
+        size, pose = (self._given.width, self._given.height), self._pose
+        poses = [pose.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [pose.orbited(0, tilt) for tilt in (0.4, -0.4)]
+        poses += [pose.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
+        around = [] if self._base.media else [one.camera(*size) for one in poses]
+        return [state.camera, *around]
+
+    def _tell(self, stage: Stage, state: Snapshot, error: Exception) -> None:
+        with self._lock:
+            self._failed = state.version
+            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+            self.told = f"{stage.name}: {kind}{error}"
+            self._lock.notify_all()
+        self._send({"is": "error", "text": self.told})
+
+    def _describe(self, state: Snapshot) -> None:
+        """Tell what rays of a view that stands met."""
+        try:
+            found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
+        except Exception as error:  # a view goes on without it
+            self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
+            return
+        if found is not None and not self._is_old(state)():
+            self._histogram = {"is": "histogram", "version": state.version, **found}
+            self._send(self._histogram)
+
+    def _send(self, what: Any) -> None:
+        with self._lock:
+            listeners = list(self._listeners)
+        for listener in listeners:
+            listener(what)

@@ -1,0 +1,135 @@
+"""Pictures of a view, from a rough one at once to the one that was asked for; each stage keeps its plans.
+
+Flow: Scene, Camera of the newest state -> [stages] -> Image, and what it is in words.
+
+| stage | pixels | settings |
+|---|---|---|
+| draft | a fraction | a quarter of the samples, no tolerance |
+| full | all | point samples, no tolerance: the bits of `jaxsph.render` |
+| tolerance | all | those that were asked for, where they hold a tolerance |
+
+A plan is made with room for views to come, of a scene of which no look hides anything, and grows when it is too small: only then
+is anything compiled. What is chosen by how large supports appear has plans of its own, as it has a say in the picture's bits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from jaxsph.engine.planning.fit import plan
+from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.render import render
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.faults import CapacityError
+from jaxsph.viewer.control_points import everywhere
+
+DRAFT_PIXELS = 50_000
+"""Most pixels of a draft: on two cores one of 40,000 particles takes a tenth of a second."""
+DRAFT_SAMPLES = 4
+"""Samples of a picture over those of its draft."""
+BANDS = 4
+"""A full picture is made in so many, so that it can be left between them; not one for a tolerance, in which they have a say."""
+HEADROOM = 1.5
+DRAFT, FULL, TOLERANCE = "draft", "full", "tolerance"
+DEFAULT = Settings(integrator="segments", tolerance=0.01)
+"""Of a view that was asked for nothing else: an error that is told, against the light integral."""
+
+
+class Abandoned(Exception):
+    """There is something newer to be shown."""
+
+
+class Stage:
+    """One way to make the picture, and its plans.
+
+    Attributes:
+        name: of the stage.
+        shrink: pixels of the picture over those of the stage, along each side.
+        settings: of the stage.
+        made: plans that were made or grown: each stands for programs that are compiled once.
+    """
+
+    def __init__(self, name: str, settings: Settings, shrink: int = 1) -> None:
+        self.name, self.settings, self.shrink, self.made = name, settings, shrink, 0
+        self._plans: dict[Any, Plan] = {}
+        self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera with the pixels of this stage."""
+        if self.shrink == 1:
+            return camera
+        width, height = (max(1, round(side / self.shrink)) for side in (camera.width, camera.height))
+        return dataclasses.replace(camera, width=width, height=height)
+
+    def prepare(self, scene: Scene, cameras: Iterable[Camera]) -> None:
+        """Make room for views.
+
+        Raises:
+            ValueError: settings that the scene does not suit.
+        """
+        for camera in cameras:
+            self._planned(everywhere(scene), self.camera(camera))
+
+    def image(self, scene: Scene, camera: Camera, stop: Callable[[], bool]) -> Image:
+        """The picture.
+
+        Raises:
+            Abandoned: `stop()` has become true between two bands.
+            ValueError: what `jaxsph.render` raises it for.
+        """
+        camera = self.camera(camera)
+        made = self._plans[self._choice(None)] if self._is_draft and self._plans else self._planned(scene, camera)
+
+        def leave(done: int, bands: int) -> None:
+            if done < bands and stop():
+                raise Abandoned
+
+        while True:
+            try:
+                return render(scene, camera, self.settings, plan=made, progress=leave)
+            except CapacityError:
+                small, made = made, self._planned(scene, camera, grow=made)
+                if made == small:
+                    raise
+
+    @property
+    def _is_draft(self) -> bool:
+        return self.name == DRAFT
+
+    def _choice(self, needed: Plan | None) -> Any:
+        return None if self._is_draft or needed is None else needed.choices
+
+    def _planned(self, scene: Scene, camera: Camera, grow: Plan | None = None) -> Plan:
+        """A kept plan with room for a picture, or more room."""
+        needed = plan(scene, camera, self.settings, bands=self._bands)
+        key = self._choice(needed)
+        kept = self._plans.get(key) if grow is None else grow
+        if kept is not None and grow is None and kept.serves(needed):
+            return kept
+        made = plan(scene, camera, self.settings, like=kept, headroom=HEADROOM, bands=self._bands)
+        self.made += made != kept
+        self._plans[key] = made
+        return made
+
+
+def stages_of(settings: Settings, camera: Camera) -> tuple[Stage, ...]:
+    """The stages of a view, the draft first."""
+    shrink = max(2, int(np.ceil(np.sqrt(camera.width * camera.height / DRAFT_PIXELS))))
+    has_tolerance = settings.tolerance is not None
+    plainly = dataclasses.replace(settings, tolerance=None, screen="pixels")
+    if has_tolerance and settings.integrator == "segments":
+        plainly = dataclasses.replace(plainly, integrator="samples")
+    rough = dataclasses.replace(plainly, samples=max(1, plainly.samples // DRAFT_SAMPLES))
+    stages = [Stage(DRAFT, rough, shrink)]
+    if has_tolerance or settings.screen != "pixels":
+        stages += [Stage(FULL, plainly), Stage(TOLERANCE, settings)]
+    else:
+        stages += [Stage(FULL, settings)]
+    return tuple(stages)

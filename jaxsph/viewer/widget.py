@@ -1,0 +1,140 @@
+"""A view in a notebook: the page's own modules in a widget, with the kernel in the place of the server.
+
+Flow: Session -> pictures -> [widget, through the kernel] <-> Jupyter, VS Code, marimo.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.resources
+import re
+import threading
+from typing import Any
+
+from jaxsph.io.libraries import require
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.picture import Picture
+from jaxsph.viewer.session import Session
+
+MODULES = ("made", "moves", "editor", "view", "notebook")
+"""Of the page, each after those that it imports."""
+IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";\n', re.MULTILINE)
+EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const) (\w+))", re.MULTILINE)
+MAX_UNSEEN = 2
+"""Frames that are on their way to a notebook: more would pile up where it is slow."""
+
+
+def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
+    """ControlPoints around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
+
+    `jaxsph view FILE` shows the same in a browser. A draft comes while something moves; then every pixel gets its ray; then the
+    tolerance is kept. The widget always says which of these is seen, and how far it may be off.
+
+    Args:
+        scene, camera: as for `jaxsph.render`.
+        settings: of the picture once nothing moves; by default segments with a tolerance of 0.01.
+
+    Returns:
+        A widget (`anywidget.AnyWidget`) that the notebook shows. Its `session` (`jaxsph.viewer.session.Session`) has the scene
+        and the camera that are seen as `session.snapshot()`; `close()` ends it.
+
+    Raises:
+        ImportError: the extra `view` is not installed.
+        ValueError: a scene with nothing in it, or a camera that is none.
+    """
+    require("anywidget", "an interactive view in a notebook", "view")
+    return _widget_class()(Session(scene, camera, settings).start())
+
+
+@functools.cache
+def bundle() -> str:
+    """The modules of the page as one, which exports `render` for a notebook."""
+    folder, parts = importlib.resources.files("jaxsph.viewer") / "page", []
+    for name in MODULES:
+        text = (folder / f"{name}.js").read_text(encoding="utf-8")
+        exported = EXPORT.findall(text)
+        body = EXPORT.sub("", IMPORT.sub(r"const {\1} = _\2;\n", text))
+        parts.append(f"const _{name} = (() => {{\n{body}\nreturn {{ {', '.join(exported)} }};\n}})();\n")
+    return "".join([*parts, "export default _notebook;\n"])
+
+
+@functools.cache
+def _widget_class() -> Any:
+    import anywidget
+
+    class View(anywidget.AnyWidget):  # type: ignore[misc]
+        """A view; see `view`."""
+
+        _esm = bundle()
+        _css = (importlib.resources.files("jaxsph.viewer") / "page" / "view.css").read_text(encoding="utf-8")
+
+        def __init__(self, session: Session) -> None:
+            super().__init__()
+            self.session, self._sender = session, _Sender(self.send)
+            self._undo = session.listen(self._sender.show)
+            self.on_msg(lambda _, message, __: self._received(message))
+
+        def close(self) -> None:
+            """End the view."""
+            self._undo()
+            self.session.close(0)
+            super().close()
+
+        def _received(self, message: Any) -> None:
+            answered(self.session, self._sender, message)
+
+    return View
+
+
+class _Sender:
+    """Sends what is newest, and no more pictures than are seen."""
+
+    def __init__(self, send: Any) -> None:
+        self._send, self._unseen = send, 0
+        self._newest: Picture | None = None
+        self._lock = threading.RLock()
+
+    def show(self, what: Any) -> None:
+        """A picture, or something else."""
+        if not isinstance(what, Picture):
+            self._send(what)
+            return
+        with self._lock:
+            self._newest = what
+            self._more()
+
+    def seen(self, *, anew: Picture | None = None) -> None:
+        """A picture has arrived; `anew`: there is somebody new, who has seen nothing."""
+        with self._lock:
+            self._unseen = 0 if anew is not None else max(self._unseen - 1, 0)
+            self._newest = anew or self._newest
+            self._more()
+
+    def _more(self) -> None:
+        if self._newest is not None and self._unseen < MAX_UNSEEN:
+            picture, self._newest = self._newest, None
+            self._unseen += 1
+            self._send(picture.header(), [picture.encoded])
+
+
+def answered(session: Session, sender: _Sender, message: Any) -> None:
+    """Do what a notebook asks for, and answer."""
+    try:
+        name = message.get("do") if isinstance(message, dict) else None
+        if name == "seen":
+            sender.seen()
+        elif name == "hello":
+            sender.show(session.state())
+            sender.seen(anew=session.picture)
+            if session.histogram is not None:
+                sender.show(session.histogram)
+        elif name == "code":
+            sender.show({"is": "code", **session.code()})
+        else:
+            answer = session.do(message)
+            sender.show(session.state() if answer is None else answer)
+    except InputError as error:
+        sender.show({"is": "error", "text": str(error)})

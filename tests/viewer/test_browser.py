@@ -1,0 +1,198 @@
+"""A person in front of a real browser: opens, drags, zooms, edits colours, clicks, saves and closes."""
+
+import io
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+
+pytest.importorskip("websockets", reason="the extra `view` is not installed")
+import browser as browsers
+
+import jaxsph as js
+
+pytestmark = pytest.mark.skipif(browsers.found() is None, reason="there is no chromium on the PATH")
+ROOT = Path(__file__).parent.parent.parent
+SIZE, SAMPLES, PARTICLES = (96, 72), 16, 300
+SECONDS = 120
+
+
+@pytest.fixture(scope="module")
+def address():
+    """A view that is served, as the command line does it."""
+    words = [f"scene:radial:particles={PARTICLES}", "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
+    more = ["--integrator", "samples", "--no-browser", "-q"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jaxsph", "view", *words, *more], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    yield process.stdout.readline().strip()
+    process.send_signal(signal.SIGINT)
+    try:
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    made = browsers.Browser(tmp_path_factory.mktemp("browser"))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def page(browser, address):
+    made = browser.page(address)
+    made.until("document.body.dataset.final == 'true'", SECONDS)
+    yield made
+    assert not [said for said in made.said if "exceptionDetails" in said or said["entry"]["level"] == "error"]
+    made.close()
+
+
+def changed(page, does):
+    """Do something, and wait until its picture stands still."""
+    before = page.ask("+document.body.dataset.version")
+    does()
+    page.until(f"+document.body.dataset.version > {before} && document.body.dataset.final == 'true'", SECONDS)
+
+
+def shown(page):
+    """What the canvas shows, (H, W, 3)."""
+    width, height, values = page.ask(
+        "(() => { const c = document.querySelector('.picture');"
+        " return [c.width, c.height, [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]]; })()"
+    )
+    return np.array(values, np.uint8).reshape(height, width, 4)[..., :3]
+
+
+def rendered(page):
+    """What `jaxsph.render` makes of the same view, by the code that the page tells, (H, W, 3)."""
+    page.ask("document.querySelector('button[title=\"Python and command\"]').click()")
+    code = page.until("document.querySelector('.code').textContent").partition("\n\n")[2]
+    page.ask("document.querySelector('dialog[open] button').click(), document.querySelector('.code').textContent = ''")
+    space = {}
+    exec(code.replace('image.save("view.png")', ""), space)
+    return space["image"].to_uint8()
+
+
+def near(picture, other):
+    return np.abs(picture.astype(int) - other.astype(int)).max() <= 1
+
+
+def test_what_stands_still_is_what_render_makes(page):
+    scene, camera = js.scenes.load("radial", PARTICLES, width=SIZE[0], height=SIZE[1])
+    image = js.render(scene, camera, js.Settings(samples=SAMPLES))
+    assert near(shown(page), image.to_uint8()) and image.to_uint8().max() > 100
+    assert page.ask("document.querySelector('.status').innerText").replace("\n", " ").startswith(f"full {SIZE[0]} x {SIZE[1]}")
+    assert page.ask("document.querySelectorAll('.editor .absorbed').length") in (0, 64)
+
+
+def test_drag_zoom_edit_and_click(page):
+    first = shown(page)
+    x, y = page.middle(".picture")
+    changed(page, lambda: page.drag([(x, y), (x + 40, y + 5), (x + 90, y + 30)]))
+    dragged = shown(page)
+    assert not near(first, dragged) and near(dragged, rendered(page))
+    changed(page, lambda: page.mouse("Wheel", x + 20, y, deltaX=0, deltaY=-240))
+    zoomed = shown(page)
+    assert not near(dragged, zoomed) and near(zoomed, rendered(page))
+    changed(page, lambda: page.drag([(x, y), (x + 30, y)], button="right"))
+    points = page.ask("document.querySelectorAll('.editor .point').length")
+    where = page.middle(".editor .point:nth-child(2)")
+    changed(page, lambda: page.drag([where, (where[0] + 5, where[1] - 20), (where[0] + 10, where[1] - 45)]))
+    edited = shown(page)
+    assert not near(zoomed, edited) and near(edited, rendered(page))
+    across, down = page.middle(".editor .ground")
+    changed(page, lambda: page.click(across - 40, down - 50))
+    assert page.ask("document.querySelectorAll('.editor .point').length") == points + 1
+    changed(page, lambda: page.key("Delete", number=46))
+    assert page.ask("document.querySelectorAll('.editor .point').length") == points
+    page.click(x, y)
+    said = page.until("document.querySelectorAll('.numbers dt').length > 3 && document.querySelector('.numbers').innerText")
+    assert "depth at half light" in said and "quantity" in said
+    row, column = 20, 60  # of a picture that is as wide as its element, and lower
+    wide = page.ask("document.querySelector('.picture').getBoundingClientRect().width")
+    scale = wide / SIZE[0]
+    assert scale * SIZE[1] < page.ask("document.querySelector('.picture').getBoundingClientRect().height") - 10
+    page.click(x + (column + 0.5 - SIZE[0] / 2) * scale, y + (row + 0.5 - SIZE[1] / 2) * scale)
+    page.until(f"document.querySelector('.numbers').innerText.includes('row {row}, column {column} of')")
+    changed(page, lambda: page.click(x, y, clicks=2))
+
+
+def test_keys_alone_suffice(page):
+    page.ask("document.querySelector('.picture').focus()")
+    before = shown(page)
+    for key, more in (
+        ("ArrowLeft", {}),
+        ("ArrowUp", {"modifiers": 8}),
+        ("+", {}),
+        ("]", {}),
+        ("1", {"code": "Digit1"}),
+        ("0", {}),
+        ("f", {}),
+    ):
+        changed(page, lambda key=key, more=more: page.key(key, **more))
+    changed(page, lambda: page.key("h"))
+    page.key("i")
+    page.until("document.querySelectorAll('.numbers dt').length > 3")
+    page.key("?", text="?")
+    assert page.until("document.querySelector('dialog[open]')?.innerText").count("\n") > 10
+    page.key("Escape", number=27)
+    page.until("!document.querySelector('dialog[open]')")
+    page.ask("document.querySelector('.editor .point').focus()")
+    changed(page, lambda: page.key("ArrowUp"))
+    changed(page, lambda: page.ask("document.querySelector('button[title^=\"as it was\"]').click()"))
+    assert not near(before, np.zeros_like(before))
+
+
+def test_a_picture_is_saved_and_the_address_holds_the_view(page, browser):
+    x, y = page.middle(".picture")
+    changed(page, lambda: page.drag([(x, y), (x - 60, y)]))
+    picture = shown(page)
+    page.key("s")
+    saved, end = browser.folder / "view.png", time.monotonic() + 60
+    while not saved.exists():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    with Pillow.open(io.BytesIO(saved.read_bytes())) as found:
+        assert near(picture, np.asarray(found.convert("RGB")))
+    page.until("location.hash.length > 20")
+    held = page.ask("location.href")
+    changed(page, lambda: page.key("h"))
+    other = browser.page(held)
+    other.until("document.body.dataset.final == 'true' && location.hash.length > 20", SECONDS)
+    deadline = time.monotonic() + 60
+    while not near(shown(other), picture):
+        assert time.monotonic() < deadline
+    other.close()
+    assert json.loads(page.ask("decodeURIComponent(location.hash.slice(1)) || '{}'")) is not None
+
+
+def luminance(color):
+    red, green, blue = (
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in (one / 255 for one in color)
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def test_text_stands_out_from_its_ground(page):
+    """Contrast of 4.5 at least (WCAG AA), of all text on grounds of one colour."""
+    page.key("?", text="?")
+    pairs = page.ask("""[...document.querySelectorAll('.panel *, .status *, dialog *')].filter((e) => e.innerText?.trim()
+      && !e.disabled && [...e.childNodes].some((n) => n.nodeType === 3)).map((e) => {
+        let ground = e;
+        while (ground && getComputedStyle(ground).backgroundColor === 'rgba(0, 0, 0, 0)') ground = ground.parentElement;
+        return [e.innerText.slice(0, 20), getComputedStyle(e).color, getComputedStyle(ground ?? document.body).backgroundColor];
+      })""")
+    assert len(pairs) > 30
+    for text, *colors in pairs:
+        low, high = sorted(luminance([float(part) for part in re.findall(r"[\d.]+", color)[:3]]) for color in colors)
+        assert (high + 0.05) / (low + 0.05) >= 4.5, (text, colors)

@@ -1,0 +1,276 @@
+"""The server of a view: this machine alone, nothing without the token, and no message that ends it."""
+
+import asyncio
+import contextlib
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from views import HEIGHT, SETTINGS, WIDTH, camera, scene
+
+pytest.importorskip("websockets", reason="the extra `view` is not installed")
+from commanded import run as commanded
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from jaxsph.cli.commands import view as command
+from jaxsph.viewer.server import MAX_MESSAGE, MAX_RECEIVED, MAX_TABS, Server
+from jaxsph.viewer.session import Session
+
+SECONDS = 240
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture(scope="module")
+def server():
+    """A server on a thread of its own, whose view is rendered."""
+    with Session(scene(), camera(), SETTINGS) as session:
+        made, began, stops = Server(session), threading.Event(), []
+
+        async def serve():
+            stop = asyncio.Event()
+            stops.append((asyncio.get_running_loop(), stop))
+            await made.serve(began.set, stop)
+
+        thread = threading.Thread(target=asyncio.run, args=(serve(),))
+        thread.start()
+        assert began.wait(60)
+        yield made
+        loop, stop = stops[0]
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(60)
+        assert not thread.is_alive()
+
+
+def got(server, path, method="GET", **headers):
+    """Status, headers and content of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=SECONDS)
+    connection.request(method, path, headers={"Host": f"127.0.0.1:{server.port}", **headers})
+    answer = connection.getresponse()
+    return answer.status, answer.headers, answer.read()
+
+
+def tab(server, **more):
+    return connect(f"ws://127.0.0.1:{server.port}/{server.token}/socket", max_size=None, open_timeout=SECONDS, **more)
+
+
+def heard(socket, kind, seconds=SECONDS):
+    """The next message of a kind: what it says, and its picture."""
+    end = time.monotonic() + seconds
+    while True:
+        message = socket.recv(timeout=max(0.0, end - time.monotonic()))
+        if isinstance(message, str):
+            told, picture = json.loads(message), None
+        else:
+            (length,) = struct.unpack(">I", message[:4])
+            told, picture = json.loads(message[4 : 4 + length]), message[4 + length :]
+        if told["is"] == kind:
+            return told, picture
+
+
+def test_the_page_and_its_modules_are_there_and_load_nothing_from_elsewhere(server):
+    status, headers, page = got(server, f"/?token={server.token}")
+    assert status == 200 and headers["Content-Type"].startswith("text/html") and f"/{server.token}/".encode() in page
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "http" not in policy and headers["Referrer-Policy"] == "no-referrer"
+    for name, kind in (("main.js", "text/javascript"), ("view.js", "text/javascript"), ("view.css", "text/css")):
+        status, headers, text = got(server, f"/{server.token}/{name}")
+        assert status == 200 and headers["Content-Type"].startswith(kind)
+        assert not re.search(rb"https?://(?!www\.w3\.org/2000/svg)", text)
+    assert got(server, f"/{server.token}/nothing.js")[0] == 404
+
+
+def test_without_the_token_or_from_elsewhere_there_is_nothing(server):
+    good = f"/?token={server.token}"
+    for path in (
+        "/",
+        "/?token=",
+        "/?token=wrong",
+        f"/?token={server.token}x",
+        "/view.js",
+        "/x/view.js",
+        "/socket",
+        "//",
+        "/%00",
+        "/../etc",
+    ):
+        assert got(server, path)[0] == 403, path
+    mine = f"127.0.0.1:{server.port}"
+    evil = [{"Origin": origin} for origin in ("http://evil.example", "null", f"https://{mine}")]
+    evil += [{"Host": host} for host in ("evil.example", f"evil.example:{server.port}", "")] + [{"Sec-Fetch-Site": "cross-site"}]
+    for headers in evil:
+        assert got(server, good, **headers)[0] == 403, headers
+    assert got(server, good, Origin=f"http://127.0.0.1:{server.port}")[0] == 200
+    assert got(server, good, Host=f"localhost:{server.port}")[0] == 200
+    for address, more in ((f"/socket?token={server.token}", {}), (f"/{server.token}/socket", {"origin": "http://evil.example"})):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://127.0.0.1:{server.port}{address}", **more)
+
+
+def test_nothing_listens_beyond_this_machine(server):
+    if Path("/proc/net/tcp").exists():
+        rows = [line.split() for file in ("tcp", "tcp6") for line in Path(f"/proc/net/{file}").read_text().splitlines()[1:]]
+        mine = {row[1].split(":")[0] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == server.port}
+        assert mine == {"0100007F"}  # 127.0.0.1, little-endian
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.2", server.port), timeout=5)
+
+
+def test_inputs_become_frames_with_words(server):
+    with tab(server) as page:
+        state, _ = heard(page, "state")
+        assert state["size"] == [WIDTH, HEIGHT] and len(state["look"]["points"]) == 4
+        page.send(json.dumps({"do": "orbit", "right": 0.1, "down": 0}))
+        told, picture = heard(page, "picture")
+        while not told["final"] or told["version"] != server.session.version:
+            told, picture = heard(page, "picture")
+        assert told["format"] == "png" and picture[:4] == b"\x89PNG" and "full: 48 x 32" in told["words"]
+        histogram, _ = heard(page, "histogram")
+        assert len(histogram["edges"]) == len(histogram["absorbed"]) + 1 and max(histogram["absorbed"]) == 1
+        page.send(json.dumps({"do": "pick", "right": 0, "down": 0}))
+        assert heard(page, "picked")[0]["of"] == [HEIGHT, WIDTH]
+        page.send(json.dumps({"do": "code"}))
+        assert "js.render(scene, camera" in heard(page, "code")[0]["python"]
+
+
+GARBAGE = ["", "{", "[]", "null", '"x"', "[" * 30000, '{"do":', b"\x00\xff", "x" * (MAX_MESSAGE + 1), "\ud7ff"]
+GARBAGE += ['{"do": "orbit", "right": 1e999, "down": 0}', '{"do": "orbit", "right": NaN, "down": 0}', '{"do": {"do": 1}}']
+
+
+@pytest.mark.parametrize("message", GARBAGE, ids=range(len(GARBAGE)))
+def test_garbage_is_answered_and_ends_nothing(server, message):
+    version = server.session.version
+    with tab(server) as page:
+        page.send(message)
+        assert heard(page, "error")[0]["text"]
+        page.send(json.dumps({"do": "pick", "right": 0, "down": 0}))
+        heard(page, "picked")
+    assert server.session.version == version
+
+
+def test_what_is_much_too_long_closes_its_own_tab_alone(server, capfd):
+    with tab(server) as other, tab(server) as page:
+        page.send("x" * (MAX_RECEIVED + 1))
+        with pytest.raises(ConnectionClosed):
+            while True:
+                page.recv(timeout=SECONDS)
+        other.send(json.dumps({"do": "code"}))
+        heard(other, "code")
+    with contextlib.suppress(http.client.RemoteDisconnected, ConnectionResetError):
+        assert got(server, f"/?token={server.token}", method="POST")[0] == 405
+    broken = socket.create_connection(("127.0.0.1", server.port))
+    broken.sendall(b"\x00\xff\x17 nothing of HTTP\r\n\r\n")
+    broken.close()
+    assert got(server, f"/?token={server.token}")[0] == 200
+    assert capfd.readouterr().err == ""
+
+
+def test_tabs_show_one_view_and_may_be_closed_and_opened_again(server):
+    with tab(server) as one:
+        with tab(server) as other:
+            heard(other, "state")
+            one.send(json.dumps({"do": "roll", "degrees": 7}))
+            version = None
+            while version != server.session.version:
+                version = heard(other, "state")[0]["version"]
+        one.send(json.dumps({"do": "roll", "degrees": 7}))
+        while heard(one, "picture")[0]["version"] != server.session.version:
+            pass
+    with tab(server) as again:
+        assert heard(again, "state")[0]["version"] == server.session.version
+    with contextlib.ExitStack() as tabs:
+        for _ in range(MAX_TABS):
+            tabs.enter_context(tab(server))
+        with pytest.raises(InvalidStatus, match="503"):
+            tabs.enter_context(tab(server))
+    end = time.monotonic() + 30
+    while server._tabs and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not server._tabs
+
+
+def test_pictures_and_looks_can_be_kept(server, tmp_path):
+    import jaxsph as js
+
+    server.session.wait(seconds=SECONDS)
+    status, headers, content = got(server, f"/{server.token}/view.exr")
+    assert status == 200 and "attachment" in headers["Content-Disposition"]
+    (tmp_path / "view.exr").write_bytes(content)
+    image = js.io.read_image(tmp_path / "view.exr")
+    assert np.allclose(np.asarray(image.color), np.asarray(server.session.picture.image.color), atol=1e-5)
+    (tmp_path / "look.json").write_bytes(got(server, f"/{server.token}/look.json")[2])
+    assert np.array_equal(js.TransferFunction.load(tmp_path / "look.json").values, server.session.transfer.values)
+
+
+def test_words_of_a_command_that_make_no_sense(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wrong_port, as_json = ["scene:radial", "--port", "70000"], ["scene:radial", "--json"]
+    for arguments, said in (([], "FILE"), (wrong_port, "--port"), (as_json, "--json"), (["nowhere.npz"], "nowhere.npz")):
+        code, _, wrong = commanded(capsys, "view", *arguments)
+        assert code in (1, 2) and len(wrong) == 1 and said in wrong[0]
+
+
+def test_a_port_that_is_taken_is_told(capsys, server):
+    code, _, wrong = commanded(
+        capsys, "view", "scene:radial:particles=50", "--size", "8x8", "--no-browser", "--port", str(server.port)
+    )
+    assert code == 1 and len(wrong) == 1
+
+
+def test_without_the_extra_one_line_names_it(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "websockets", None)
+    code, _, wrong = commanded(capsys, "view", "scene:radial:particles=50")
+    assert code == 1 and wrong == [
+        'jaxsph view: the library `websockets` is needed for an interactive view: pip install "jaxsph[view]"'
+    ]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+@pytest.mark.parametrize("late", [False, True], ids=["while it compiles", "once it stands"])
+def test_an_interrupt_ends_it_with_exit_code_0(late):
+    words = [
+        "view",
+        "scene:radial:particles=200",
+        "--size",
+        f"{WIDTH}x{HEIGHT}",
+        "--samples",
+        "16",
+        "--integrator",
+        "samples",
+        "--no-browser",
+    ]
+    process = subprocess.Popen([sys.executable, "-m", "jaxsph", *words], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        line = process.stdout.readline()
+        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{20,})\n", line)
+        assert found, line
+        if late:
+            with connect(f"ws://127.0.0.1:{found[1]}/{found[2]}/socket", max_size=None) as page:
+                while not heard(page, "picture")[0]["final"]:
+                    pass
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+        assert process.stdout.read() == ""
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_settings_of_the_command():
+    assert command._settings(command.View()).tolerance == 0.01
+    assert command._settings(command.View(samples=64)).samples == 64
+    asked = command._settings(command.View(tolerance=0.1))
+    assert (asked.tolerance, asked.integrator) == (0.1, "segments")
+    assert command._settings(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
+    assert command._settings(command.View(integrator="samples")).tolerance is None

@@ -1,0 +1,277 @@
+"""A view without anybody who shows it: inputs coalesce, what is old is abandoned, and pictures are those of `jaxsph.render`."""
+
+import dataclasses
+import threading
+
+import jax
+import numpy as np
+import pytest
+from views import HEIGHT, SETTINGS, WIDTH, camera, scene
+
+import jaxsph as js
+from jaxsph.model.transfer.domains import Scale
+from jaxsph.viewer import session as views
+from jaxsph.viewer.explained import histogram_of
+from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.session import Session
+from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
+
+SECONDS = 240
+
+
+def same(image, other):
+    names = ("color", "transmittance", "depth")
+    return all(np.array_equal(np.asarray(getattr(image, name)), np.asarray(getattr(other, name))) for name in names)
+
+
+@pytest.fixture(scope="module")
+def session():
+    with Session(scene(), camera(), SETTINGS) as made:
+        yield made
+
+
+@pytest.fixture
+def home(session):
+    """The session, as it began."""
+    yield session
+    session.do({"do": "reset_look"})
+    session.do({"do": "home"})
+
+
+def test_the_last_picture_of_a_view_is_that_of_render_bit_for_bit(home):
+    picture = home.wait(seconds=SECONDS)
+    assert picture.final and picture.stage == FULL and picture.image.shape == (HEIGHT, WIDTH)
+    assert same(picture.image, js.render(scene(), camera(), SETTINGS))
+    for message in (
+        {"do": "orbit", "right": 0.2, "down": -0.1},
+        {"do": "zoom", "factor": 1.7, "right": 0.2},
+        {"do": "roll", "degrees": 20},
+    ):
+        home.do(message)
+    picture, state = home.wait(seconds=SECONDS), home.snapshot()
+    assert picture.version == state.version and picture.camera.near is None
+    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
+    assert not same(picture.image, js.render(scene(), camera(), SETTINGS))
+
+
+def test_every_frame_says_what_it_is_and_how_wrong(home):
+    pictures = []
+    undo = home.listen(pictures.append)
+    home.do({"do": "orbit", "right": 0.01, "down": 0})
+    home.wait(seconds=SECONDS)
+    undo()
+    told = [picture for picture in pictures if not isinstance(picture, dict) and picture.version == home.version]
+    assert [picture.stage for picture in told] == [DRAFT, FULL]
+    draft, full = told
+    height, width = draft.image.shape
+    assert width * height < WIDTH * HEIGHT / 3
+    assert (
+        draft.words
+        == f"draft: {width} x {height}, 4 samples a ray; error not estimated; {WIDTH * HEIGHT - width * height:,} rays left"
+    )
+    assert full.words == f"full: {WIDTH} x {HEIGHT}, 16 samples a ray; error not estimated"
+    assert (draft.format, full.format, full.header()["rays_left"]) == ("jpeg", "png", 0)
+    assert draft.encoded[:2] == b"\xff\xd8" and full.encoded[:4] == b"\x89PNG"
+
+
+def test_nothing_compiles_after_the_first_drag_and_the_first_edit(home):
+    home.do({"do": "orbit", "right": 0.1, "down": 0})
+    home.wait(seconds=SECONDS)
+    rows = home.state()["look"]["points"]
+    rows[1][1] *= 2
+    home.do({"do": "points", "points": rows})
+    home.wait(seconds=SECONDS)
+    compiled = []
+    event = "/jax/core/compile/backend_compile_duration"
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **more: compiled.append(more) if name == event else None
+    )
+    for turn in range(4):
+        home.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
+        home.do({"do": "points", "points": [*rows, [0.3, turn, 0.1, 0.2, 0.3]][turn % 2 :]})
+        home.wait(seconds=SECONDS)
+    assert not compiled
+
+
+def test_a_look_is_edited_and_taken_back(home):
+    before = np.asarray(home.scene.transfer.extinction)
+    assert len(before) == 8  # four points, and room
+    home.do({"do": "exposure", "stops": 1})
+    assert np.array_equal(np.asarray(home.scene.transfer.extinction), 2 * before)
+    home.do({"do": "undo"})
+    assert np.array_equal(np.asarray(home.scene.transfer.extinction), before)
+    home.do({"do": "redo"})
+    assert np.array_equal(np.asarray(home.scene.transfer.extinction), 2 * before)
+    home.do({"do": "colormap", "name": "viridis"})
+    assert np.allclose(np.asarray(home.scene.transfer.colors)[0], (0.267, 0.005, 0.329), atol=0.01)
+    home.do({"do": "points", "points": [[0.5, 2, 1, 0, 0], [0.25, 1, 0, 1, 0]]})
+    values = np.asarray(home.scene.transfer.values)
+    assert np.allclose(values[:2], (-0.3, 0.0), atol=1e-6) and (values[2:] == values[1]).all()
+
+
+def test_a_drag_of_points_is_one_step_back(home):
+    first = home.state()["look"]["points"]
+    for opaque in (1.0, 2.0, 3.0):
+        rows = [[*row] for row in first]
+        rows[0][1] = opaque
+        home.do({"do": "points", "points": rows, "done": opaque == 3.0})
+    home.do({"do": "undo"})
+    assert home.state()["look"]["points"] == first
+
+
+def test_a_pixel_is_told_in_numbers_and_what_is_seen_there_becomes_the_middle(home):
+    picture = home.wait(seconds=SECONDS)
+    told = home.do({"do": "pick", "right": 0.0, "down": 0.0})
+    assert (told["row"], told["column"]) == (HEIGHT // 2, WIDTH // 2)
+    assert np.allclose(told["color"], np.asarray(picture.image.color)[HEIGHT // 2, WIDTH // 2])
+    assert np.isclose(told["depth"], 4, atol=1.2) and -0.7 < told["quantity"] < 0.7 and told["neighbours"] > 3
+    home.do({"do": "center", "right": 0.0, "down": 0.0})
+    assert np.allclose(home.snapshot().pose.target, told["place"])
+    with pytest.raises(InputError, match="nothing is seen there"):
+        home.wait(seconds=SECONDS)
+        home.do({"do": "center", "right": 0.7, "down": -0.45})
+
+
+def test_a_view_is_restored_from_what_it_told(home):
+    home.do({"do": "orbit", "right": 0.2, "down": 0.1})
+    home.do({"do": "projection", "name": "parallel"})
+    told, camera_then = home.state()["pose"], home.snapshot().camera
+    home.do({"do": "home"})
+    home.do({"do": "restore", "pose": told})
+    assert np.allclose(np.asarray(home.snapshot().camera.axes), np.asarray(camera_then.axes))
+    assert home.snapshot().camera.projection == "orthographic"
+
+
+def test_the_code_that_is_told_makes_the_picture(home, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    home.do({"do": "orbit", "right": 0.2, "down": 0.1})
+    home.do({"do": "exposure", "stops": 0.5})
+    space = {"scene": scene(), "camera": None}
+    exec(home.code()["python"], space)
+    assert np.abs(np.asarray(space["image"].color) - np.asarray(home.wait(seconds=SECONDS).image.color)).max() < 1e-6
+    assert (tmp_path / "view.png").exists()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [None, 3, [], {}, {"do": 3}, {"do": "explode"}, {"do": "orbit"}, {"do": "orbit", "right": "a", "down": 0}, {"do": "points"},
+     {"do": "orbit", "right": float("nan"), "down": 0}, {"do": "zoom", "factor": -1}, {"do": "axis", "name": ["x"]},
+     {"do": "points", "points": []}, {"do": "points", "points": [[0, -1, 0, 0, 0]]}, {"do": "points", "points": [[0] * 5] * 1000},
+     {"do": "points", "points": [[0, 1, 2, 0, 0]]}, {"do": "colormap", "name": "nothing of the kind"}, {"do": "colormap"},
+     {"do": "restore"}, {"do": "restore", "pose": {"target": [0, 0]}}, {"do": "pick"}, {"do": "exposure", "stops": True},
+     {"do": "restore", "pose": {"target": [0, 0, 0], "pole": [0, 0, 0], "forward": [0, 0, 1], "up": [0, 1, 0], "distance": 4,
+                                "tangent": 0.3, "perspective": True}}],
+    ids=str,
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused_and_changes_nothing(session, message):
+    version = session.version
+    with pytest.raises(InputError):
+        session.do(message)
+    assert session.version == version
+
+
+@pytest.mark.parametrize("within", [None, js.Sphere((0, 0, 0), 0.5)], ids=["everywhere", "in a clip"])
+def test_a_histogram_says_what_there_is(within):
+    shown = dataclasses.replace(scene(), within=within)
+    found = histogram_of(shown, camera(), Scale.of(np.asarray(shown.transfer.values)))
+    assert len(found["edges"]) == len(found["there"]) + 1 and max(found["there"]) == 1
+    assert (max(found["absorbed"]) == 1) == (within is None)
+
+
+class Slow:
+    """A stage that is held up between bands, for as long as a test likes."""
+
+    def __init__(self, name):
+        self.name, self.settings, self.made = name, SETTINGS, 1
+        self.begun, self.go, self.seen, self.left = threading.Semaphore(0), threading.Semaphore(0), [], []
+
+    def camera(self, camera):
+        return camera
+
+    def image(self, shown, camera, stop):
+        self.seen.append(float(camera.eye[0]))
+        self.begun.release()
+        assert self.go.acquire(timeout=60)
+        if stop():
+            self.left.append(self.seen[-1])
+            raise Abandoned
+        layer = np.zeros((2, 3), np.float32)
+        return js.Image(np.zeros((2, 3, 3), np.float32), layer, layer, layer, layer, True, 0, {})
+
+
+@pytest.fixture
+def slow():
+    """A session whose stages are held up."""
+    made = Session(scene(), camera(), SETTINGS)
+    made.stages = (Slow(DRAFT), Slow(FULL))
+    yield made.start()
+    for stage in made.stages:
+        stage.go.release(100)
+    assert made.close(60)
+
+
+def test_inputs_coalesce_and_the_newest_wins(slow):
+    draft, _ = slow.stages
+    assert draft.begun.acquire(timeout=60)
+    for _ in range(50):
+        slow.do({"do": "pan", "right": 0.01, "down": 0})
+    draft.go.release()
+    assert draft.begun.acquire(timeout=60)
+    draft.go.release()
+    assert slow.wait(DRAFT, 60).version == slow.version == 51
+    assert len(draft.seen) == 2 and draft.seen[-1] == pytest.approx(float(slow.snapshot().camera.eye[0]))
+
+
+def test_a_picture_that_is_old_is_left_at_its_next_stage_and_drafts_go_on_beside_it(slow):
+    draft, full = slow.stages
+    draft.go.release(100)
+    slow.wait(DRAFT, 60)
+    assert full.begun.acquire(timeout=60)  # which is now held up
+    slow.do({"do": "pan", "right": 0.1, "down": 0})
+    assert slow.wait(DRAFT, 60).version == 2
+    full.go.release()
+    assert full.begun.acquire(timeout=60)
+    full.go.release()
+    assert slow.wait(FULL, 60).version == 2
+    assert len(full.left) == 1 and full.left[0] == full.seen[0]
+
+
+def test_a_stage_that_fails_is_told_and_the_view_goes_on(slow, monkeypatch):
+    draft, full = slow.stages
+    draft.go.release(100)
+    full.go.release(100)
+    told = []
+    slow.listen(lambda what: told.append(what) if isinstance(what, dict) else None)
+    slow.wait(seconds=60)
+    monkeypatch.setattr(full, "image", lambda *_: 1 / 0)
+    monkeypatch.setattr(views, "histogram_of", lambda *_: {}["nothing"])
+    slow.do({"do": "pan", "right": 0.1, "down": 0})
+    with pytest.raises(RuntimeError, match="full: ZeroDivisionError"):
+        slow.wait(FULL, 60)
+    monkeypatch.undo()
+    slow.do({"do": "pan", "right": 0.1, "down": 0})
+    assert slow.wait(FULL, 60).version == 3 and slow.told == ""
+    assert {"is": "error", "text": "full: ZeroDivisionError: division by zero"} in told
+
+
+def test_stages_lead_to_what_was_asked_for():
+    asked = js.Settings(integrator="segments", tolerance=0.01)
+    draft, full, last = stages_of(asked, camera(1024, 768))
+    assert [stage.name for stage in (draft, full, last)] == [DRAFT, FULL, TOLERANCE]
+    assert draft.shrink == 4 and (draft.settings.samples, draft.settings.tolerance) == (64, None)
+    assert (full.settings.samples, full.settings.integrator, full.settings.tolerance) == (256, "samples", None)
+    assert last.settings == asked
+    quadtree = dataclasses.replace(SETTINGS, screen="quadtree")
+    assert [stage.settings.screen for stage in stages_of(quadtree, camera())] == ["pixels", "pixels", "quadtree"]
+
+
+def test_a_full_picture_is_planned_in_bands_between_which_it_can_be_left():
+    assert js.plan(scene(), camera(), SETTINGS).bands == 1
+    assert js.plan(scene(), camera(), SETTINGS, bands=9).bands == 2  # of 16 rows each
+    with pytest.raises(ValueError, match="`bands` must be at least 1, got 0"):
+        js.plan(scene(), camera(), SETTINGS, bands=0)
+
+
+def test_what_is_no_scene_is_refused():
+    with pytest.raises(ValueError, match="scene"):
+        Session(camera(), scene())
