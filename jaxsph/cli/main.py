@@ -217,11 +217,16 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
     def end(*_: object) -> None:
         raise _Terminated
 
+    def ask() -> None:
+        with asks:  # a timer that is cancelled may be past its wait
+            if signal.getsignal(signal.SIGTERM) is end:
+                os.kill(os.getpid(), signal.SIGTERM)
+
     def lost(told: Any) -> None:  # what is raised while an object is thrown away goes no further: ask again
         if not isinstance(told.exc_value, _Terminated):
             before(told)
             return
-        again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), signal.SIGTERM))
+        again = threading.Timer(AGAIN_SECONDS, ask)
         again.daemon = True
         asking.append(again)
         again.start()
@@ -231,6 +236,7 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
         yield
         return
     asking: list[threading.Timer] = []
+    asks = threading.Lock()
     before, sys.unraisablehook = sys.unraisablehook, lost
     signal.signal(signal.SIGTERM, end)
     try:
@@ -240,7 +246,9 @@ def _ending_in_order(own_process: bool) -> Iterator[None]:
             for again in asking:  # what is done is not to be asked when nobody hears it any more: that would kill the process
                 again.cancel()
         finally:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            while signal.getsignal(signal.SIGTERM) is end:
+                with contextlib.suppress(_Terminated), asks:
+                    signal.signal(signal.SIGTERM, signal.SIG_DFL)
             sys.unraisablehook = before
 
 

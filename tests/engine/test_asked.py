@@ -26,7 +26,7 @@ def test_another_kind_of_argument_is_refused_by_name(frames, verb, wrong):
 
 def test_a_plan_of_another_kind_is_refused_by_name(frames):
     rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match=r"`plan` must be a `jaxsph\.Plan`, got Settings"):
+    with pytest.raises(ValueError, match=r"`plan` must be a plan, got Settings; make one with `jaxsph\.plan`"):
         js.render(frames.scene(rng), frames.camera(rng), plan=frames.settings)
 
 
