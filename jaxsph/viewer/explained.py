@@ -90,30 +90,14 @@ def quantity_at(particles: Particles, place: np.ndarray) -> tuple[float | None, 
 def histogram_of(scene: Scene, camera: Camera, scale: Scale) -> dict[str, Any] | None:
     """What rays meet by place on an axis, as JSON has it: path length, and light absorbed; each over its largest.
 
-    In clips and periodic boxes, where that is not known: what there is by volume, whatever meets it. None without either.
+    None of media that have no quantity.
     """
     if scene.media or not scene.looks:
         return None
-    if scene.within is not None or scene.particles_within is not None:
-        return _by_volume(scene, scale)
     found = visibility_histogram(scene, camera, rays=RAYS, bins=BINS)
     places = np.clip(np.nan_to_num(scale.place(found.edges), neginf=-1.0, posinf=2.0), -1, 2)
     bars = {name: _shares(getattr(found, name)) for name in ("there", "absorbed")}
     return {"edges": places.tolist(), **bars, "rays": found.rays}
-
-
-def _by_volume(scene: Scene, scale: Scale) -> dict[str, Any] | None:
-    """By volume of particles (of two quantities, by that of extinction), or of the cells of the first volume."""
-    particles = scene.particles
-    if particles is None:
-        values = np.asarray(scene.volumes[0][0].values, np.float64).ravel()
-        weight = np.ones(len(values))
-    else:
-        valid, second = np.asarray(particles.valid), particles.extinction_quantity
-        values = np.asarray(particles.quantity if second is None else second, np.float64)[valid]
-        weight = np.asarray(particles.volume, np.float64)[valid]
-    there, edges = np.histogram(scale.place(values), BINS, (0, 1), weights=weight)
-    return {"edges": edges.tolist(), "there": _shares(there), "absorbed": [0.0] * BINS, "rays": 0}
 
 
 def _shares(values: np.ndarray) -> list[float]:

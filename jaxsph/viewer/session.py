@@ -8,7 +8,6 @@ after them once nothing has moved for a moment: it leaves what it does at the ne
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 import time
 from collections.abc import Callable
@@ -18,17 +17,17 @@ import jax
 import numpy as np
 
 from jaxsph.engine.asked import require_asked
-from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.viewer.code import Source, command_of, python_of
-from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, looking
+from jaxsph.viewer.code import Source
 from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
-from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit, number
+from jaxsph.viewer.inputs import InputError, number
 from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
+from jaxsph.viewer.state import State
 
 REST_SECONDS = 0.2
 """How long nothing moves before more than drafts are made."""
@@ -36,7 +35,7 @@ Listener = Callable[[Any], None]
 
 
 class Snapshot(NamedTuple):
-    """A state: everything that a picture is made of."""
+    """A state that stays as it is: everything that a picture is made of."""
 
     version: int
     scene: Scene
@@ -50,7 +49,6 @@ class Session:
     Use it as a context, or call `start` and `close`. Methods may be called from any thread.
 
     Attributes:
-        scene: with the look that is shown.
         settings: of the last picture of a state.
         stages: how pictures are made, the draft first.
         told: a reason why there is no picture of the settings, for people; empty where there is.
@@ -71,12 +69,7 @@ class Session:
         scene.check()
         self.settings, self.told = DEFAULT if settings is None else settings, ""
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
-        look = first_look(scene)
-        self._given, self._first = camera, Pose.of(camera, scene)
-        self._pose, self._moved = self._first, False
-        self._steps = None if look is None else Steps(ControlPoints.of(look))
-        self._base = scene
-        self.scene = self._looked()
+        self._state = State(scene, camera)
         self._version, self._failed, self._changed = 1, 0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
@@ -130,41 +123,23 @@ class Session:
     def snapshot(self) -> Snapshot:
         """The newest state."""
         with self._lock:
-            return Snapshot(self._version, self.scene, self._camera(), self._pose)
+            state = self._state
+            return Snapshot(self._version, state.scene, state.camera, state.pose)
 
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
         with self._lock:
-            pose, camera = self._pose, self._camera()
-            look = None if self._steps is None else self._steps.look.told()
-            return {
-                "is": "state",
-                "version": self._version,
-                "pose": pose.told(),
-                "size": [camera.width, camera.height],
-                "height": pose.height,
-                "axes": pose.axes.tolist(),
-                "look": look,
-                "edited": self._steps is not None and self._steps.look.points is not None,
-                "moved": self._moved,
-                "told": self.told,
-            }
+            return {"is": "state", "version": self._version, "told": self.told, **self._state.told()}
 
     @property
     def transfer(self) -> TransferFunction | None:
         """The look that is shown, where there is one."""
-        return first_look(self.scene)
+        return self._state.transfer
 
     def code(self) -> dict[str, str]:
         """The Python and the command that make the newest state again."""
         with self._lock:
-            pose = self._pose if self._moved else None
-            edited = self._steps is not None and self._steps.look.points is not None
-            camera, look = self._camera(), self.transfer if edited else None
-        return {
-            "python": python_of(self._source, camera, pose, look, self.settings),
-            "command": command_of(self._source, camera, pose, edited, self.settings),
-        }
+            return self._state.code(self._source, self.settings)
 
     @property
     def histogram(self) -> dict[str, Any] | None:
@@ -216,7 +191,7 @@ class Session:
         """Do what a message asks for.
 
         Args:
-            message: `{"do": NAME, ...}`, see `inputs`; also `fit`, `home`, `center`, `pick`, `restore`.
+            message: `{"do": NAME, ...}`, see `State.do`; also `pick`.
 
         Returns:
             An answer for who asked, where there is one.
@@ -226,12 +201,11 @@ class Session:
         """
         if not isinstance(message, dict) or not isinstance(message.get("do"), str):
             raise InputError('a message must be an object such as {"do": "orbit", "right": 0.1, "down": 0}')
-        name = message["do"]
         try:
-            if name == "pick":
+            if message["do"] == "pick":
                 return self._picked(message)
             with self._lock:
-                self._do(name, message)
+                self._state.do(message, self._seen)
                 self._version += 1
                 self._changed = time.monotonic()
                 self._lock.notify_all()
@@ -240,52 +214,6 @@ class Session:
         except (ValueError, ArithmeticError) as error:
             raise InputError(str(error)) from error
         return None
-
-    def _do(self, name: str, message: dict[str, Any]) -> None:
-        if name in MOTIONS:
-            self._move(MOTIONS[name](self._pose, message))
-        elif name in KNOWN_EDITS:
-            if self._steps is None:
-                raise InputError("this scene has no transfer function to edit")
-            edit(self._steps, message)
-            self.scene = self._looked()
-        elif name == "fit":
-            lower, upper = self._bounds()
-            self._move(self._pose.fitted(lower, upper, self._given.width / self._given.height))
-        elif name == "home":
-            self._pose, self._moved = self._first, False
-        elif name == "center":
-            self._move(self._pose.centred(self._seen(message)))
-        elif name == "restore":
-            if not isinstance(message.get("pose"), dict):
-                raise InputError("`pose` of 'restore' must be an object")
-            self._move(self._first.read(message["pose"]))
-            if message.get("points") is not None and self._steps is not None:
-                edit(self._steps, {"do": "points", "points": message["points"]})
-                self.scene = self._looked()
-        else:
-            known = ", ".join((*MOTIONS, *KNOWN_EDITS, "fit", "home", "center", "restore", "pick"))
-            raise InputError(f"there is no {name[:40]!r}; there are {known}")
-
-    def _move(self, pose: Pose) -> None:
-        pose.camera(1, 1)  # refuses what is none
-        self._pose, self._moved = pose, True
-
-    def _camera(self) -> Camera:
-        if not self._moved:
-            return self._given
-        camera = self._pose.camera(self._given.width, self._given.height)
-        if self._base.media:  # which do not say how large they are
-            camera = dataclasses.replace(camera, near=self._given.near, far=self._given.far)
-        return camera
-
-    def _looked(self) -> Scene:
-        return self._base if self._steps is None else looking(self._base, self._steps.look.transfer())
-
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        if not self._base.parts:
-            raise InputError("this scene does not say how large it is")
-        return BoundingBox.around(self._base.parts).bounds()
 
     def _seen(self, message: dict[str, Any]) -> np.ndarray:
         """The place at half light under a place of the picture."""
@@ -343,7 +271,7 @@ class Session:
             while not self._closed:
                 still = REST_SECONDS - (time.monotonic() - self._changed) if rest else 0.0
                 if self._version > done and still <= 0:
-                    return Snapshot(self._version, self.scene, self._camera(), self._pose)
+                    return self.snapshot()
                 self._lock.wait(still if self._version > done else None)
         return None
 
@@ -355,7 +283,9 @@ class Session:
         started = time.perf_counter()
         try:
             if not stage.made:
-                stage.prepare(state.scene, self._around(state))
+                with self._lock:
+                    around = self._state.around
+                stage.prepare(state.scene, [state.camera, *around])
             image = stage.image(state.scene, state.camera, stop)
         except Abandoned:
             return False
@@ -377,14 +307,6 @@ class Session:
             self._send(picture)
         return True
 
-    def _around(self, state: Snapshot) -> list[Camera]:
-        """The view, and some around it, for which there is to be room."""
-        size, pose = (self._given.width, self._given.height), self._pose
-        poses = [pose.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [pose.orbited(0, tilt) for tilt in (0.4, -0.4)]
-        poses += [pose.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
-        around = [] if self._base.media else [one.camera(*size) for one in poses]
-        return [state.camera, *around]
-
     def _tell(self, stage: Stage, state: Snapshot, error: Exception) -> None:
         with self._lock:
             self._failed = state.version
@@ -396,7 +318,8 @@ class Session:
     def _describe(self, state: Snapshot) -> None:
         """Tell what rays of a view that stands met."""
         try:
-            found = None if self._steps is None else histogram_of(state.scene, state.camera, self._steps.look.scale)
+            scale = self._state.scale
+            found = None if scale is None else histogram_of(state.scene, state.camera, scale)
         except Exception as error:  # a view goes on without it
             self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
             return

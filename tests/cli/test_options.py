@@ -104,7 +104,7 @@ def test_every_option_of_a_command_is_read_by_it(command, asked, capsys):
 
 def test_render_shows_no_more_options_than_a_person_can_take_in(capsys):
     shown = [one.name for one in cli.arguments_of("render") if one.show and one.name.startswith("--")]
-    assert len(shown) <= 47
+    assert len(shown) <= 46
     code, out, _ = run(capsys, "render", "--help")
     assert code == 0 and all(f"  {name}" in out for name in shown)
     assert {word for word in out.split() if word.startswith("--") and word[2:].strip(":,").isidentifier()} <= {

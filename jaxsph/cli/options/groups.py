@@ -330,7 +330,8 @@ class Control(Quality):
         option("--estimator", "NAME", values.one_of(ESTIMATORS), QUALITY, ", ".join(ESTIMATORS)),
     ] = None
     relax: Annotated[
-        float | None, option("--relax", "R", values.number, QUALITY, "0 is certified, 1 takes neighbouring rays for alike")
+        float | None,
+        option("--relax", "R", values.number, QUALITY, "0 is certified, 1 takes neighbouring rays for alike", show=False),
     ] = None
     screen: Annotated[
         str | None,

@@ -1,0 +1,155 @@
+"""What a view shows now: a scene with its look, and a pose; inputs change it, a page and the code that makes it again are told.
+
+Flow: inputs -> [state] -> scene and camera -> session; state -> page, code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.viewer.code import Source, command_of, python_of
+from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, looking
+from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
+from jaxsph.viewer.pose import Pose
+
+OTHERS = ("fit", "home", "center", "restore")
+"""What can be done besides motions and edits of the look."""
+Seen = Callable[[dict[str, Any]], np.ndarray]
+
+
+class State:
+    """A scene as it is looked at; for one thread at a time.
+
+    Attributes:
+        scene: with the look that is shown.
+        pose: of the camera; `moved` since the view began, whose camera is that which was given.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera) -> None:
+        """As `jaxsph.render` takes them.
+
+        Raises:
+            ValueError: a camera that is none.
+        """
+        look = first_look(scene)
+        self._given, self._first = camera, Pose.of(camera, scene)
+        self.pose, self.moved = self._first, False
+        self._steps = None if look is None else Steps(ControlPoints.of(look))
+        self._base = scene
+        self.scene = self._looked()
+
+    @property
+    def camera(self) -> Camera:
+        """That which was given, until something moves."""
+        if not self.moved:
+            return self._given
+        camera = self.pose.camera(self._given.width, self._given.height)
+        if self._base.media:  # which do not say how large they are
+            camera = dataclasses.replace(camera, near=self._given.near, far=self._given.far)
+        return camera
+
+    @property
+    def around(self) -> list[Camera]:
+        """Views around this one, for which there is to be room."""
+        size, pose = (self._given.width, self._given.height), self.pose
+        poses = [pose.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [pose.orbited(0, tilt) for tilt in (0.4, -0.4)]
+        poses += [pose.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
+        return [] if self._base.media else [one.camera(*size) for one in poses]
+
+    @property
+    def transfer(self) -> TransferFunction | None:
+        """The look that is shown, where there is one."""
+        return first_look(self.scene)
+
+    @property
+    def scale(self) -> Scale | None:
+        """The axis of the look, where there is one."""
+        return None if self._steps is None else self._steps.look.scale
+
+    @property
+    def edited(self) -> bool:
+        """Whether the look is another than that which was given."""
+        return self._steps is not None and self._steps.look.points is not None
+
+    def told(self) -> dict[str, Any]:
+        """For a page, as JSON has it."""
+        camera = self.camera
+        return {
+            "pose": self.pose.told(),
+            "size": [camera.width, camera.height],
+            "height": self.pose.height,
+            "axes": self.pose.axes.tolist(),
+            "look": None if self._steps is None else self._steps.look.told(),
+            "edited": self.edited,
+            "moved": self.moved,
+        }
+
+    def code(self, source: Source, settings: Settings) -> dict[str, str]:
+        """The Python and the command that make it again."""
+        pose, camera = self.pose if self.moved else None, self.camera
+        look = self.transfer if self.edited else None
+        return {
+            "python": python_of(source, camera, pose, look, settings),
+            "command": command_of(source, camera, pose, self.edited, settings),
+        }
+
+    def do(self, message: dict[str, Any], seen: Seen) -> None:
+        """Do what a message asks for, see `inputs`; also `OTHERS`.
+
+        Args:
+            message: `{"do": NAME, ...}`.
+            seen: the place that is seen where a message says.
+
+        Raises:
+            InputError: what cannot be understood or done; nothing has changed.
+        """
+        name = message["do"]
+        if name in MOTIONS:
+            self._move(MOTIONS[name](self.pose, message))
+        elif name in KNOWN_EDITS:
+            if self._steps is None:
+                raise InputError("this scene has no transfer function to edit")
+            self._edit(self._steps, message)
+        elif name == "fit":
+            lower, upper = self._bounds()
+            self._move(self.pose.fitted(lower, upper, self._given.width / self._given.height))
+        elif name == "home":
+            self.pose, self.moved = self._first, False
+        elif name == "center":
+            self._move(self.pose.centred(seen(message)))
+        elif name == "restore":
+            if not isinstance(message.get("pose"), dict):
+                raise InputError("`pose` of 'restore' must be an object")
+            pose = self._first.read(message["pose"])
+            pose.camera(1, 1)  # before the look changes
+            if message.get("points") is not None and self._steps is not None:
+                self._edit(self._steps, {"do": "points", "points": message["points"]})
+            self._move(pose)
+        else:
+            known = ", ".join((*MOTIONS, *KNOWN_EDITS, *OTHERS, "pick"))
+            raise InputError(f"there is no {name[:40]!r}; there are {known}")
+
+    def _move(self, pose: Pose) -> None:
+        pose.camera(1, 1)  # refuses what is none
+        self.pose, self.moved = pose, True
+
+    def _edit(self, steps: Steps, message: dict[str, Any]) -> None:
+        edit(steps, message)
+        self.scene = self._looked()
+
+    def _looked(self) -> Scene:
+        return self._base if self._steps is None else looking(self._base, self._steps.look.transfer())
+
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        if not self._base.parts:
+            raise InputError("this scene does not say how large it is")
+        return BoundingBox.around(self._base.parts).bounds()
