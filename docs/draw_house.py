@@ -1,25 +1,22 @@
 """Draw `docs/house.svg` and `docs/engine.svg`: which rooms the code has, on which floors they are, and which import which.
 
-Everything in the picture is read from the code. Rooms are the folders and modules of `jaxsph/`, or of `jaxsph/engine/`, with
-the first line of their docstrings; floors are the layers that `pyproject.toml` has import-linter keep; arrows are imports,
-found with `ast`. An import that other arrows already lead to is not drawn: what a room uses is all that can be reached from it
-downwards.
+Everything in the picture is read from the code (`house_rooms`). Rooms are the folders and modules of `jaxsph/`, or of
+`jaxsph/engine/`, with the first line of their docstrings; floors are the layers that `pyproject.toml` has import-linter keep;
+arrows are imports, found with `ast`. An import that other arrows already lead to is not drawn: what a room uses is all that can
+be reached from it downwards.
 
     python docs/draw_house.py
 """
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import functools
 import html
-import re
 import tomllib
 from collections import defaultdict
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+from house_rooms import ROOT, Edge, contents_of, floors_of, imports_of, named_rooms, purpose_of, reduced, rooms_of
+
 PICTURES = {"jaxsph": ROOT / "docs" / "house.svg", "jaxsph.engine": ROOT / "docs" / "engine.svg"}
 
 WIDTH = 840  # of the house, pixels
@@ -33,94 +30,6 @@ LINE = 17  # of text
 NAME_SIZE, TEXT_SIZE, FILE_SIZE = 15, 13, 12
 INK, SOFT, FAINT, LIGHT = "#1f2933", "#3e4c59", "#66788a", "#9aa5b1"
 WALL, ROOM, FOLDER, PAPER = "#cbd2d9", "#ffffff", "#eaf2fb", "#f7f9fb"
-Edge = tuple[str, str]
-
-
-def rooms_of(package: Path) -> list[str]:
-    """Folders and modules, by name."""
-    return sorted(path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists())
-
-
-def modules_of(package: Path, room: str) -> list[Path]:
-    """The files of a room, those of its folders too."""
-    folder = package / room
-    return sorted(folder.rglob("*.py")) if folder.is_dir() else [package / f"{room}.py"]
-
-
-def contents_of(package: Path, room: str) -> list[str]:
-    """What is in the folder of a room: folders, with a stroke, and modules."""
-    inside = rooms_of(package / room)
-    folders = [name for name in inside if (package / room / name).is_dir()]
-    return [*(f"{name}/" for name in folders), *(name for name in inside if name not in folders and name != "__init__")]
-
-
-def dotted(package: Path) -> str:
-    """The name that a package is imported by."""
-    return ".".join(package.relative_to(ROOT).parts)
-
-
-def purpose_of(package: Path, room: str) -> str:
-    """First line of a room's docstring."""
-    folder = package / room
-    file = folder / "__init__.py" if folder.is_dir() else package / f"{room}.py"
-    return (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").split("\n")[0].replace("`", "")
-
-
-def imports_of(package: Path, room: str, rooms: list[str]) -> set[str]:
-    """Other rooms that a room imports, anywhere in its files."""
-    found = set()
-    for file in modules_of(package, room):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                names = [f"{node.module}.{alias.name}" for alias in node.names]
-            for name in names:
-                if f"{name}.".startswith(f"{dotted(package)}."):
-                    first = name.removeprefix(dotted(package)).split(".")[1:2]
-                    found.add(first[0] if first and first[0] in rooms else "__init__")
-    return found - {room}
-
-
-def named_rooms(package: Path) -> set[str]:
-    """Rooms whose modules are looked up by name, `package.room.module:name` in a string."""
-    entry = re.compile(rf"{re.escape(dotted(package))}\.(\w+)\.[\w.]+:\w+")
-    strings = (
-        node.value
-        for file in package.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    )
-    return {match[1] for match in map(entry.fullmatch, strings) if match}
-
-
-def floors_of(layers: list[str], imports: dict[str, set[str]]) -> list[list[str]]:
-    """Rooms by floor from the ground up: those of the layers; a room that is in none stands right above what it imports."""
-    floors = [[name for name in re.findall(r"\w+", layer) if name in imports] for layer in reversed(layers)]
-    floors = [floor for floor in floors if floor]
-    for room in sorted(set(imports) - {name for floor in floors for name in floor}, key=lambda name: (name == "__main__", name)):
-        below = [k for k, floor in enumerate(floors) if imports[room] & set(floor)]
-        nth = max(below, default=-1) + 1
-        if nth == len(floors):
-            floors.append([])
-        floors[nth].append(room)
-    return floors
-
-
-def reduced(imports: dict[str, set[str]]) -> list[Edge]:
-    """Imports to which no other way leads."""
-
-    @functools.cache
-    def reached(room: str) -> set[str]:
-        return imports[room].union(*(reached(other) for other in imports[room]))
-
-    return [
-        (room, other)
-        for room in sorted(imports)
-        for other in sorted(imports[room])
-        if not any(other in reached(between) for between in imports[room])
-    ]
 
 
 @dataclasses.dataclass
