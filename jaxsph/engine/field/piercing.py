@@ -7,7 +7,7 @@ $b^2 + (t - t_{foot})^2 |d|^2$, so with feet found once each weight takes one sq
 slab, and positions to where each ray is there, such that nothing large cancels.
 
 A kernel falls with distance. So between two depths a particle weighs most at its foot, or at the end that is nearer to it, and
-the sum of these largest weights bounds the field in between from above.
+the sum of these largest weights bounds the field in between from above, but for the rounding of either sum.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Carry = TypeVar("Carry")
 BLOCK = 16  # particles of each slab, unrolled
 
 
-class Lines(NamedTuple):
+class SlabRays(NamedTuple):
     """Rays of slabs.
 
     Attributes:
@@ -48,7 +48,7 @@ class Lines(NamedTuple):
     middle: Float[Array, "tasks 1"]
 
     @classmethod
-    def of(cls, task: SlabTask) -> Lines:
+    def of(cls, task: SlabTask) -> SlabRays:
         """Of the slabs of a task."""
         u, v = task.ray_coordinates()
         middle = 0.5 * (task.border[:, :1] + task.border[:, -1:])
@@ -98,7 +98,7 @@ class Piercing:
     ordered: Ordered
     rank: Int[Array, " pairs"]
     task: SlabTask
-    lines: Lines
+    lines: SlabRays
     kernel: str
 
     def bound(self, border: Float[Array, "tasks borders"], level: Float[Array, ""]) -> Bound:

@@ -4,10 +4,10 @@ Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> norm
 
 **Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
 level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
-below the level there is no surface, and that is a theorem. Else the field is asked for at one place more, where it may be
-largest, and then, if it is not reached there, at the vertex of the parabola through the three. The first change of sign between
-neighbouring places is a crossing. It is followed by false position (the Illinois form: Dahlquist & Bjoerck 1974, section 6.2)
-and a step of Newton's, to some roundings of a support.
+below the level there is no surface, a theorem but for the rounding of sums that are within some eps of the level. Else the field
+is asked for at one place more, where it may be largest, and then, if it is not reached there, at the vertex of the parabola
+through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the
+Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's, to some roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
@@ -33,7 +33,7 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.piercing import Lines, Piercing
+from jaxsph.engine.field.piercing import Piercing, SlabRays
 from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
@@ -167,7 +167,7 @@ class ParticleSurface(Medium):
     def _searched(self, task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> Float[Array, "tasks 8 rays"]:
         """Rows of `Hit`, of some slabs, given the field on their borders."""
         assert self.ordered is not None and self.rank is not None
-        rays = Piercing(self.ordered, self.rank, task, Lines.of(task), self.kernel)
+        rays = Piercing(self.ordered, self.rank, task, SlabRays.of(task), self.kernel)
         at = jnp.broadcast_to((task.border - rays.lines.middle)[..., None], weight.shape)
         places, values = self._places(rays, at, weight)
         inside = values >= self.level

@@ -13,39 +13,9 @@ from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from slabs_drawn import FORMS, SAMPLES, TASKS, drawn
 
-from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.cover import cover_of, outer_pivot
-from jaxsph.engine.field.schedule import SlabSchedule
-from jaxsph.engine.field.tasks import SlabTask
-
-TASKS, SAMPLES, COLUMNS, ROWS, PARTICLES = 34, 5, 3, 4, 30  # more slabs than are looked at together
-NEAR, FAR = 1.0, 4.0
-FORMS = "perspective", "orthographic", "scattered"
-
-
-def drawn(rng, form):
-    """Particles in two windows a slab, and slabs that tile a depth, their rays all about."""
-    support = 0.7 * 10 ** -rng.uniform(0, 1.7, PARTICLES)
-    x, y = rng.uniform(-0.7, 0.7, (2, PARTICLES))
-    scale = 10 ** rng.uniform(-1, 1, PARTICLES)
-    where = {"x": x, "y": y, "z": rng.uniform(NEAR, FAR, PARTICLES), "scale": scale, "size": scale * support}
-    columns = where | {"quantity": rng.uniform(0, 1, PARTICLES)}
-    unread = dict.fromkeys(field.name for field in dataclasses.fields(Ordered))
-    ordered = Ordered(**unread | {name: jnp.asarray(value) for name, value in columns.items()})
-    begin = np.stack([np.zeros(TASKS), rng.integers(10, 20, TASKS)]).astype(np.int32)
-    length = np.stack([rng.integers(0, 10, TASKS), rng.integers(0, 10, TASKS)]).astype(np.int32)
-    reference = rng.uniform(0, 1, TASKS)
-    zero = jnp.zeros(TASKS, jnp.int32)
-    given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), (jnp.asarray(reference),)
-    entry = SlabSchedule(zero == 0, zero, *given)
-    first = rng.uniform(NEAR, FAR, (TASKS, 1))
-    depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
-    count = COLUMNS if form != "scattered" else ROWS
-    u, v = rng.uniform(-0.4, 0.4, (TASKS, count)), rng.uniform(-0.4, 0.4, (TASKS, ROWS))
-    placed = (jnp.asarray(value) for value in (u, v, depth, depth))
-    task = SlabTask(entry, zero, zero, *placed, form != "orthographic", form == "scattered", between=True)
-    return ordered, jnp.asarray(rng.permutation(PARTICLES).astype(np.int32)), task
 
 
 def chords_of(ordered, rank, task, item):
