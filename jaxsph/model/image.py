@@ -41,6 +41,8 @@ class Image:
         metadata: strings and numbers for the file header.
         levels: what error control gave each cell of 8 x 8 pixels and 16 samples, front to back: sampling level 0 (full rate)
             to 4, 5 for a super-pixel, -1 for an empty cell; None at full rate.
+        normal: of the scene's surface of particles, of unit length and out of the fluid, in the world; 0 where no ray meets it.
+            None without one, and where pixels are interpolated.
     """
 
     color: Float[Array, "height width 3"]
@@ -53,6 +55,7 @@ class Image:
     stats: dict[str, Any]
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
+    normal: Float[Array, "height width 3"] | None = None
 
     writer = Method()
     """How images become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
@@ -144,6 +147,8 @@ class Image:
         layers: dict[str, Any] = {"color": ((*PLANE, "channel"), np.asarray(self.color), {"long_name": "premultiplied colour"})}
         for name in ("transmittance", "depth", "error_bound", "evaluations"):
             layers[name] = PLANE, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
+        if self.normal is not None:
+            layers["normal"] = (*PLANE, "axis"), np.asarray(self.normal), {"long_name": "normal of the surface"}
         told = {"certified": str(bool(self.certified)).lower(), "faults": int(self.faults)}
         return dataset(layers, {"channel": ["red", "green", "blue"]}, self.metadata, **told)
 

@@ -38,6 +38,11 @@ class OfPlaces(NamedTuple):
         return cls(jnp.zeros_like(task.depth), jnp.zeros_like(task.border), jnp.zeros_like(task.depth[0, 0]))
 
 
+Stops = tuple[Array, Array, Array, Array]
+"""Where rays end at something opaque: view depths, infinite where they do not; and x, y and z of its normal in view space, of unit
+length and out of it, 0 where there is none."""
+
+
 class Medium(abc.ABC):
     """A participating medium that emits and absorbs.
 
@@ -48,7 +53,6 @@ class Medium(abc.ABC):
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
         stops_rays: whether `stops` tells where rays end at something opaque, behind which nothing is marched.
-        no_derivatives: what is said where an image of it is differentiated; None where that is right.
         in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
             part of an interval.
     """
@@ -57,7 +61,6 @@ class Medium(abc.ABC):
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     stops_rays: ClassVar[bool] = False
-    no_derivatives: ClassVar[str | None] = None
 
     @property
     def dtype(self) -> Any:
@@ -142,8 +145,8 @@ class Medium(abc.ABC):
         """
         return jnp.zeros(task.shape[::2], task.depth.dtype)
 
-    def stops(self, gathered: Any, task: Any) -> Float[Array, "tasks rays"]:
-        """View depths at which rays end in slabs, infinite where they do not; of media that `stops_rays`.
+    def stops(self, gathered: Any, task: Any) -> Stops:
+        """Where rays end in slabs, (tasks, rays) each; of media that `stops_rays`.
 
         There lies the half depth of rays that arrive with more, exactly and not to within a sample.
         """
@@ -159,13 +162,16 @@ class Medium(abc.ABC):
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)
 
-    def pull(self, total: Total, gathered: Any, task: Any, cotangents: list[Array]) -> tuple[Total, OfPlaces]:
+    def pull(
+        self, total: Total, gathered: Any, task: Any, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Total, OfPlaces]:
         """Cotangents of what is `met`, pulled back: of red, green, blue and extinction at samples, or of means.
 
         By default by differentiating `gather`, `extinction` and `colors`.
 
         Args:
             total: of the slabs before, see `no_cotangents`.
+            of_stops: cotangents of where rays end, of media that `stops_rays`.
 
         Returns:
             `total` with those of these slabs, and those of where samples are.
@@ -175,12 +181,21 @@ class Medium(abc.ABC):
             moved = dataclasses.replace(
                 task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor
             )
-            return medium.met(medium.gather(moved), moved)
+            gathered = medium.gather(moved)
+            stops = () if of_stops is None else medium.stops(gathered, moved)
+            return [*medium.met(gathered, moved), *stops]
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        of_medium, of_places = jax.vjp(optics, self, there)[1](cotangents)
-        added = [
-            value if more.dtype == jax.dtypes.float0 else value + more
-            for value, more in zip(jax.tree.leaves(total), jax.tree.leaves(of_medium), strict=True)
-        ]
-        return jax.tree.unflatten(jax.tree.structure(total), added), of_places
+        of_medium, of_places = jax.vjp(optics, self, there)[1]([*cotangents, *(of_stops or ())])
+        return added(total, of_medium), of_places
+
+    def apart(self, total: Any) -> tuple[Any, dict[str, Array]]:
+        """What was added up as cotangents of the medium's leaves, and of the grid's particles by name; by default none of these."""
+        return total, {}
+
+
+def added(total: Total, more: Any) -> Total:
+    """Cotangents, with more of the same; what has none stays as it is."""
+    leaves = zip(jax.tree.leaves(total), jax.tree.leaves(more), strict=True)
+    sums = [value if other.dtype == jax.dtypes.float0 else value + other for value, other in leaves]
+    return jax.tree.unflatten(jax.tree.structure(total), sums)  # type: ignore[no-any-return]

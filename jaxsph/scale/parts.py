@@ -213,12 +213,17 @@ def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[s
 LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
 
+def _layers_of(parts: list[Image]) -> tuple[str, ...]:
+    """Of pixels, that all parts have."""
+    return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
+
+
 def of_columns(image: Image, left: int, right: int) -> Image:
     """Some columns alone, from the border of a tile to that of another or of the image; on the host.
 
     There because a device would compile a program for every width.
     """
-    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in LAYERS}
+    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in _layers_of([image])}
     layers["levels"] = (
         None if image.levels is None else np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
     )
@@ -227,7 +232,7 @@ def of_columns(image: Image, left: int, right: int) -> Image:
 
 def joined(parts: list[Image], axis: int = 0) -> Image:
     """The image of rows that follow on one another, or of columns."""
-    whole = {name: jnp.asarray(np.concatenate([getattr(part, name) for part in parts], axis)) for name in LAYERS}
+    whole = {name: jnp.asarray(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
     of_cells = [part.levels for part in parts if part.levels is not None]
     levels = jnp.asarray(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(

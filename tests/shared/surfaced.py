@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+import jaxsph as js
 from jaxsph.model.particles import kernels
 
+SPACING = 0.1
 SAMPLES, HALVINGS = 1200, 40
 
 
@@ -23,6 +27,26 @@ class Crossing(NamedTuple):
     normal: np.ndarray
     facing: np.ndarray
     quantity: np.ndarray
+
+
+def ball(kernel="cubic_spline", dtype=np.float32, spread=0.2, seed=3):
+    """Jittered particles in a ball, with supports that vary."""
+    rng = np.random.default_rng(seed)
+    steps = (np.arange(9) - 4) * SPACING
+    position = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
+    position = position[np.linalg.norm(position, axis=1) < 0.4]
+    position = position + rng.uniform(-0.01, 0.01, position.shape)
+    support = 0.2 * rng.uniform(1 - spread, 1 + spread, len(position))
+    columns = (one.astype(dtype) for one in (position, support, position[:, 0], np.full(len(position), SPACING**3)))
+    return js.Particles.from_arrays(*columns, kernel)
+
+
+def view_of_ball(projection="perspective", width=16, height=14, eye=(0.35, 0.45, -2.1), near=1.2, dtype=None):
+    """Of all of it."""
+    where = {"eye": eye, "target": (0.0, 0.0, 0.0), "width": width, "height": height, "near": near, "far": 3.2}
+    orthographic = projection == "orthographic"
+    camera = js.Camera.orthographic(**where, view_height=1.3) if orthographic else js.Camera.look_at(**where, fov_degrees=35.0)
+    return camera if dtype is None else jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), camera)
 
 
 def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES) -> Crossing:

@@ -24,14 +24,14 @@ from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.cast.batches import Batches, CastPlan, batches_of, with_room
-from jaxsph.engine.cast.composite import Together
+from jaxsph.engine.cast.composite import Together, no_stops
 from jaxsph.engine.cast.integrator import Integrator, Optics
 from jaxsph.engine.cast.march import RayResult, march
 from jaxsph.engine.cast.replay import ReplayState, fresh_replay, pull_composite
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
-from jaxsph.engine.field.transposed import COLUMNS
+from jaxsph.engine.field.transposed import COLUMNS, columns_of
 from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.engine.media.particles import ParticleMedium, Wanted
@@ -48,7 +48,7 @@ from jaxsph.numerics.trees import tree
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
 KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
-Layers = tuple[Array, Array]  # colour and transmittance of an image, or their cotangents
+Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def cast(
     Differentiation:
         Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
         by the transfer function and by what other media are made of. Lists, windows, levels and the references of sums are
-        held fixed; `depth` has none.
+        held fixed; so has `stop`, and `depth` where that is it.
 
     Raises:
         NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
@@ -119,7 +119,13 @@ def cast(
     camera, transfer, media, within = shown
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
     fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, limits)
-    return _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
+    found = _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
+    if found.stop is None:
+        return found
+    depth, *normal = found.stop
+    in_world = [sum(n * axis[k] for n, axis in zip(normal, camera.axes, strict=True)) for k in range(3)]
+    there = jnp.where(found.depth == depth, depth, found.depth)
+    return dataclasses.replace(found, depth=there, stop=jnp.stack([depth, *in_world]))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -160,38 +166,44 @@ def _moved(
     """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
     inputs, fixed = primals
     found = _cast(method, inputs, fixed)
-    color, transmittance = (checkpoint_name(layer, KEPT) for layer in (found.color, found.transmittance))
-    found = dataclasses.replace(found, color=color, transmittance=transmittance)
+    found = _with_layers(found, tuple(checkpoint_name(layer, KEPT) for layer in _layers(found)))
     still = jax.tree.map(jnp.zeros_like, found)
     leaves, structure = jax.tree.flatten(inputs)
     moves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
     moving = [i for i, move in enumerate(moves) if not _is_zero(move)]
     if not moving:
         return found, still
-    _require_values(fixed, inputs.media)
+    _require_values(fixed)
     wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
 
     def push(moves: list[Array]) -> Layers:
         def light(parts: list[Array]) -> Layers:
             there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
-            rays = _march(method, jax.tree.unflatten(structure, there), fixed)
-            return rays.color, rays.transmittance
+            return _layers(_march(method, jax.tree.unflatten(structure, there), fixed))
 
         return jax.jvp(light, ([leaves[i] for i in moving],), (moves,))[1]
 
     def pull(cotangent: Layers) -> list[Array]:
-        cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, (found.color, found.transmittance), cotangent))
+        cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, _layers(found), cotangent))
         return [cotangents[i] for i in moving]
 
-    like, why = (found.color, found.transmittance), method.integrator.forward_only
+    like, why = _layers(found), method.integrator.forward_only
     if why is not None:
-        color, transmittance = forward_only(push([moves[i] for i in moving]), why)
-        return found, dataclasses.replace(still, color=color, transmittance=transmittance)
-    color, transmittance = linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE)
-    return found, dataclasses.replace(still, color=color, transmittance=transmittance)
+        return found, _with_layers(still, forward_only(push([moves[i] for i in moving]), why))
+    return found, _with_layers(still, linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE))
 
 
 _cast.defjvp(_moved, symbolic_zeros=True)
+
+
+def _layers(rays: RayResult) -> Layers:
+    """Those that have derivatives."""
+    layers = rays.color, rays.transmittance
+    return layers if rays.stop is None else (*layers, rays.stop)
+
+
+def _with_layers(rays: RayResult, layers: Layers) -> RayResult:
+    return dataclasses.replace(rays, **dict(zip(("color", "transmittance", "stop"), layers, strict=False)))
 
 
 def _is_zero(move: Any) -> bool:
@@ -202,11 +214,8 @@ def _moves(part: Any) -> bool:
     return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
 
 
-def _require_values(fixed: NonDiffInputs, media: tuple[Medium, ...]) -> None:
+def _require_values(fixed: NonDiffInputs) -> None:
     """Raise where values come from elsewhere, so that their derivatives would be missing."""
-    for medium in media:
-        if medium.no_derivatives is not None:
-            raise NotImplementedError(medium.no_derivatives)
     if fixed.schedule.paint is not None:
         raise NotImplementedError(
             "an image with super-pixels has no derivatives, as their colours come from bounds; "
@@ -241,7 +250,7 @@ class Accumulated:
 def _pull(
     method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
 ) -> DiffInputs:
-    """Cotangents of `inputs`, from those of the image's colour and transmittance; zero where they are not `wanted`."""
+    """Cotangents of `inputs`, from those of the image's layers; zero where they are not `wanted`."""
     plan = method.plan.of_shard(2)  # as twice as much is held of each slab
     grid, camera = _seen(inputs, fixed)
     packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
@@ -254,14 +263,19 @@ def _pull(
     with barriers(plan.tuning.fusion_barriers):
         found = _Backward(batches, medium, method.integrator, wanted.field).pull(image, cotangent, start)
     of_media = found.medium if len(media) > 1 else (found.medium,)
-    columns, transfer, others = jax.tree.map(jnp.zeros_like, inputs.columns), None, of_media
+    columns, transfer = jax.tree.map(jnp.zeros_like, inputs.columns), None
     within = jax.tree.map(jnp.zeros_like, inputs.within)
     if inputs.transfer is not None:
-        particles, *others = of_media
+        particles, *of_media = of_media
         if inputs.within is not None:
             particles, within = particles.medium, particles.clip
-        found_columns, transfer = particles.columns(), particles.of_transfer()
+        found_columns, transfer = columns_of(particles.table), particles.of_transfer()
         columns = {name: found_columns[name] for name in columns}
+    others = []
+    for one, of_one in zip(media[len(media) - len(inputs.media) :], of_media, strict=True):
+        own, of_columns = one.apart(of_one)
+        others.append(own)
+        columns = {name: column + of_columns[name] if of_columns else column for name, column in columns.items()}
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
     half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)
@@ -285,7 +299,7 @@ class _Backward:
         light, gathered = jax.tree.map(
             lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.march, items)
         )
-        light = (*light[:3], jnp.ones_like(light[3]))
+        light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
 
         def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
             rays, held, total = carry
@@ -310,18 +324,20 @@ class _Backward:
         return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
 
     def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
-        """Red, green, blue and transmittance of slabs, and what their medium gathers there."""
+        """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what their medium gathers there."""
         task = self.batches.task(items)
         gathered = self.medium.gather(task)
         light = self.integrator(self.medium, gathered, task)
-        return (*light.color, light.transmittance), gathered
+        stops = self.medium.stops(gathered, task) if self.medium.stops_rays else ()
+        return (*light.color, light.transmittance, *stops), gathered
 
-    def pull_slabs(self, items: Array, gathered: Any, of_slabs: Float[Array, "4 tasks rays"], total: Accumulated) -> Accumulated:
-        """Add what follows from the cotangents of a chunk of slabs: of red, green, blue and optical thickness."""
+    def pull_slabs(self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated) -> Accumulated:
+        """Add what follows from the cotangents of a chunk of slabs, see `replay.pull_composite`."""
         task = self.batches.task(items)
         through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
         of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
-        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics)
+        of_stops = (tuple(of_slabs[4:]),) if self.medium.stops_rays else ()
+        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics, *of_stops)
         if not self.geometry:
             return dataclasses.replace(total, medium=of_medium)
 

@@ -19,7 +19,9 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.cast.batches import Batch
 from jaxsph.engine.cast.integrator import Segment
 from jaxsph.engine.cast.samples import transmitted
+from jaxsph.engine.media.mixture import first_stops
 from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.model.medium import Stops
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -56,27 +58,37 @@ class RayState:
         transmittance: of all that was met so far.
         depth: where that fell to one half, infinite where it has not.
         square: sum of the squared errors that slabs are estimated to have, as they are seen; None where none are.
+        stop: where they first end at something opaque, see `Medium.stops`; None where nothing is.
     """
 
     color: tuple[Float[Array, "packets rays"], ...]
     transmittance: Float[Array, "packets rays"]
     depth: Float[Array, "packets rays"]
     square: Float[Array, "packets rays"] | None = None
+    stop: Stops | None = None
 
 
 def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False, stopping: bool = False) -> Segment:
     """Slabs with nothing in them; `estimated`: and with no error; `stopping`: and where nothing ends rays."""
     red, green, blue, error = (jnp.zeros((slots, rays), dtype) for _ in range(4))
     through, thickness = jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype)
-    stop = jnp.full((slots, rays), jnp.inf, dtype) if stopping else None
+    stop = no_stops((slots, rays), dtype) if stopping else None
     return Segment((red, green, blue), through, thickness, error if estimated else None, stop)
 
 
-def fresh_rays(packets: int, rays: int, dtype: Any, together: Together, estimated: bool = False) -> RayState:
-    """Rays that have met nothing."""
+def no_stops(shape: tuple[int, ...], dtype: Any) -> Stops:
+    """Of rays that nothing ends."""
+    return jnp.full(shape, jnp.inf, dtype), *(jnp.zeros(shape, dtype) for _ in range(3))  # type: ignore[return-value]
+
+
+def fresh_rays(
+    packets: int, rays: int, dtype: Any, together: Together, estimated: bool = False, stopping: bool = False
+) -> RayState:
+    """Rays that have met nothing; of `estimated` and `stopping` see `empty_segments`."""
     room = packets + together.packets, rays
     red, green, blue, square, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 0, 1, jnp.inf))
-    return RayState((red, green, blue), transmittance, depth, square if estimated else None)
+    stop = no_stops(room, dtype) if stopping else None
+    return RayState((red, green, blue), transmittance, depth, square if estimated else None, stop)
 
 
 def over_layers(
@@ -155,7 +167,10 @@ def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_dep
     square = rays.square
     if square is not None and light.error is not None:
         square = square + (rays.transmittance * light.error[slot]) ** 2
-    return RayState(color, behind, depth, square)
+    stop = rays.stop
+    if stop is not None and light.stop is not None:
+        stop = first_stops(stop, tuple(of_slabs[slot] for of_slabs in light.stop))  # type: ignore[arg-type]
+    return RayState(color, behind, depth, square, stop)
 
 
 def _with_half_depth(
@@ -184,7 +199,7 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segme
     In a sample in which something ends them, that is where. Whatever the products of the samples round to here, one that has
     crossed does so at the last sample if not before.
     """
-    thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[slot]
+    thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[0][slot]
     left, reached = transmitted(thickness), transmittance
     for k in range(thickness.shape[1]):
         behind = transmittance * left[:, k]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model.medium import Medium
+from jaxsph.model.medium import Medium, Stops
 from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
@@ -26,14 +26,14 @@ class Segment:
         transmittance: what it lets through, the exponential of minus the sum of `thickness`.
         thickness: optical thickness between borders.
         error: how wrong colours and transmittance are estimated to be, whatever shines behind; None where that is not asked for.
-        stop: view depths at which rays end, see `Medium.stops`; None where nothing ends them so.
+        stop: where rays end, see `Medium.stops`; None where nothing ends them so.
     """
 
     color: tuple[Float[Array, "slabs rays"], Float[Array, "slabs rays"], Float[Array, "slabs rays"]]
     transmittance: Float[Array, "slabs rays"]
     thickness: Float[Array, "slabs samples rays"]
     error: Float[Array, "slabs rays"] | None = None
-    stop: Float[Array, "slabs rays"] | None = None
+    stop: Stops | None = None
 
 
 class Integrator:

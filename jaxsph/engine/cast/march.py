@@ -33,7 +33,9 @@ class RayResult:
 
     `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
     ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
-    `cut` is how many slabs they left out, whatever those would have taken.
+    `cut` is how many slabs they left out, whatever those would have taken. `stop` are the depths at which rays first end at
+    something opaque, infinite where they do not, and x, y and z of its normal, in view space before `adjoint.cast` and in the world
+    after; None where nothing is.
     """
 
     color: Float[Array, "3 packets rows columns"]
@@ -43,6 +45,7 @@ class RayResult:
     error: Float[Array, "packets rows columns"] | None = None
     refined: Float[Array, " packets"] | None = None
     cut: Float[Array, " packets"] | None = None
+    stop: Float[Array, "4 packets rows columns"] | None = None
 
 
 class Marched(NamedTuple):
@@ -110,7 +113,7 @@ def march(
         return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
 
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
-    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining)
+    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
     light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
     start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
     found = lax.fori_loop(0, batches.number, march_batch, start)
@@ -139,4 +142,5 @@ def result_of(rays: RayState, batches: Batches) -> RayResult:
     rank, shape = batches.compacted.bundle_rank, batches.packets.shape
     *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
     error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
-    return RayResult(jnp.stack(color), transmittance, depth, error=error)
+    stop = None if rays.stop is None else jnp.stack([field[rank].reshape(-1, *shape) for field in rays.stop])
+    return RayResult(jnp.stack(color), transmittance, depth, error=error, stop=stop)

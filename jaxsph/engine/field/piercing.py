@@ -17,6 +17,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -101,6 +102,10 @@ class Piercing:
     lines: SlabRays
     kernel: str
 
+    def ray(self) -> list[Float[Array, "tasks rays"]]:
+        """View coordinates of a vector along each ray, of a unit of depth."""
+        return [self.lines.slope_u, self.lines.slope_v, jnp.ones_like(self.lines.u)]
+
     def bound(self, border: Float[Array, "tasks borders"], level: Float[Array, ""]) -> Bound:
         """Of the field between borders, relative to the middle."""
         smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
@@ -143,40 +148,81 @@ class Piercing:
 
     def found(self, place: Float[Array, "tasks rays"]) -> Found:
         """Field, gradient and quantities at one depth of each ray."""
-        smooth, lines, number = kernels.by_name(self.kernel), self.lines, len(self.task.entry.references)
-        here = lines.u + place * lines.slope_u, lines.v + place * lines.slope_v, place
+        number = len(self.task.entry.references)
 
         def add(block: Block, passed: Passed, total: Array) -> Array:
-            size, scale = block.size[..., None], block.scale[..., None]
-            rest = (place[:, None] - passed.foot) ** 2 * passed.rate
-            weight = smooth.weigh(passed.nearest, rest, size, jnp)
-            slope = 2 * scale**2 * smooth.slope(passed.nearest, rest, size, jnp)
-            there = block.x[..., None], block.y[..., None], block.z[..., None] - lines.middle[..., None]
-            rows = [weight, *(slope * (at[:, None] - of) for at, of in zip(here, there, strict=True))]
-            rows += [weight * quantity[..., None] for quantity in block.quantities]
-            return total + jnp.stack([row.sum(1) for row in rows])
+            return total + self._rows(block, passed, self.lines, place)
 
         weight, *rows = self._over(add, jnp.zeros((4 + number, *place.shape), place.dtype))
         return Found(weight, tuple(rows[:3]), tuple(rows[3:]))
 
+    def pull(
+        self, table: Float[Array, "particles 8"], place: Float[Array, "tasks rays"], of_found: Found
+    ) -> tuple[Float[Array, "particles 8"], Float[Array, ""]]:
+        """Cotangents of particles, `field.transposed.COLUMNS`, added to `table`, from those of what is `found` at a place.
+
+        Returns:
+            The table, and the cotangent of a common factor of all u and v, where the place stays.
+        """
+        of_rows = jnp.stack([of_found.weight, *of_found.gradient, *of_found.weighted])
+        task = self.task
+
+        def rows(columns: tuple[Array, ...], factor: Array) -> Array:
+            block = Block(*columns[:5], columns[5:])
+            lines = SlabRays.of(dataclasses.replace(task, u=task.u * factor, v=task.v * factor))
+            return self._rows(block, self._passed(block, lines), lines, place)
+
+        def pulled(block: Block) -> tuple[Array, Array]:
+            columns = block.x, block.y, block.z, block.scale, block.size, *block.quantities
+            of_columns, of_factor = jax.vjp(rows, columns, jnp.ones((), place.dtype))[1](of_rows)
+            row = [jnp.where(block.size > 0, column, 0) for column in of_columns]
+            row += [jnp.zeros_like(row[0])] * (table.shape[1] - len(row))
+            return jnp.stack(row, -1).reshape(-1, table.shape[1]), of_factor
+
+        def put(nth: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            particle, block = self._fetched(nth)
+            row, of_factor = fusion_barrier(nth >= 0, pulled, block)
+            return carry[0].at[particle.ravel()].add(row, mode="promise_in_bounds"), carry[1] + of_factor
+
+        return lax.fori_loop(0, self._blocks(), put, (table, jnp.zeros((), place.dtype)))
+
+    def _rows(self, block: Block, passed: Passed, lines: SlabRays, place: Float[Array, "tasks rays"]) -> Float[Array, "rows tasks rays"]:
+        """What a block adds to what is `found`."""
+        smooth, size, scale = kernels.by_name(self.kernel), block.size[..., None], block.scale[..., None]
+        rest = (place[:, None] - passed.foot) ** 2 * passed.rate
+        weight = smooth.weigh(passed.nearest, rest, size, jnp)
+        slope = 2 * scale**2 * smooth.slope(passed.nearest, rest, size, jnp)
+        here = lines.u + place * lines.slope_u, lines.v + place * lines.slope_v, place
+        there = block.x[..., None], block.y[..., None], block.z[..., None] - lines.middle[..., None]
+        rows = [weight, *(slope * (at[:, None] - of) for at, of in zip(here, there, strict=True))]
+        rows += [weight * quantity[..., None] for quantity in block.quantities]
+        return jnp.stack([row.sum(1) for row in rows])
+
     def _over(self, add: Callable[[Block, Passed, Carry], Carry], start: Carry) -> Carry:
         """All particles of the windows, a block at a time."""
+
+        def put(nth: Array, carry: Carry) -> Carry:
+            block = self._fetched(nth)[1]
+            return add(block, fusion_barrier(nth >= 0, self._passed, block, self.lines), carry)
+
+        return lax.fori_loop(0, self._blocks(), put, start)
+
+    def _blocks(self) -> Int[Array, ""]:
+        """Of the slab whose windows hold most."""
+        return (self.task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+
+    def _fetched(self, nth: Array) -> tuple[Int[Array, "tasks block"], Block]:
+        """The nth block of each slab, by rank and as such."""
         entry = self.task.entry
         windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
 
-        def fetched(index: Array) -> Block:
-            return fetch(self.ordered, self.rank, windows, index, references)[1]
+        def fetched(index: Array) -> tuple[Array, Block]:
+            return fetch(self.ordered, self.rank, windows, index, references)
 
-        def put(nth: Array, carry: Carry) -> Carry:
-            block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-            return add(block, fusion_barrier(nth >= 0, self._passed, block), carry)
+        return fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
 
-        blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-        return lax.fori_loop(0, blocks, put, start)
-
-    def _passed(self, block: Block) -> Passed:
+    def _passed(self, block: Block, lines: SlabRays) -> Passed:
         """How rays pass a block of particles."""
-        lines = self.lines
         x, y = block.x[..., None] - lines.u[:, None], block.y[..., None] - lines.v[:, None]
         z, scale = block.z[..., None] - lines.middle[..., None], block.scale[..., None]
         along = x * lines.slope_u[:, None] + y * lines.slope_v[:, None] + z

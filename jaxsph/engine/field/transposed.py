@@ -80,6 +80,11 @@ def pull_gather(
     return lax.fori_loop(0, blocks, add_block, GatherCotangents(table, jnp.zeros_like(s), jnp.zeros_like(s)))
 
 
+def columns_of(table: Float[Array, "particles 8"]) -> dict[str, Float[Array, " particles"]]:
+    """Cotangents of particles by name, of rows of them."""
+    return {name: table[:, k] for k, name in enumerate(COLUMNS)}
+
+
 def _columns(block: Block) -> tuple[Array, ...]:
     return block.x, block.y, block.z, block.scale, block.size, *block.quantities
 

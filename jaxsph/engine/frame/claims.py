@@ -45,6 +45,7 @@ def disclaimed(image: Image, word: Int[Array, ""]) -> Image:
         color=jnp.where(unusable, 0, image.color),
         transmittance=jnp.where(unusable, 1, image.transmittance),
         depth=jnp.where(unusable, jnp.inf, image.depth),
+        normal=None if image.normal is None else jnp.where(unusable, 0, image.normal),
         error_bound=jnp.where(faulty, 1, image.error_bound),
         certified=image.certified & ~faulty,
         faults=word,

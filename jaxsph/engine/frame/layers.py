@@ -42,6 +42,7 @@ class Layers(NamedTuple):
         full: evaluations that full rate takes.
         levels: what error control gave each cell, if there is any that gives levels.
         rays: how many were cast, where pixels are interpolated.
+        normal: of what ends rays, see `Image`; None where nothing does.
     """
 
     color: Float[Array, "rows columns 3"]
@@ -52,6 +53,7 @@ class Layers(NamedTuple):
     full: Float[Array, "rows columns"]
     levels: Int[Array, "bundle_rows bundle_columns cells"] | None
     rays: Int[Array, ""] | None = None
+    normal: Float[Array, "rows columns 3"] | None = None
 
 
 class Band(NamedTuple):
@@ -114,11 +116,15 @@ def of_band(band: OfShards, *, plan: Plan) -> Layers:
     if band.cast[0].rays.error is not None:
         error = unshard(tuple(shard.rays.error for shard in band.cast), 0)
         bound = registry.screen(plan.screen).resolve(RayResult(color, error, depth), lists)[1]
+    normal = None
+    if band.cast[0].rays.stop is not None:
+        stop = unshard(tuple(shard.rays.stop for shard in band.cast), 1)
+        normal = registry.screen(plan.screen).resolve(RayResult(stop[1:], transmittance, depth), lists)[0]
     color, transmittance, depth = pixels
     if band.cast[0].cut is not None:  # what may be left out by rays that ended is what they let through
         cut = unshard(tuple(shard.cut for shard in band.cast))
         bound = bound + jnp.where(over_pixels(cut), lax.stop_gradient(transmittance), 0)
-    return Layers(color, transmittance, depth, over_pixels(spent), bound, over_pixels(verdict.full), levels)
+    return Layers(color, transmittance, depth, over_pixels(spent), bound, over_pixels(verdict.full), levels, normal=normal)
 
 
 def crop(bands: Layers, plan: Plan) -> Layers:

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.medium import Medium, OfPlaces, Stops
 from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "..."]]
@@ -84,10 +84,10 @@ class Mixture(Medium):
         """Whether any of them does."""
         return any(medium.stops_rays for medium in self.media)
 
-    def stops(self, gathered: tuple[Any, ...], task: Any) -> Float[Array, "tasks rays"]:
+    def stops(self, gathered: tuple[Any, ...], task: Any) -> Stops:
         """By the first of them."""
         found = [medium.stops(one, task) for medium, one in zip(self.media, gathered, strict=True) if medium.stops_rays]
-        return functools.reduce(jnp.minimum, found)
+        return functools.reduce(first_stops, found)
 
     def every_other(self, gathered: tuple[Any, ...]) -> tuple[Any, ...]:
         """Of each."""
@@ -98,7 +98,12 @@ class Mixture(Medium):
         return tuple(medium.no_cotangents() for medium in self.media)
 
     def pull(  # type: ignore[override]
-        self, total: tuple[Any, ...], gathered: tuple[Any, ...], task: Any, cotangents: list[Array]
+        self,
+        total: tuple[Any, ...],
+        gathered: tuple[Any, ...],
+        task: Any,
+        cotangents: list[Array],
+        of_stops: Stops | None = None,
     ) -> tuple[tuple[Any, ...], OfPlaces]:
         """See `Medium.pull`: through the mixing by `jax.vjp`, then through each medium as it does."""
 
@@ -118,12 +123,21 @@ class Mixture(Medium):
         if self.mix != "extinction":
             of_border, of_factor = jax.vjp(path, task.border, jnp.ones_like(places.factor))[1](of_path)
             places = places._replace(border=of_border, factor=of_factor)
-        added = []
+        added, first = [], None if of_stops is None else self.stops(gathered, task)[0]
         for medium, so_far, one, of_one in zip(self.media, total, gathered, of_optics, strict=True):
-            more, moved = medium.pull(so_far, one, task, of_one)
+            of_own: tuple[Any, ...] = ()
+            if of_stops is not None and medium.stops_rays:
+                own = medium.stops(one, task)[0] == first
+                of_own = (tuple(jnp.where(own, of_stop, 0) for of_stop in of_stops),)
+            more, moved = medium.pull(so_far, one, task, of_one, *of_own)
             added.append(more)
             places = jax.tree.map(jnp.add, places, moved)
         return tuple(added), places
+
+
+def first_stops(one: Stops, other: Stops) -> Stops:
+    """Of two, where rays end first."""
+    return tuple(jnp.where(one[0] <= other[0], a, b) for a, b in zip(one, other, strict=True))  # type: ignore[return-value]
 
 
 def mixed_extinction(extinctions: Optics) -> Float[Array, "..."]:

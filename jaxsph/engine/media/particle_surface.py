@@ -1,13 +1,13 @@
 r"""The surface of particles as a medium: opaque where a ray first crosses a level of their coverage, shaded by its gradient.
 
-Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> normal -> shade] -> integrator.
+Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> root -> light] -> integrator.
 
 **Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
 level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
 below the level there is no surface, a theorem but for the rounding of sums that are within some eps of the level. Else the field
 is asked for at one place more, where it may be largest, and then, if it is not reached there, at the vertex of the parabola
 through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the
-Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's, to some roundings of a support.
+Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's (`surface_root`), to some roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
@@ -33,23 +33,25 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.piercing import Piercing, SlabRays
+from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
 from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.headlight import OPAQUE, headlight
+from jaxsph.engine.field.transposed import WIDTH, columns_of
+from jaxsph.engine.media.headlight import OPAQUE
+from jaxsph.engine.media.surface_root import Root, SurfaceLook, pull_root, root_near
 from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.medium import COLORS, Medium
+from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops, added
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
-from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
 STEPS = 10  # of false position, at most
-ENOUGH = 0.6  # power of eps, as a share of the level, at which they end: Newton's step squares that
+ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: Newton's step squares that
 
 
 class Hit(NamedTuple):
@@ -66,6 +68,13 @@ class Hit(NamedTuple):
     interval: Int[Array, "tasks rays"]
     color: Float[Array, "tasks 3 rays"]
     normal: Float[Array, "tasks 3 rays"]
+
+
+class SurfaceCotangents(NamedTuple):
+    """Of particles in rank order, `field.transposed.COLUMNS`; and of what the surface is besides them."""
+
+    table: Float[Array, "particles 8"]
+    own: ParticleSurface
 
 
 class Bracket(NamedTuple):
@@ -98,8 +107,7 @@ class ParticleSurface(Medium):
 
     Attributes:
         level: as a sum of weights, see `access.view.weight_of`.
-        color, ambient: as of the surface.
-        segments: of the transfer function that colours it; None without one.
+        look: how it looks.
         clip: where it is shown; None everywhere.
         fault: fault word.
         kernel: name of the smoothing kernel.
@@ -109,14 +117,8 @@ class ParticleSurface(Medium):
     at_points = False
     between_samples = True
     stops_rays = True
-    no_derivatives = (
-        "an image of a surface of particles (`Scene(surface=...)`) has no derivatives yet; leave the surface out and give a "
-        "`transfer`, or take the surface of a grid (`jaxsph.resample`, `jaxsph.IsoSurface`)"
-    )
     level: Float[Array, ""]
-    color: Float[Array, "3"]
-    ambient: Float[Array, ""]
-    segments: Segments | None
+    look: SurfaceLook
     clip: Clip | None
     fault: Int[Array, ""]
     kernel: str
@@ -133,7 +135,8 @@ class ParticleSurface(Medium):
         usable = (level > 0) & jnp.isfinite(level) & jnp.isfinite(color).all() & jnp.isfinite(ambient)
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         fault = faults.raised(faults.BAD_SURFACE, ~usable)
-        return cls(weight_of(level, particles, viewed.live), color, ambient, segments, clip, fault, particles.kernel)
+        look = SurfaceLook(color, ambient, segments)
+        return cls(weight_of(level, particles, viewed.live), look, clip, fault, particles.kernel)
 
     def in_band(self, grid: Grid) -> ParticleSurface:
         """With the particles of a band."""
@@ -148,12 +151,14 @@ class ParticleSurface(Medium):
         return jnp.zeros_like(slabs.z_lower, bool)
 
     def gather(self, task: SlabTask) -> Hit:
-        """Where the rays of slabs first meet the surface, and how it looks there."""
-        if self.ordered is None or self.rank is None:
-            raise ValueError("a surface is asked for without the lists of a band; call `in_band` first")
-        on_borders = dataclasses.replace(task, depth=task.border, between=False, part=None, measured=False)
-        sums = (gather_scattered if task.scattered else gather)(self.ordered, self.rank, on_borders, self.kernel)
-        weight = by_rays(sums)[0]
+        """Where the rays of slabs first meet the surface, and how it looks there.
+
+        Differentiation:
+            As of an implicit function, see `surface_root`. Which rays meet it has none: silhouettes do not move.
+        """
+        on_borders, still = _on_borders(task), lax.stop_gradient(self)
+        sums = gather_scattered if task.scattered else gather
+        weight = by_rays(sums(*still._lists(), lax.stop_gradient(on_borders), self.kernel))[0]
         tasks, _, rays = weight.shape
         nothing = jnp.asarray([jnp.inf, -1, *[0] * 6], weight.dtype)[None, :, None]
 
@@ -161,32 +166,44 @@ class ParticleSurface(Medium):
             rows = self._searched(some, weight[jnp.minimum(items, tasks - 1)])
             return found.at[items].set(rows, mode="drop")
 
-        found = over_groups(search, jnp.broadcast_to(nothing, (tasks, 8, rays)), on_borders, weight >= self.level)
+        found = over_groups(search, jnp.broadcast_to(nothing, (tasks, 8, rays)), on_borders, weight >= still.level)
         return Hit(found[:, 0], found[:, 1].astype(jnp.int32), found[:, 2:5], found[:, 5:])
+
+    def _lists(self) -> tuple[Ordered, Int[Array, " pairs"]]:
+        if self.ordered is None or self.rank is None:
+            raise ValueError("a surface is asked for without the lists of a band; call `in_band` first")
+        return self.ordered, self.rank
+
+    def _rays(self, task: SlabTask) -> Piercing:
+        return Piercing(*self._lists(), task, SlabRays.of(task), self.kernel)
 
     def _searched(self, task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> Float[Array, "tasks 8 rays"]:
         """Rows of `Hit`, of some slabs, given the field on their borders."""
-        assert self.ordered is not None and self.rank is not None
-        rays = Piercing(self.ordered, self.rank, task, SlabRays.of(task), self.kernel)
-        at = jnp.broadcast_to((task.border - rays.lines.middle)[..., None], weight.shape)
-        places, values = self._places(rays, at, weight)
-        inside = values >= self.level
+        still, there = lax.stop_gradient((self, task))
+        rays = still._rays(there)
+        at = jnp.broadcast_to((there.border - rays.lines.middle)[..., None], weight.shape)
+        places, values = still._places(rays, at, weight)
+        inside = values >= still.level
         crossed = inside[:, 1:] != inside[:, :-1]
-        if self.clip is not None:
-            crossed &= self.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
+        if still.clip is not None:
+            crossed &= still.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
         bracket = Bracket(
-            *_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - self.level, values[:, 1:] - self.level)
+            *_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - still.level, values[:, 1:] - still.level)
         )
         number = crossed.shape[1]
         first = jnp.where(crossed, jnp.arange(number, dtype=jnp.int32)[:, None], number).min(1)
         met = first < number
 
         def lit() -> Array:
-            return self._lit(rays, bracket, met)
+            ends, moving = still._narrowed(rays, bracket, met), self._rays(task)
+            root = root_near(moving, ends.secant(), (ends.low, ends.high), self.level)
+            colors, normal = self.look.shade(root.found, moving.ray(), task.entry.references[0][:, None])
+            depth = root.place + moving.lines.middle
+            return jnp.where(met[:, None], jnp.stack([depth, *colors, *normal], 1), 0)
 
         none = jnp.zeros((met.shape[0], 7, met.shape[1]), weight.dtype)
         rows = lax.cond(met.any(), lit, lambda: none)
-        depth = jnp.where(met, rows[:, 0] + rays.lines.middle, jnp.inf)
+        depth = jnp.where(met, rows[:, 0], jnp.inf)
         interval = jnp.where(met, first // 2, -1).astype(weight.dtype)
         return jnp.concatenate([depth[:, None], interval[:, None], rows[:, 1:]], 1)
 
@@ -217,8 +234,8 @@ class ParticleSurface(Medium):
         asked = lax.cond(wanted.any(), lambda: rays.weights(place), lambda: known)
         return place, jnp.where(wanted, asked, known)
 
-    def _lit(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Float[Array, "tasks 7 rays"]:
-        """The depth of the crossing, relative to the middle; colour, and normal."""
+    def _narrowed(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Bracket:
+        """Brackets by false position, of the rays that cross: Newton's step from their secant is to some roundings of a root."""
 
         def goes_on(carry: _Search) -> Array:
             return (carry.number < STEPS) & carry.active.any()
@@ -240,27 +257,8 @@ class ParticleSurface(Medium):
             return _Search(ends, side, active & (jnp.abs(here) > enough), carry.number + 1)
 
         enough = self.level * float(jnp.finfo(self.level.dtype).eps) ** ENOUGH
-        ends = lax.while_loop(goes_on, step, _Search(bracket, jnp.zeros(met.shape, jnp.int32), met, jnp.int32(0))).ends
-        place = ends.secant()
-        found = rays.found(place)
-        ray = rays.lines.slope_u, rays.lines.slope_v, jnp.ones_like(place)
-        slope = sum(of * along for of, along in zip(found.gradient, ray, strict=True))
-        step_on = jnp.where(slope != 0, (self.level - found.weight) / jnp.where(slope != 0, slope, 1), 0)
-        place = jnp.clip(place + step_on, ends.low, ends.high)
-        steepest = jnp.maximum(jnp.maximum(abs(found.gradient[0]), abs(found.gradient[1])), abs(found.gradient[2]))
-        gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
-        length = jnp.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
-        normal = [-of / jnp.where(length > 0, length, 1) for of in gradient]
-        light = headlight(normal, ray, self.ambient)
-        colors = [color * light for color in self._colors(rays.task, found.weight, found.weighted[0])]
-        return jnp.where(met[:, None], jnp.stack([place, *colors, *normal], 1), 0)
-
-    def _colors(self, task: SlabTask, weight: Array, weighted: Array) -> list[Float[Array, "..."]]:
-        """Red, green and blue before they are lit."""
-        if self.segments is None:
-            return list(self.color)
-        quantity = task.entry.references[0][:, None] + jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
-        return read(self.segments, find(self.segments, quantity), COLORS)
+        found: _Search = lax.while_loop(goes_on, step, _Search(bracket, jnp.zeros(met.shape, jnp.int32), met, jnp.int32(0)))
+        return found.ends
 
     def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
         """Opaque where the surface is."""
@@ -287,9 +285,68 @@ class ParticleSurface(Medium):
         """See `Medium.every_other`."""
         return gathered._replace(interval=jnp.where(gathered.interval >= 0, gathered.interval // 2, -1))
 
-    def stops(self, gathered: Hit, task: SlabTask) -> Float[Array, "tasks rays"]:
+    def stops(self, gathered: Hit, task: SlabTask) -> Stops:
         """See `Medium.stops`."""
-        return gathered.depth
+        return gathered.depth, *(gathered.normal[:, k] for k in range(3))  # type: ignore[return-value]
+
+
+    def no_cotangents(self) -> SurfaceCotangents:
+        """None yet."""
+        x = self._lists()[0].x
+        own = jax.tree.map(jnp.zeros_like, dataclasses.replace(self, ordered=None, rank=None))
+        return SurfaceCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own)
+
+    def apart(self, total: SurfaceCotangents) -> tuple[ParticleSurface, dict[str, Float[Array, " particles"]]]:
+        """See `Medium.apart`."""
+        return total.own, columns_of(total.table)
+
+    def pull(  # type: ignore[override]
+        self, total: SurfaceCotangents, gathered: Hit, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[SurfaceCotangents, OfPlaces]:
+        """See `Medium.pull`. Where the borders of slabs are changes no crossing."""
+        met = gathered.interval >= 0
+        (of_color,) = jax.vjp(lambda color: self.met(gathered._replace(color=color), task), gathered.color)[1](cotangents)
+        of_depth, *of_normal = jnp.zeros((4, *met.shape), of_color.dtype) if of_stops is None else of_stops
+        of_hit = jnp.concatenate([of_depth[:, None], of_color, jnp.stack(of_normal, 1)], 1)
+        tasks = met.shape[0]
+
+        def pull_some(items: Array, some: SlabTask, carry: tuple[SurfaceCotangents, Array]) -> tuple[SurfaceCotangents, Array]:
+            here, real = jnp.minimum(items, tasks - 1), (items < tasks)[:, None]
+            of_rows = jnp.where((met[here] & real)[:, None], of_hit[here], 0)
+            return self._pull_some(some, jnp.where(met[here], gathered.depth[here], 0), of_rows, *carry)
+
+        start = total, jnp.zeros((), gathered.depth.dtype)
+        total, factor = over_groups(pull_some, start, _on_borders(task), ~met[:, None])
+        return total, OfPlaces.none(task)._replace(factor=factor)
+
+    def _pull_some(
+        self,
+        task: SlabTask,
+        depth: Float[Array, "tasks rays"],
+        of_rows: Float[Array, "tasks rows rays"],
+        total: SurfaceCotangents,
+        factor: Float[Array, ""],
+    ) -> tuple[SurfaceCotangents, Float[Array, ""]]:
+        """Add what follows from cotangents of depth, colours and normal, of some slabs whose rays meet the surface at a depth."""
+        rays, reference = self._rays(task), task.entry.references[0][:, None]
+        place = depth - rays.lines.middle
+
+        def shaded(look: SurfaceLook, found: Found, factor: Array) -> Array:
+            u, v, forward = rays.ray()
+            colors, normal = look.shade(found, [u * factor, v * factor, forward], reference)
+            return jnp.stack([*colors, *normal], 1)
+
+        pull_shade = jax.vjp(shaded, self.look, rays.found(place), jnp.ones_like(factor))[1]
+        of_look, of_found, of_factor = pull_shade(of_rows[:, 1:])
+        of_root = pull_root(total.table, rays, place, Root(of_rows[:, 0], of_found))
+        look, level = added(total.own.look, of_look), total.own.level + of_root.level
+        own = dataclasses.replace(total.own, look=look, level=level)
+        return SurfaceCotangents(of_root.table, own), factor + of_factor + of_root.factor
+
+
+def _on_borders(task: SlabTask) -> SlabTask:
+    """With samples on the borders of what samples stand for."""
+    return dataclasses.replace(task, depth=task.border, between=False, part=None, measured=False)
 
 
 def _first(crossed: Bool[Array, "tasks places rays"], *of_places: Array) -> list[Float[Array, "tasks rays"]]:

@@ -27,7 +27,7 @@ from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.methods import methods_of
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import COLUMNS, WIDTH, pull_gather
+from jaxsph.engine.field.transposed import WIDTH, pull_gather
 from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_thickness, pull_cover, pull_means
 from jaxsph.model.medium import Medium, OfPlaces
@@ -53,10 +53,6 @@ class ParticleCotangents(NamedTuple):
 
     table: Float[Array, "particles 8"]
     transfer: tuple[Float[Array, "5 points"], ...]
-
-    def columns(self) -> dict[str, Float[Array, " particles"]]:
-        """Of particles, by name."""
-        return {name: self.table[:, k] for k, name in enumerate(COLUMNS)}
 
     def with_transfer(self, more: Iterable[Float[Array, "5 points"]]) -> ParticleCotangents:
         """With more, of all parts of the transfer function."""

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
-from jaxsph.model.medium import LIGHT, Medium, OfPlaces
+from jaxsph.model.medium import LIGHT, Medium, OfPlaces, Stops
 from jaxsph.numerics.trees import tree
 
 
@@ -61,11 +61,6 @@ class Within(Medium):
     def stops_rays(self) -> bool:  # type: ignore[override]
         """As the medium."""
         return self.medium.stops_rays
-
-    @property
-    def no_derivatives(self) -> str | None:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.no_derivatives
 
     @property
     def dtype(self) -> Any:
@@ -132,7 +127,7 @@ class Within(Medium):
         """Of what is inside, where the medium knows of parts; else all that the medium misses."""
         return self.medium.missed(gathered, self._task(task, self._part(task)))
 
-    def stops(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks rays"]:
+    def stops(self, gathered: Any, task: SlabTask) -> Stops:
         """Those of the medium: where it is not shown, no sample counts."""
         return self.medium.stops(gathered, task)
 

@@ -5,6 +5,7 @@
 | `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color`, see `scene_linear` |
 | `A` | `1 - transmittance` |
 | `Z` | view depth where transmittance falls to 1/2, inf where it never does |
+| `N.x` `N.y` `N.z` | normal of the surface of particles in the world, 0 where none is met; of scenes with one |
 | `error.bound` | largest difference to the reference image that a pixel can have |
 | `work.evaluations` | kernel evaluations spent on the pixel |
 
@@ -37,6 +38,7 @@ SOURCE = "OpenEXR"
 VERSION_KEY = "jaxsph.version"
 FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
 """Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
+NORMAL = "N.x", "N.y", "N.z"
 RESERVED = (
     "channels", "chromaticities", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
@@ -60,6 +62,8 @@ def write(path: Path, image: Image) -> None:
         "error.bound": image.error_bound,
         "work.evaluations": image.evaluations,
     }
+    if image.normal is not None:
+        layers |= {name: image.normal[..., i] for i, name in enumerate(NORMAL)}
     write_layers(path, layers, {**_attributes(image), **windows, **header_of(displayed=bool(windows))})
 
 
@@ -93,6 +97,7 @@ def read(path: Path) -> Image:
             faults=int(metadata.get("faults") or 0),
             stats={},
             metadata=tuple(metadata.items()),
+            normal=jnp.stack([jnp.asarray(layers[name]) for name in NORMAL], -1) if set(NORMAL) <= set(layers) else None,
         )
 
 

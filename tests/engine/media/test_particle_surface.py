@@ -12,34 +12,18 @@ import pytest
 from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
-from surfaced import crossing
+from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
 
-WIDTH, HEIGHT, SPACING, AMBIENT = 16, 14, 0.1, 0.2
+WIDTH, HEIGHT, AMBIENT = 16, 14, 0.2
 SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32
 GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
-NEAR, FAR = 1.2, 3.2
 
 
-def camera(projection="perspective", eye=(0.35, 0.45, -2.1), near=NEAR, **more):
-    where = {"eye": eye, "target": (0.0, 0.0, 0.0), "width": WIDTH, "height": HEIGHT, "near": near, "far": FAR} | more
-    if projection == "orthographic":
-        return js.Camera.orthographic(**where, view_height=1.3)
-    return js.Camera.look_at(**where, fov_degrees=35.0)
-
-
-def ball(kernel="cubic_spline", dtype=np.float32, spread=0.2, seed=3):
-    """Jittered particles in a ball, with supports that vary."""
-    rng = np.random.default_rng(seed)
-    steps = (np.arange(9) - 4) * SPACING
-    position = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(-1, 3)
-    position = position[np.linalg.norm(position, axis=1) < 0.4]
-    position = position + rng.uniform(-0.01, 0.01, position.shape)
-    support = 0.2 * rng.uniform(1 - spread, 1 + spread, len(position))
-    columns = (one.astype(dtype) for one in (position, support, position[:, 0], np.full(len(position), SPACING**3)))
-    return js.Particles.from_arrays(*columns, kernel)
+def camera(projection="perspective", **more):
+    return view_of_ball(projection, WIDTH, HEIGHT, **more)
 
 
 def check(scene, view, settings=SETTINGS, close=CLOSE, within=None):
@@ -69,11 +53,15 @@ def test_a_ball_is_in_its_place_without_holes_and_lit_by_its_gradient(projection
     look = js.TransferFunction.from_points([-0.5, 0.5], [[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]], [1.0, 1.0])
     surface = js.Surface(0.45, smoothing=smoothing, ambient=AMBIENT)
     scene = js.Scene(particles=ball(kernel), transfer=look, surface=surface)
-    image, truth, both = check(scene, camera(projection), dataclasses.replace(SETTINGS, integrator=integrator))
+    view = camera(projection)
+    image, truth, both = check(scene, view, dataclasses.replace(SETTINGS, integrator=integrator))
     share = (truth.quantity + 0.5)[..., None]
     wanted = np.array([0.1, 0.5, 0.9]) * (1 - share) + np.array([0.9, 0.5, 0.1]) * share
     wanted = wanted * (AMBIENT + (1 - AMBIENT) * truth.facing)[..., None]
     np.testing.assert_allclose(np.asarray(image.color)[both], wanted[both], atol=1e-3)
+    in_view = np.asarray(image.normal, np.float64) @ np.asarray(view.axes, np.float64).T
+    np.testing.assert_allclose(in_view[both], truth.normal[both], atol=1e-3)
+    np.testing.assert_array_equal(in_view[np.isinf(truth.depth)], 0)
     np.testing.assert_array_equal(np.asarray(image.color)[np.isinf(truth.depth)], 0)
     assert image.stats["evaluations"] > 0
 
@@ -176,18 +164,6 @@ def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, 
     assert alone.any() and np.isfinite(depth[alone]).all()
     nothing = most.sum(-1) < (1 - GRAZED) * float(scene.surface.level)
     assert np.isinf(depth[nothing]).all()
-
-
-def test_a_derivative_is_refused_by_name():
-    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45)), camera()
-    plan = js.plan(scene, view, SETTINGS)
-
-    def light(position):
-        moved = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, position=position))
-        return js.render(moved, view, SETTINGS, plan=plan).color.sum()
-
-    with pytest.raises(NotImplementedError, match=r"Scene\(surface=\.\.\.\).*has no derivatives yet; leave the surface out"):
-        jax.eval_shape(jax.grad(light), scene.particles.position)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,110 @@
+"""Where a ray meets a surface, its normal and its light have the derivatives of an implicit function, in both modes."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import AGREE, QUICKLY, along, still, stepped
+from surfaced import ball, view_of_ball
+
+import jaxsph as js
+
+STEP = 1e-6  # of a difference: so small that no other ray meets the surface
+CLOSE = 1e-6  # of the sum of a slope's terms
+MOVED = ("position", "support", "quantity", "volume", "level", "smoothing", "color", "ambient", "eye", "axes", "half_height")
+
+
+def interior(depth):
+    """Rays whose neighbours meet the surface as well: silhouettes do not move in derivatives."""
+    met = np.isfinite(np.asarray(depth))
+    inner = met.copy()
+    for shift in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        inner &= np.roll(met, shift, (0, 1))
+    return inner
+
+
+def fog():
+    """A sheet of points in front of the ball."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 4), np.linspace(-0.4, 0.4, 4)), -1).reshape(-1, 2)
+    position = np.concatenate([grid, np.full((16, 1), -0.7)], 1)
+    return js.Points.from_arrays(position, np.full(16, 0.2), np.full((16, 3), 0.6), np.full(16, 1.0))
+
+
+def directions(inputs, rng):
+    """Named directions: each moves one part of the particles, the surface or the camera, as a share of it."""
+    for name in MOVED:
+        zero = list(still(inputs))
+        for k, part in enumerate(inputs):
+            if name in vars(part):
+                value = getattr(part, name)
+                size = 1 if name in ("position", "quantity", "eye", "axes") else value
+                move = size * jnp.asarray(rng.normal(size=np.shape(value)))
+                zero[k] = copy.copy(zero[k])
+                object.__setattr__(zero[k], name, move)  # a direction is not checked as a level is
+        yield name, tuple(zero)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "projection", "integrator", "coloured", "fogged"),
+    [
+        ("cubic_spline", "perspective", "samples", True, False),
+        pytest.param("poly6", "orthographic", "segments", False, False, marks=pytest.mark.slow),
+        pytest.param("wendland_c2", "perspective", "samples", False, True, marks=pytest.mark.slow),
+    ],
+)
+def test_both_modes_are_central_differences(kernel, projection, integrator, coloured, fogged, x64):
+    look = js.TransferFunction.from_points(np.array([-0.5, 0.5]), np.array([[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]]), np.ones(2))
+    camera = view_of_ball(projection, dtype=np.float64)
+    numbers = {"level": 0.45, "smoothing": 1.1, "color": np.array([0.4, 0.6, 0.8]), "ambient": 0.3}
+    surface = js.Surface(**{name: jnp.asarray(value, jnp.float64) for name, value in numbers.items()})
+    scene = js.Scene(
+        particles=ball(kernel, np.float64),
+        surface=surface,
+        transfer=look if coloured else None,
+        points=fog() if fogged else None,
+    )
+    settings = js.Settings(samples=40, integrator=integrator)
+    plan = js.plan(scene, camera, settings)
+    inner, rng = interior(js.render(scene, camera, settings, plan=plan).depth), np.random.default_rng(5)
+    weights = [jnp.asarray(rng.normal(size=(*inner.shape, 7)) * inner[..., None])]
+
+    def total(inputs):
+        particles, surface, camera = inputs
+        image = js.render(dataclasses.replace(scene, particles=particles, surface=surface), camera, settings, plan=plan)
+        depth = jnp.where(jnp.isfinite(image.depth), image.depth, 0)[..., None]
+        return (jnp.concatenate([image.color, image.normal, depth], -1) * weights[0]).sum()
+
+    @jax.jit
+    def looked(inputs, move):
+        return *jax.jvp(total, (inputs,), (move,)), jax.grad(total, allow_int=True)(inputs)
+
+    compiled = looked.lower(inputs := (scene.particles, surface, camera), still(inputs)).compile(QUICKLY)
+    gradient, checked = compiled(inputs, still(inputs))[2], 0
+    for name, move in directions(inputs, rng):
+        _, pushed, _ = compiled(inputs, move)
+        ahead, behind = (compiled(stepped(inputs, move, by), still(inputs))[0] for by in (STEP, -STEP))
+        pulled, size = along(gradient, move)
+        assert abs(float(ahead - behind) / (2 * STEP) - float(pushed)) <= CLOSE * max(size, 1), name
+        assert abs(pulled - float(pushed)) <= 1e3 * AGREE * max(size, 1), name
+        checked += size > 1e-3
+    assert checked >= 9 - coloured  # what a transfer function colours has no colour of its own
+
+
+def test_without_an_outer_jit_a_gradient_is_that_of_forward_mode(x64):
+    """Backward, depths are found again by another program, and rounded otherwise."""
+    scene = js.Scene(particles=ball(dtype=np.float64), surface=js.Surface(0.45))
+    camera, settings = view_of_ball(dtype=np.float64), js.Settings(samples=40)
+    plan = js.plan(scene, camera, settings)
+
+    def seen(level):
+        image = js.render(dataclasses.replace(scene, surface=js.Surface(level)), camera, settings, plan=plan)
+        return jnp.where(jnp.isfinite(image.depth), image.depth, 0).sum() + (image.normal[..., 2] ** 2).sum()
+
+    level = jnp.asarray(0.45, jnp.float64)
+    pushed = jax.jvp(seen, (level,), (jnp.ones_like(level),))[1]
+    np.testing.assert_allclose(float(jax.grad(seen)(level)), float(pushed), rtol=1e-9)
