@@ -69,8 +69,9 @@ def render(
         `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
         camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
         grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
-        memory does not grow with samples or particles in a cell. Images with super-pixels, of the pilot estimator or of
-        surfaces of particles have no derivatives and raise `NotImplementedError`, as do second derivatives.
+        memory does not grow with samples or particles in a cell. Of a surface of particles `normal` has derivatives as well,
+        and so has `depth` where a ray ends at it; which rays meet it is held fixed, so silhouettes do not move. Images with
+        super-pixels or of the pilot estimator have no derivatives and raise `NotImplementedError`, as do second derivatives.
 
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,

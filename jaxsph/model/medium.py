@@ -39,8 +39,8 @@ class OfPlaces(NamedTuple):
 
 
 Stops = tuple[Array, Array, Array, Array]
-"""Where rays end at something opaque: view depths, infinite where they do not; and x, y and z of its normal in view space, of unit
-length and out of it, 0 where there is none."""
+"""Where rays end at something opaque: view depths, infinite where they do not; and x, y and z of its normal in view space, of
+unit length and out of it, 0 where there is none."""
 
 
 class Medium(abc.ABC):
@@ -190,7 +190,7 @@ class Medium(abc.ABC):
         return added(total, of_medium), of_places
 
     def apart(self, total: Any) -> tuple[Any, dict[str, Array]]:
-        """What was added up as cotangents of the medium's leaves, and of the grid's particles by name; by default none of these."""
+        """What was added up: cotangents of the medium's leaves, and of the grid's particles by name, by default of none."""
         return total, {}
 
 

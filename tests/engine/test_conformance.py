@@ -43,6 +43,9 @@ TABLE = [
     Row("surface", "box", "segments", "pixels"),
     Row("surface", "~sphere", "samples", "quadtree"),
     Row("surface", "plane & ~sphere", "segments", "pixels"),
+    Row("fluid", "plane", "samples", "pixels", "wendland_c2"),
+    Row("fluid", "sphere", "segments", "pixels"),
+    Row("fluid", "~sphere", "samples", "quadtree", "cubic_spline"),
     Row("all together", "everywhere", "samples", "pixels", "wendland_c2"),
     Row("all together", "plane & ~sphere", "segments", "pixels", "cubic_spline"),
     Row("all together", "sphere", "segments", "quadtree", "poly6"),
@@ -124,7 +127,7 @@ def figures(row, frames, options):
 def check_figures(row, found):
     assert found["size"] > 1e-2
     assert found["alike"] <= ALIKE
-    assert found["difference"] <= (OF_SURFACES if row.media in ("surface", "all together") else DIFFERENCE)
+    assert found["difference"] <= (OF_SURFACES if row.media in ("surface", "fluid", "all together") else DIFFERENCE)
     assert abs(found["empty"]) <= ROUNDING and found["finite"]
 
 
@@ -195,9 +198,6 @@ REFUSED = [
     (Row("points", "sphere", **STEPS), "jit", ValueError, r"`Scene\(points=\.\.\.\)` cannot answer; put it into an octree"),
     (Row("surface", **STEPS), "jit", ValueError, "`IsoSurface` cannot answer; leave that out"),
     (Row("fluid", **STEPS), "jit", ValueError, r"asks media for points, and `Scene\(surface=\.\.\.\)` lies between them"),
-    (Row("fluid", "plane"), "grad", NotImplementedError, r"`Scene\(surface=\.\.\.\)`\) has no derivatives yet"),
-    (Row("fluid", "sphere", "segments"), "grad", NotImplementedError, r"`Scene\(surface=\.\.\.\)`\) has no derivatives yet"),
-    (Row("fluid", "sphere", "samples", "quadtree"), "grad", NotImplementedError, "has no derivatives yet"),
     (Row("volume", "plane", **STEPS), "grad", NotImplementedError, "step_doubling"),
 ]
 

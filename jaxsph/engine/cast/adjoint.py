@@ -324,14 +324,16 @@ class _Backward:
         return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
 
     def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
-        """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what their medium gathers there."""
+        """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what is gathered there."""
         task = self.batches.task(items)
         gathered = self.medium.gather(task)
         light = self.integrator(self.medium, gathered, task)
         stops = self.medium.stops(gathered, task) if self.medium.stops_rays else ()
         return (*light.color, light.transmittance, *stops), gathered
 
-    def pull_slabs(self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated) -> Accumulated:
+    def pull_slabs(
+        self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated
+    ) -> Accumulated:
         """Add what follows from the cotangents of a chunk of slabs, see `replay.pull_composite`."""
         task = self.batches.task(items)
         through = functools.partial(self.pull_integrator, gathered, task, of_slabs)

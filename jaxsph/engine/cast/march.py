@@ -34,8 +34,8 @@ class RayResult:
     `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
     ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
     `cut` is how many slabs they left out, whatever those would have taken. `stop` are the depths at which rays first end at
-    something opaque, infinite where they do not, and x, y and z of its normal, in view space before `adjoint.cast` and in the world
-    after; None where nothing is.
+    something opaque, infinite where they do not, and x, y and z of its normal, in view space until `adjoint.cast` turns them into
+    the world; None where nothing is.
     """
 
     color: Float[Array, "3 packets rows columns"]

@@ -168,7 +168,8 @@ class Piercing:
         task = self.task
 
         def rows(columns: tuple[Array, ...], factor: Array) -> Array:
-            block = Block(*columns[:5], columns[5:])
+            x, y, z, scale, size, *quantities = columns
+            block = Block(x, y, z, scale, size, tuple(quantities))
             lines = SlabRays.of(dataclasses.replace(task, u=task.u * factor, v=task.v * factor))
             return self._rows(block, self._passed(block, lines), lines, place)
 
@@ -186,7 +187,9 @@ class Piercing:
 
         return lax.fori_loop(0, self._blocks(), put, (table, jnp.zeros((), place.dtype)))
 
-    def _rows(self, block: Block, passed: Passed, lines: SlabRays, place: Float[Array, "tasks rays"]) -> Float[Array, "rows tasks rays"]:
+    def _rows(
+        self, block: Block, passed: Passed, lines: SlabRays, place: Float[Array, "tasks rays"]
+    ) -> Float[Array, "rows tasks rays"]:
         """What a block adds to what is `found`."""
         smooth, size, scale = kernels.by_name(self.kernel), block.size[..., None], block.scale[..., None]
         rest = (place[:, None] - passed.foot) ** 2 * passed.rate

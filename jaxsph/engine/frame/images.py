@@ -70,7 +70,8 @@ def traced_image_of(drawn: Drawn, settings: Settings, plan: Plan) -> Image:
 def _image(drawn: Drawn, settings: Settings, plan: Plan) -> tuple[Image, Any]:
     """The layers as an image, and its fault word."""
     layers: Layers = drawn.layers
-    image = Image(*layers[:3], layers.bound, layers.evaluations, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
+    of_pixels = *layers[:3], layers.bound, layers.evaluations
+    image = Image(*of_pixels, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:
         image = with_ended_rays(image, settings)
     return image, drawn.faults | missed(image, settings)

@@ -289,7 +289,6 @@ class ParticleSurface(Medium):
         """See `Medium.stops`."""
         return gathered.depth, *(gathered.normal[:, k] for k in range(3))  # type: ignore[return-value]
 
-
     def no_cotangents(self) -> SurfaceCotangents:
         """None yet."""
         x = self._lists()[0].x

@@ -3,8 +3,8 @@ r"""What a ray finds where it crosses a surface, as a function of the particles 
 Flow: bracket -> [surface_root: root -> field -> light] -> particle_surface; cotangents -> [surface_root] -> particles.
 
 With F the field, p all that it depends on, and t the depth of a crossing, $F(t, p) = c$ makes t a function of p and c whose
-derivatives are those of one step of Newton's with its slope held fixed, $dt = (dc - F_p \, dp) / F_t$. What is found there, field,
-gradient and quantities G, moves by $G_p \, dp + G_t \, dt$. So however the root was found, only the place counts.
+derivatives are those of one step of Newton's with its slope held fixed, $dt = (dc - F_p \, dp) / F_t$. What is found there, G
+(field, gradient and quantities), moves by $G_p \, dp + G_t \, dt$. So however the root was found, only the place counts.
 
 Backward, $\bar G$ gives the place the cotangent $\bar t + \bar G \cdot G_t$, and the field takes minus that over $F_t$: what is
 found then has the cotangents of particles at a place that stays, in one more pass over them.
@@ -84,9 +84,7 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
     return found.gradient[0] * ray[0] + found.gradient[1] * ray[1] + found.gradient[2] * ray[2]
 
 
-def root_near(
-    rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""]
-) -> Root:
+def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""]) -> Root:
     """The root that a place is near to, by a step of Newton's, and what is found there.
 
     Args:
@@ -103,9 +101,7 @@ def root_near(
     return Root(root, rays.found(root))
 
 
-def pull_root(
-    table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root
-) -> OfRoot:
+def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
     """Cotangents of all that a root depends on, from those of the root; 0 where the field has no slope along the ray."""
     _, moved = jax.jvp(rays.found, (place,), (jnp.ones_like(place),))
     of_found = cotangents.found

@@ -36,6 +36,9 @@ class Surface:
     **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding: see
     `jaxsph.engine.media.particle_surface`, which says what of thin parts is found between samples, and what is an estimate.
 
+    **Derivatives** by positions, supports, volumes, quantities, level, smoothing and camera are those of an implicit function, of
+    depth, normal and colour alike. Silhouettes have none: a ray that stops meeting the surface is not foreseen.
+
     Nothing closes a fluid where a clip cuts it or a ray begins in it: there the first crossing is where the ray leaves it.
 
     Attributes:
