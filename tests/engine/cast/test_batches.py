@@ -53,6 +53,10 @@ def task_of(schedule, items, list_id=None, **how):
     return found.task(items), found.borders(items)
 
 
+def first(number, tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:number], tree)
+
+
 def batches_with_chunks(schedule, list_id=None):
     """Every batch with the items of its chunks, without dummies."""
     nth, number = 0, 1
@@ -102,7 +106,7 @@ def test_packets_keep_the_schedule_of_the_bundle_whose_list_they_read():
     for _, chunks in batches_with_chunks(schedule, list_id):
         items = np.concatenate(chunks)
         padded = np.pad(items, (0, PLAN.batch_slabs - len(items)), mode="edge")  # of one length, which share a program
-        task, _ = jax.tree.map(lambda leaf, number=len(items): np.asarray(leaf)[:number], task_of(schedule, padded, list_id))
+        task = first(len(items), task_of(schedule, padded, list_id)[0])
         np.testing.assert_array_equal(task.slab, items // len(list_id))
         np.testing.assert_array_equal(task.bundle, list_id[items % len(list_id)])
         np.testing.assert_array_equal(task.entry.count, np.asarray(schedule.count)[task.slab, task.bundle])

@@ -16,6 +16,8 @@ from surfaced import crossing
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 WIDTH, HEIGHT, SPACING, AMBIENT = 16, 14, 0.1, 0.2
 SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32
