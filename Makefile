@@ -7,8 +7,9 @@ PYTHON ?=
 # Processes that share the suite, what is left going to whichever is idle; 0 runs all in one.
 JOBS ?= 2
 PYTEST_ARGS ?=
-# With this JAX compiles once what several tests or benchmarks compile, in any process, as long as the folder is there.
-SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.1 JAX_COMPILATION_CACHE_DIR
+# With this JAX compiles once what several tests or benchmarks compile, in any process, as long as the folder is there: single
+# operations, too, thousands of which take a thirtieth of a second each.
+SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
 .PHONY: setup check test test-slow test-slow-share test-nightly test-endurance notebooks lint format demo results clean

@@ -1,11 +1,13 @@
 """What an image says of itself: after a fault nothing is certified, and no error is told that is not known."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from examples import examples
 from forced import ran
 from hypothesis import given
@@ -25,7 +27,7 @@ def drawn(frames):
     scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
     plan = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, list_capacity=96))
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
     def draw(grown, change, at):
         particles = dataclasses.replace(scene.particles, support=scene.particles.support * grown)
         look = dataclasses.replace(scene.transfer, colors=scene.transfer.colors.at[at, 0].add(change))
@@ -124,15 +126,17 @@ _BY_TOLERANCE = jax.jit(
         scene, camera, js.Settings(samples=samples, tolerance=tolerance), plan=plan
     ),
     static_argnums=4,
+    compiler_options=QUICKLY,
 )
 
 
 def test_only_point_samples_know_their_error_at_full_rate(frames):
     rng = np.random.default_rng(1)
     scene, camera = frames.scene(rng), frames.camera(rng)
-    reference = js.render(scene, camera, frames.settings)
+    reference = js.render(scene, camera, frames.settings, plan=frames.plan())
     assert reference.certified and (np.asarray(reference.error_bound) == 0).all()
-    image = js.render(scene, camera, dataclasses.replace(frames.settings, integrator="segments"))
+    plan = dataclasses.replace(frames.plan(), integrator="segments")
+    image = js.render(scene, camera, dataclasses.replace(frames.settings, integrator="segments"), plan=plan)
     assert not image.certified and np.isnan(image.error_bound).all() and not image.faults
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -58,9 +59,16 @@ def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES
     strength = np.asarray(p.volume, np.float64)[real] / reach**3
     quantity, kernel = np.asarray(p.quantity, np.float64)[real], kernels.by_name(p.kernel)
 
-    def weights(place: np.ndarray) -> np.ndarray:
-        square = ((place[..., None, :] - view) ** 2).sum(-1) / reach**2
-        return strength * kernel.norm * kernel.of_square(square, np)
+    def weights(place: np.ndarray, some: np.ndarray) -> np.ndarray:
+        square = ((place[..., None, :] - view[some]) ** 2).sum(-1) / reach[some] ** 2
+        return strength[some] * kernel.norm * kernel.of_square(square, np)
+
+    def beside(ray: np.ndarray) -> np.ndarray:
+        """Particles that a ray comes so near to that places on it, or a little off it, may lie in their supports."""
+        start, end = (at(ray, depth) for depth in (0.0, 1.0))
+        way = (end - start) / np.linalg.norm(end - start)
+        away = (view - start) - ((view - start) @ way)[:, None] * way
+        return np.flatnonzero(np.linalg.norm(away, axis=1) <= reach + 0.01 * reach.min())
 
     u, v = (np.asarray(axis, np.float64) for axis in _axes(camera))
     rays = np.stack(np.broadcast_arrays(u[None, :], v[:, None], np.ones((len(v), len(u)))), -1).reshape(-1, 3)
@@ -74,18 +82,23 @@ def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES
             else np.concatenate([np.broadcast_to(ray[:2], (*depth.shape[:-1], 2)), depth], -1)
         )
 
-    found = [_of_ray(at, ray, depths, weights, level, within, camera) for ray in rays]
+    some = [beside(ray) for ray in rays]
+    found = [
+        _of_ray(at, ray, depths, functools.partial(weights, some=near), level, within, camera)
+        for ray, near in zip(rays, some, strict=True)
+    ]
     depth, clearance = (np.array([one[k] for one in found]) for k in (0, 1))
     normal, facing, carried = np.zeros((len(rays), 3)), np.ones(len(rays)), np.zeros(len(rays))
     for k, (ray, t) in enumerate(zip(rays, depth, strict=True)):
         if not np.isfinite(t):
             continue
         place, step = at(ray, t), 1e-5 * reach.min()
-        slopes = [(weights(place + e).sum() - weights(place - e).sum()) / (2 * step) for e in step * np.eye(3)]
+        here, near = functools.partial(weights, some=some[k]), some[k]
+        slopes = [(here(place + e).sum() - here(place - e).sum()) / (2 * step) for e in step * np.eye(3)]
         normal[k] = -np.array(slopes) / np.linalg.norm(slopes)
         way = ray if camera.is_perspective else np.array([0.0, 0.0, 1.0])
         facing[k] = abs(normal[k] @ way) / np.linalg.norm(way)
-        carried[k] = (weights(place) * quantity).sum() / weights(place).sum()
+        carried[k] = (here(place) * quantity[near]).sum() / here(place).sum()
     shape = len(v), len(u)
     return Crossing(*(one.reshape(*shape, *one.shape[1:]) for one in (depth, clearance, normal, facing, carried)))
 

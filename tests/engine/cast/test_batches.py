@@ -1,11 +1,14 @@
 """Batches: every filled slab is marched once, those of a chunk are about as full, and samples sit where the contract says."""
 
 import dataclasses
+import functools
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 from jaxsph.engine.access.slab_windows import MAX_LEVEL
 from jaxsph.engine.cast.batches import CastPlan, batches_of
@@ -27,30 +30,51 @@ def schedule_of(rng, level=None, painted=None):
     return SlabSchedule(*(jnp.asarray(column) for column in columns), (reference,), painted, paint)
 
 
-def batches(schedule, samples=SLABS * 4 - 1, list_id=None, on_borders=False):
+def batches(schedule, list_id=None, samples=SLABS * 4 - 1, on_borders=False):
     grid = types.SimpleNamespace(half_steps=jnp.arange(2 * samples + 1, dtype=jnp.float32) / 2, samples=samples)
     number = BUNDLES if list_id is None else len(list_id)
     u, v = jnp.arange(3.0 * number).reshape(3, number), -jnp.arange(2.0 * number).reshape(2, number)
     return batches_of(grid, schedule, RayPackets(u, v, list_id), PLAN, True, on_borders)
 
 
-def chunks_of(found, batch):
-    """Items of the chunks of a batch, without dummies."""
-    chunks = []
-    for nth in range(int(batch.chunks)):
-        items, begin = found.chunk(batch, jnp.int32(nth))
-        assert int(begin) == nth * PLAN.chunk
-        chunks.append(np.asarray(items)[np.asarray(items) < found.schedule.count.size])
-        assert chunks[-1].size, "no chunk is marched for nothing"
-    return chunks
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def nth_batch(schedule, nth, list_id):
+    """How many batches and packets there are; one batch; and items of as many chunks as it can have, and where they begin."""
+    found = batches(schedule, list_id)
+    batch = found.batch(nth)
+    every = jnp.arange(found.num_slots // PLAN.chunk, dtype=jnp.int32)
+    return found.number, found.num_packets, vars(batch), jax.vmap(functools.partial(found.chunk, batch))(every)
+
+
+@functools.partial(jax.jit, static_argnames=("samples", "on_borders"), compiler_options=QUICKLY)
+def task_of(schedule, items, list_id=None, **how):
+    """What is to be done for items, and the borders of their samples."""
+    found = batches(schedule, list_id, **how)
+    return found.task(items), found.borders(items)
+
+
+def first(number, tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:number], tree)
+
+
+def batches_with_chunks(schedule, list_id=None):
+    """Every batch with the items of its chunks, without dummies."""
+    nth, number = 0, 1
+    while nth < number:
+        number, packets, batch, (items, begin) = jax.tree.map(np.asarray, nth_batch(schedule, np.int32(nth), list_id))
+        assert packets == (BUNDLES if list_id is None else len(list_id))
+        batch, used = types.SimpleNamespace(**batch), batch["chunks"]
+        np.testing.assert_array_equal(begin[:used], PLAN.chunk * np.arange(used))
+        chunks = [chunk[chunk < SLABS * packets] for chunk in items[:used]]
+        assert all(chunk.size for chunk in chunks), "no chunk is marched for nothing"
+        yield batch, chunks
+        nth += 1
 
 
 def test_every_filled_slab_is_in_one_chunk():
-    schedule = schedule_of(np.random.default_rng(0))
-    found, seen = batches(schedule), []
-    for nth in range(int(found.number)):
-        batch = found.batch(jnp.int32(nth))
-        number, of_batch = int(batch.number), np.concatenate(chunks_of(found, batch))
+    schedule, seen = schedule_of(np.random.default_rng(0)), []
+    for batch, chunks in batches_with_chunks(schedule):
+        number, of_batch = int(batch.number), np.concatenate(chunks)
         np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
         blocks = -(-np.asarray(schedule.count).ravel()[of_batch] // BLOCK)
         assert (np.diff(blocks) <= 0).all()
@@ -64,12 +88,12 @@ def test_chunks_hold_slabs_of_one_method():
     method = rng.integers(0, NUM_METHODS, schedule.count.shape)
     level = jnp.asarray(np.maximum(method - INTERPOLATED, 0), jnp.int32)
     count = jnp.where(method >= INTERPOLATED, 0, schedule.count)
-    found, seen = batches(dataclasses.replace(schedule, count=count, level=level, method=jnp.asarray(method, jnp.int32))), []
-    for nth in range(int(found.number)):
-        batch = found.batch(jnp.int32(nth))
+    schedule = dataclasses.replace(schedule, count=count, level=level, method=jnp.asarray(method, jnp.int32))
+    seen = []
+    for batch, chunks in batches_with_chunks(schedule):
         number = int(batch.number)
         np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
-        for items in chunks_of(found, batch):
+        for items in chunks:
             assert len(set(method.ravel()[items])) == 1
             assert (np.diff(-(-np.asarray(count).ravel()[items] // BLOCK)) <= 0).all()
             seen += items.tolist()
@@ -78,11 +102,11 @@ def test_chunks_hold_slabs_of_one_method():
 
 def test_packets_keep_the_schedule_of_the_bundle_whose_list_they_read():
     schedule, list_id = schedule_of(np.random.default_rng(4)), np.array([3, 3, 0, 12, 7])
-    found, seen = batches(schedule, list_id=jnp.asarray(list_id)), []
-    assert found.num_packets == len(list_id)
-    for nth in range(int(found.number)):
-        items = np.concatenate(chunks_of(found, found.batch(jnp.int32(nth))))
-        task = found.task(jnp.asarray(items))
+    seen = []
+    for _, chunks in batches_with_chunks(schedule, list_id):
+        items = np.concatenate(chunks)
+        padded = np.pad(items, (0, PLAN.batch_slabs - len(items)), mode="edge")  # of one length, which share a program
+        task = first(len(items), task_of(schedule, padded, list_id)[0])
         np.testing.assert_array_equal(task.slab, items // len(list_id))
         np.testing.assert_array_equal(task.bundle, list_id[items % len(list_id)])
         np.testing.assert_array_equal(task.entry.count, np.asarray(schedule.count)[task.slab, task.bundle])
@@ -94,36 +118,36 @@ def test_packets_keep_the_schedule_of_the_bundle_whose_list_they_read():
 
 @pytest.mark.parametrize("level", range(MAX_LEVEL + 1))
 def test_a_coarse_sample_sits_in_the_middle_of_its_window(level):
-    found = batches(schedule_of(np.random.default_rng(1), level))
-    task = found.task(jnp.arange(BUNDLES))
+    task, borders = task_of(schedule_of(np.random.default_rng(1), level), np.arange(BUNDLES))
     windows = np.arange(PLAN.slab_samples + 1) * 2**level
     last = SLABS * 4 - 1
     np.testing.assert_array_equal(task.border[0], np.minimum(windows, last))
     np.testing.assert_array_equal(task.depth[0], np.minimum(windows[:-1] + 2**level / 2, last))
-    np.testing.assert_array_equal(found.borders(jnp.arange(BUNDLES)), task.border)
+    np.testing.assert_array_equal(borders, task.border)
 
 
 @pytest.mark.parametrize("level", range(MAX_LEVEL + 1))
 def test_samples_on_borders_hold_both_ends(level):
     """So that the last of a slab is the first of the next."""
-    task = batches(schedule_of(np.random.default_rng(1), level), on_borders=True).task(jnp.arange(BUNDLES))
+    task, _ = task_of(schedule_of(np.random.default_rng(1), level), np.arange(BUNDLES), on_borders=True)
     np.testing.assert_array_equal(task.depth, task.border)
     np.testing.assert_array_equal(task.depth[0], np.minimum(np.arange(PLAN.slab_samples + 1) * 2**level, SLABS * 4 - 1))
 
 
 def test_a_super_pixel_is_one_sample_as_long_as_a_cell():
-    task = batches(schedule_of(np.random.default_rng(2), MAX_LEVEL, painted=True)).task(jnp.arange(BUNDLES))
+    task, _ = task_of(schedule_of(np.random.default_rng(2), MAX_LEVEL, painted=True), np.arange(BUNDLES))
     np.testing.assert_array_equal(task.border[0], [0, *[1 << MAX_LEVEL] * PLAN.slab_samples])
 
 
 def test_what_lies_past_the_last_sample_has_no_length():
-    task = batches(schedule_of(np.random.default_rng(3)), samples=SLABS * 4 - 3).task((SLABS - 1) * BUNDLES + jnp.arange(BUNDLES))
+    last = (SLABS - 1) * BUNDLES + np.arange(BUNDLES)
+    task, _ = task_of(schedule_of(np.random.default_rng(3)), last, samples=SLABS * 4 - 3)
     np.testing.assert_array_equal(np.diff(np.asarray(task.border), axis=1)[0], [1, 0, 0, 0])
 
 
 def test_a_dummy_has_no_particles_and_no_length():
-    task = batches(schedule_of(np.random.default_rng(3))).task(jnp.full(2, SLABS * BUNDLES))
-    assert not task.entry.length.any() and not task.entry.count.any()
+    task, _ = task_of(schedule_of(np.random.default_rng(3)), np.full(2, SLABS * BUNDLES))
+    assert not np.asarray(task.entry.length).any() and not np.asarray(task.entry.count).any()
     assert not np.diff(np.asarray(task.border), axis=1).any()
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,8 +50,13 @@ def test_depth_is_found_in_all_bundles_that_cross_however_many(crossing, tuning)
     border, each = jnp.asarray([1.0, 1.5, 2.5, 4.0, 4.25]), jnp.arange(bundles)
     starts, together = jnp.asarray([0, bundles], jnp.int32), Together.of(bundles, tuning)
     batch = Batch(each, each, each, jnp.int32(0), jnp.int32(bundles), jnp.int32(1))
-    rays = fresh_rays(bundles, RAYS, jnp.float32, together)
-    state = composite(rays, light, batch, lambda place: jnp.tile(border, (place.size, 1)), starts, together)
+
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def composited(light):
+        rays = fresh_rays(bundles, RAYS, jnp.float32, together)
+        return composite(rays, light, batch, lambda place: jnp.tile(border, (place.size, 1)), starts, together)
+
+    state = composited(light)
     behind = np.cumsum(np.concatenate([np.zeros((bundles, 1, RAYS)), thickness], 1), 1)
     wanted = np.full((bundles, RAYS), np.inf)
     for at in np.ndindex(wanted.shape):

@@ -37,7 +37,7 @@ def test_a_tolerance_is_kept_against_the_light_integral() -> None:
 
 
 @pytest.mark.core
-def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled) -> None:
+def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled, quick_programs) -> None:
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
     settings = dataclasses.replace(SEGMENTS, samples=frames.samples)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 from jaxsph.engine.cast.samples import PointSamples, emitted, transmitted
 from jaxsph.engine.field.tasks import SlabTask
@@ -44,6 +46,15 @@ def task(rng, perspective):
     return SlabTask(None, jnp.arange(TASKS), jnp.arange(TASKS), *(jnp.asarray(v) for v in (*sides, *depths)), perspective)
 
 
+@functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
+def light(several, where, in_few_passes):
+    """Colours and transmittance of rays, and the thickness of their samples."""
+    with barriers(in_few_passes):
+        medium = Mixture.of(several)
+        found = PointSamples()(medium, medium.gather(where), where)
+    return jnp.stack([*found.color, found.transmittance]), jnp.broadcast_to(found.thickness, where.shape)
+
+
 @pytest.mark.parametrize("perspective", [True, False])
 @pytest.mark.parametrize("media", [1, 2, 3])
 def test_passes_over_memory_change_no_light(media, perspective, x64):
@@ -51,14 +62,8 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
     there = rng.uniform(size=(media, 1, TASKS, SAMPLES, 1)) < 0.7
     optics = rng.uniform(0, 2, (media, 4, TASKS, SAMPLES, ROWS * COLUMNS)) * there
     several, where = tuple(Given(jnp.asarray(one)) for one in optics), task(rng, perspective)
-
-    def light(in_few_passes):
-        with barriers(in_few_passes):
-            medium = Mixture.of(several)
-            found = PointSamples()(medium, medium.gather(where), where)
-        return np.stack([*found.color, found.transmittance]), np.broadcast_to(found.thickness, where.shape)
-
-    for few, plain in zip(light(True), light(False), strict=True):
+    lit, thickness = (np.asarray(layer) for layer in light(several, where, True))
+    for few, plain in zip((lit, thickness), light(several, where, False), strict=True):
         np.testing.assert_allclose(few, plain, rtol=1e-12, atol=1e-15)
     # each sample adds its colour times what it takes away of the light
     extinction = optics[:, 3].sum(0)
@@ -66,8 +71,8 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
     taken = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], 1) - left
     for channel in range(3):
         color = (optics[:, channel] * optics[:, 3]).sum(0) / np.where(extinction > 0, extinction, 1)
-        np.testing.assert_allclose(light(True)[0][channel], (color * taken).sum(1), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(light(True)[0][3], left[:, -1], rtol=1e-12)
+        np.testing.assert_allclose(lit[channel], (color * taken).sum(1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(lit[3], left[:, -1], rtol=1e-12)
 
 
 def test_colours_add_up_to_the_alpha_that_is_lost():

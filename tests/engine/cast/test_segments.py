@@ -28,7 +28,7 @@ CLOSE = 1e-5  # of alpha
 ROUNDING = 64 * np.finfo(np.float32).eps  # of the square of what positions reach to: what grazes a support meets it or not
 FACE = 32 * np.finfo(np.float32).eps  # length units that a face may be off by, so that rays nearly along it meet it elsewhere
 EXTINCTION = 2.0
-GREY = js.TransferFunction.from_points([0.0, 1.0], np.full((2, 3), 0.5), [EXTINCTION, EXTINCTION])
+GREY = js.TransferFunction.from_points([0.0, 0.5, 1.0], np.full((3, 3), 0.5), [EXTINCTION] * 3)
 PROJECTIONS = "perspective", "orthographic"
 
 
@@ -92,7 +92,7 @@ def test_balls_of_several_quantities_and_one_extinction_have_the_alpha_of_their_
         (1.2 * 10 ** -rng.uniform(0, 1.5, 2)).astype(np.float32),
     )
     particles = balls(position, support, rng.uniform(0, 1, 2).astype(np.float32), rng.uniform(0.1, 1, 2).astype(np.float32))
-    view, looks = camera(), dataclasses.replace(GREY, colors=jnp.asarray([[1.0, 0, 0], [0, 0, 1]]))
+    view, looks = camera(), dataclasses.replace(GREY, colors=jnp.asarray([[1.0, 0, 0], [0.5, 0, 0.5], [0, 0, 1]]))
     image = shown(js.Scene(particles, looks), view)
     if two_pieces_at_most(Rays.of(view), position, support, view):
         check_alpha(image, Rays.of(view), position, support)
@@ -187,9 +187,10 @@ def test_a_box_of_one_quantity_has_the_alpha_of_what_rays_meet_of_it(seed):
     """However it is placed, and rays cut off its corners."""
     rng = np.random.default_rng(seed)
     lower, size = rng.uniform(-1, 0.2, 3).astype(np.float32), rng.uniform(0.05, 1.5, 3).astype(np.float32)
-    volume = js.Volume.from_array(np.full((3, 3, 3), 0.5, np.float32), lower, size / 2)
+    volume = js.Volume.from_array(np.full((2, 2, 5), 0.5, np.float32), lower, size / np.float32([1, 1, 4]))
+    looks = js.TransferFunction.from_points(np.linspace(0, 1, 4), np.full((4, 3), 0.5), [EXTINCTION] * 4)
     view = camera()
-    image, rays = shown(js.Scene(volume=volume, volume_transfer=GREY), view), Rays.of(view)
+    image, rays = shown(js.Scene(volume=volume, volume_transfer=looks), view), Rays.of(view)
     least, most = (1 - np.exp(-EXTINCTION * rays.in_box(lower - off, lower + size + off)) for off in (-FACE, FACE))
     alpha = np.asarray(image.alpha, float).ravel()
     assert (alpha >= least - CLOSE).all() and (alpha <= most + CLOSE).all(), np.maximum(least - alpha, alpha - most).max()
@@ -197,8 +198,8 @@ def test_a_box_of_one_quantity_has_the_alpha_of_what_rays_meet_of_it(seed):
 
 def test_a_jump_of_the_transfer_function_is_seen_between_samples():
     """Hardly any sample is where it lies: the error is that of what is smooth."""
-    particles, view, values = several(np.random.default_rng(3)), camera(), [0.0, 0.5, 0.5, 1.0]
-    looks = js.TransferFunction.from_points(values, [[1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]], [0.2, 0.2, 3.0, 3.0])
+    particles, view = several(np.random.default_rng(3)), camera()
+    looks = js.TransferFunction.from_points([0.5, 0.5, 1.0], [[1, 0, 0], [0, 0, 1], [0, 0, 1]], [0.2, 3.0, 3.0])
     color, transmittance = off(shown(js.Scene(particles, looks), view), view, particles, looks)
     assert color.mean() < 4e-3 and transmittance.mean() < 4e-3
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.cast.step_doubling import SHORTEST, StepDoubling
@@ -161,7 +162,7 @@ def test_an_image_is_that_of_very_many_samples(projection, image):
 
 def test_under_jit_the_image_is_the_same_and_a_plan_knows_its_step_tolerance(image):
     plan = js.plan(scene(), camera(), SETTINGS)
-    jitted = jax.jit(lambda shown: js.render(shown, camera(), SETTINGS, plan=plan).color)(scene())
+    jitted = jax.jit(lambda shown: js.render(shown, camera(), SETTINGS, plan=plan).color, compiler_options=QUICKLY)(scene())
     np.testing.assert_allclose(jitted, image.color, atol=0.1 * SETTINGS.step_tolerance)  # a step may be accepted or not
     with pytest.raises(ValueError, match=r"`plan` was made for settings.step_tolerance = 0.002, got 0.01"):
         js.render(scene(), camera(), dataclasses.replace(SETTINGS, step_tolerance=0.01), plan=plan)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES
@@ -25,7 +26,7 @@ def adapted(frames, stages):
     plan, control = frames.plan(), ControlPlan(super_pixels=True, merge=True, allocation="budget")
     scene, camera = frames.scene(rng, decades=0.1), frames.camera(rng)
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])
-    run = jax.jit(functools.partial(adapt, slab_samples=4, plan=control, tuning=CPU))
+    run = jax.jit(functools.partial(adapt, slab_samples=4, plan=control, tuning=CPU), compiler_options=QUICKLY)
 
     def decide(quantity, tolerance, wanted=True):
         particles = js.Particles(**{**vars(scene.particles), "quantity": jnp.asarray(quantity, jnp.float32)})

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import SUBSAMPLED_SHARE, interpolation_error
@@ -23,7 +24,7 @@ def band(stages):
     grid, _ = stages(scene.particles, camera, plan=plan)
     sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
     lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
-    judge = jax.jit(functools.partial(interpolation_error, slab_samples=plan.cast.slab_samples))
+    judge = jax.jit(functools.partial(interpolation_error, slab_samples=plan.cast.slab_samples), compiler_options=QUICKLY)
     return grid, lattice, lambda lattice: judge(grid, lattice, camera, scene.transfer)
 
 

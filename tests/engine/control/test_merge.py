@@ -24,22 +24,25 @@ merge = jax.jit(merged_levels, static_argnums=2)
 unions = jax.jit(coarser_windows, static_argnums=1)
 
 
+costs = jax.jit(evaluations_of_levels, static_argnums=(1, 2, 3))
+
+
 @functools.partial(jax.jit, static_argnums=2)
-def evaluated(windows, levels, slab_samples):
+def evaluated(windows, levels, slab_samples, past):
     shape = windows[0].length.shape[1:]
     schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
-    return evaluations(schedule, CELLS * CELL_SAMPLES, slab_samples)
+    return evaluations(schedule, CELLS * CELL_SAMPLES - past, slab_samples)
 
 
 @pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
 def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
     found = unions(windows_of(slab_samples), slab_samples)
-    merged, alone = (evaluations_of_levels(found, CELLS, slab_samples, merge) for merge in (True, False))
+    merged, alone = (costs(found, CELLS, slab_samples, merge) for merge in (True, False))
     for level in range(MAX_LEVEL + 1):
         share = 1 << max(level - fits(slab_samples), 0)  # cells that share a slab
         whole = CELLS // share * share
-        levels = jnp.asarray(np.where(np.arange(CELLS) < whole, level, SUPER_PIXEL)[:, None] * np.ones(BUNDLES, int), jnp.int32)
-        spent = evaluated(found, levels, slab_samples)
+        levels = np.int32(np.where(np.arange(CELLS) < whole, level, SUPER_PIXEL)[:, None] * np.ones(BUNDLES, int))
+        spent = evaluated(found, levels, slab_samples, 0)
         np.testing.assert_allclose(np.asarray(merged[level])[:whole].sum(0), spent, rtol=1e-6)
         assert (alone[level] is None) == (share > 1)
         windows = np.asarray(found[level].length).sum(0)[: whole * CELL_SAMPLES // slab_samples >> level]
@@ -47,9 +50,8 @@ def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
 
 
 def test_samples_past_the_last_are_not_evaluated_at_full_rate():
-    windows, levels = windows_of(4), jnp.zeros((CELLS, BUNDLES), jnp.int32)
-    schedule = coarse_schedule(unions(windows, 4), levels, (jnp.zeros(windows.count.shape),), None, 4)
-    all_of_them, fewer = (np.asarray(evaluations(schedule, CELLS * CELL_SAMPLES - past, 4)) for past in (0, 3))
+    windows, levels = windows_of(4), np.zeros((CELLS, BUNDLES), np.int32)
+    all_of_them, fewer = (np.asarray(evaluated(unions(windows, 4), levels, 4, past)) for past in (0, 3))
     np.testing.assert_allclose(all_of_them - fewer, 3 * np.asarray(windows.count)[-1])
 
 

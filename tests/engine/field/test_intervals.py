@@ -19,6 +19,7 @@ SAMPLES = 5
 DEPTH = 2.0 + 0.3 * np.arange(SAMPLES)
 LINE = 0.7, -0.4  # a quantity that is linear along the ray: value at depth 0, and change a unit of depth
 intervals = jax.jit(intervals_of)
+means = jax.jit(lambda looks, made: means_of(MeanTables.of(looks.segments()), made, slice(0, 4)))
 
 
 def field(depth):
@@ -103,7 +104,5 @@ def test_means_are_of_the_part_that_is_inside():
     looks = TransferFunction.from_points([0.0, 1.0], [[0, 0, 1.0], [1, 0, 0]], [0.0, 2.0])
     near, far, share = (jnp.asarray(part, jnp.float32)[None, :, None] for part in ([0.0, 0.5], [1.0, 0.5], [0.25, 0.0]))
     made = Intervals(near, far, share)
-    red, green, blue, extinction = (
-        np.asarray(mean)[0, :, 0] for mean in means_of(MeanTables.of(looks.segments()), made, slice(0, 4))
-    )
+    red, green, blue, extinction = (np.asarray(mean)[0, :, 0] for mean in means(looks, made))
     np.testing.assert_allclose([red, green, blue, extinction], [[0.25 * 2 / 3, 0], [0, 0], [0.25 / 3, 0], [0.25, 0]], atol=1e-6)

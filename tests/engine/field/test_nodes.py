@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.cast.batches import batches_of
@@ -19,6 +20,7 @@ from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.particles import kernels
 
 WIDER = Spacing(8, 4)
+node_sums = jax.jit(sum_at_nodes, static_argnums=(2, 3, 6), compiler_options=QUICKLY)
 
 
 @pytest.mark.parametrize("spacing", [FINEST, WIDER])
@@ -28,7 +30,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
     plan = js.plan(scene, camera, frames.settings)
     grid, _ = stages(scene.particles, camera, plan=plan)
     ordered = grid.ordered
-    lattice = sum_at_nodes(
+    lattice = node_sums(
         grid,
         camera,
         scene.particles.kernel,
@@ -81,6 +83,15 @@ def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
     assert part.shape[1:] == (4, 6) and (part > 0).any()
 
 
+@functools.partial(jax.jit, static_argnames=("plan", "kernel"), compiler_options=QUICKLY)
+def sums_of(grid, reference, camera, slabs, *, plan, kernel):
+    """Sums at all rays of some slabs, and of those that are subsampled."""
+    packets = RayPackets(*grid.rays(camera, jnp.arange(plan.lists.num_bundles)))
+    batches = batches_of(grid, full_rate(grid.windows, reference), packets, plan.cast, camera.is_perspective)
+    task = batches.task(slabs)
+    return [how(grid.ordered, grid.lists.rank, task, kernel=kernel) for how in (gather, gather_subsampled)]
+
+
 EYE, TARGET, SIZE = (1.5, 1.1, -2.2), (0.5, 0.5, 0.5), {"width": 230, "height": 197}
 CAMERAS = {
     "perspective": lambda: js.Camera.look_at(EYE, TARGET, near=1.0, far=5.0, **SIZE),
@@ -96,17 +107,11 @@ def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 1], [1, 0, 0]], [1.0, 1.0])
     plan = js.plan(js.Scene(particles=particles, transfer=transfer), camera, js.Settings(samples=96))
     grid, reference = stages(particles, camera, plan=plan)
-    schedule = full_rate(grid.windows, reference)
-    packets = RayPackets(*grid.rays(camera, jnp.arange(plan.lists.num_bundles)))
-    batches = batches_of(grid, schedule, packets, plan.cast, camera.is_perspective)
-    fullest = np.argsort(np.asarray(schedule.count).ravel())[-plan.cast.chunk :]
-    task = batches.task(jnp.asarray(fullest, jnp.int32))
-
-    def sums_by(how):
-        sums = jax.jit(functools.partial(how, kernel=particles.kernel))(grid.ordered, grid.lists.rank, task)
-        return np.asarray(sums.weight) + 1j * np.asarray(*sums.weighted)
-
-    every, few = sums_by(gather), sums_by(gather_subsampled)
+    fullest = np.argsort(np.asarray(grid.windows.count).ravel())[-plan.cast.chunk :].astype(np.int32)
+    every, few = (
+        np.asarray(sums.weight) + 1j * np.asarray(*sums.weighted)
+        for sums in sums_of(grid, reference, camera, fullest, plan=plan, kernel=particles.kernel)
+    )
     at = np.ix_(range(len(few)), range(few.shape[1]), SUBSAMPLE, SUBSAMPLE)
     np.testing.assert_allclose(few[at], every[at], rtol=1e-12, atol=1e-12 * np.abs(every).max())
     assert np.sqrt((np.abs(few - every) ** 2).mean()) < 0.02 * np.sqrt((np.abs(every) ** 2).mean())

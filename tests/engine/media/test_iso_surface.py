@@ -11,6 +11,8 @@ import pytest
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 POINTS, RADIUS, COLOR, AMBIENT = 25, 0.7, (0.9, 0.5, 0.2), 0.25
 SETTINGS = js.Settings(samples=48)
 

@@ -16,6 +16,8 @@ from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 WIDTH, HEIGHT, AMBIENT = 16, 14, 0.2
 SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32

@@ -1,5 +1,6 @@
 """Marking: the worst leaves are found, and no more than were asked for."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,18 +12,36 @@ from jaxsph.engine.screen.canvas import of_lattice
 from jaxsph.engine.screen.marking import FEWEST, Leaves, leaves_of, wanted_by, worst
 from jaxsph.engine.screen.pyramid import places
 
-ALL = jnp.float32(1)
+ALL = np.float32(1)
+SIDES = 8, 4, 2
 
 
 def some_leaves(seed, hidden=0.0):
     rng, found = np.random.default_rng(seed), []
-    for side, count in ((8, 5), (4, 10), (2, 20)):
+    for side, count in zip(SIDES, (5, 10, 20), strict=True):
         norm = rng.exponential(1.0, (count, count)).astype(np.float32)
         split = rng.random(norm.shape) < 0.7
         looks_empty = split & (rng.random(norm.shape) < hidden)
-        arrays = [jnp.asarray(part) for part in (np.where(looks_empty, 0, norm), norm, split, looks_empty)]
+        arrays = np.where(looks_empty, 0, norm), norm, split, looks_empty
         found.append(Leaves(*arrays, side))
     return found
+
+
+@jax.jit
+def worst_of(arrays, number):
+    """So many of the worst leaves, without their sides, which are not traced."""
+    return worst([Leaves(*some, side) for some, side in zip(arrays, SIDES, strict=True)], number, ALL)
+
+
+def worst_some(leaves, number):
+    return worst_of([some[:-1] for some in leaves], np.int32(number))
+
+
+@jax.jit
+def looked_at(canvas, tolerance):
+    """What leaves of two sides say, and the pixels that splitting them asks for."""
+    leaves, quality = leaves_of(canvas, (4, 2), tolerance)
+    return [some.split for some in leaves], quality, wanted_by([some.split for some in leaves], canvas, (4, 2))
 
 
 def flat(marked):
@@ -33,7 +52,7 @@ def flat(marked):
 @given(seed=st.integers(0, 10**6), number=st.integers(1, 600))
 def test_the_worst_leaves_are_so_many_and_none_that_is_left_is_worse(seed, number):
     leaves = some_leaves(seed)
-    marked, norm = flat(worst(leaves, number, ALL)), flat([some.norm for some in leaves])
+    marked, norm = flat(worst_some(leaves, number)), flat([some.norm for some in leaves])
     candidates = flat([some.split for some in leaves])
     assert not (marked & ~candidates).any()
     assert marked.sum() == min(number, candidates.sum())
@@ -60,10 +79,10 @@ def test_a_stage_splits_all_where_there_are_few():
 
 def test_leaves_that_look_empty_compete_with_those_of_their_size():
     leaves = some_leaves(5, hidden=0.3)
-    hidden, marked = flat([some.hidden for some in leaves]), flat(worst(leaves, 60, ALL))
+    hidden, marked = flat([some.hidden for some in leaves]), flat(worst_some(leaves, 60))
     assert 0 < (hidden & marked).sum() < 60
     alone = [some._replace(split=some.hidden) for some in leaves]
-    assert (flat(worst(alone, 1, ALL)) == flat([some.hidden for some in leaves])).all()  # nothing tells them apart
+    assert (flat(worst_some(alone, 1)) == flat([some.hidden for some in leaves])).all()  # nothing tells them apart
 
 
 def canvas_of(image, stride):
@@ -77,11 +96,10 @@ def canvas_of(image, stride):
 
 def test_a_linear_image_is_good_at_once_and_a_corner_is_split_where_it_is():
     rows, columns = np.mgrid[:33, :41].astype(np.float32)
-    linear, quality = leaves_of(canvas_of(0.01 * rows + 0.005 * columns, 4), (4, 2), jnp.float32(1e-3))
-    assert not flat([some.split for some in linear]).any() and float(quality.over) == 0 and float(quality.l2) < 1e-6
+    linear, quality, _ = looked_at(canvas_of(0.01 * rows + 0.005 * columns, 4), np.float32(1e-3))
+    assert not flat(linear).any() and float(quality.over) == 0 and float(quality.l2) < 1e-6
     canvas = canvas_of((columns > 20).astype(np.float32), 4)
-    leaves, quality = leaves_of(canvas, (4, 2), jnp.float32(1e-3))
-    split = np.asarray(leaves[0].split)
+    leaves, quality, wanted = looked_at(canvas, np.float32(1e-3))
+    split, wanted = np.asarray(leaves[0]), np.asarray(wanted)
     assert float(quality.over) == split.sum() > 0 and split.any(0).sum() <= 4 and split.any(0)[5]
-    wanted = np.asarray(wanted_by([some.split for some in leaves], canvas, (4, 2)))
     assert wanted.any() and not wanted[np.asarray(canvas.known)].any() and wanted[:, 22].any()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from hypothesis import example, given
@@ -22,13 +23,22 @@ def corners():
     return types.SimpleNamespace(row=row, column=column)
 
 
+queues_of = jax.jit(lambda image: queued(by_bundle(LISTS, image)))
+
+
+@jax.jit
+def packets(queue, nth):
+    """Those that are cast in the nth turn, and which pixels that are."""
+    chosen = queue.turn(nth, PACKETS).chosen()
+    return chosen, chosen.pixels(corners(), SHAPE)
+
+
 def cast(queue):
     """How often each pixel of the image is cast, and the packets."""
     count, parts = np.zeros(SHAPE[0] * SHAPE[1] + 1, int), []
     for turn in range(-(-int(queue.number) // PACKETS)):
-        chosen = queue.turn(turn, PACKETS).chosen()
-        pixel = np.asarray(chosen.pixels(corners(), SHAPE))
-        real = np.asarray(chosen.real).T
+        chosen, pixel = packets(queue, turn)
+        pixel, real = np.asarray(pixel), np.asarray(chosen.real).T
         assert (pixel[~real] == SHAPE[0] * SHAPE[1]).all(), "room is painted past the last pixel"
         np.add.at(count, pixel.ravel(), 1)
         parts += [bundle for bundle, some in zip(np.asarray(chosen.bundle), real.any(1), strict=True) if some]
@@ -44,7 +54,7 @@ def test_every_wanted_pixel_is_in_exactly_one_packet(seed, counts):
     rng = np.random.default_rng(seed)
     wanted = np.stack([rng.permutation(BUNDLE * BUNDLE) < count for count in counts])
     image = np.asarray(LISTS.as_image(wanted.reshape(-1, BUNDLE, BUNDLE)))[: SHAPE[0], : SHAPE[1]]
-    apart, together = queued(by_bundle(LISTS, jnp.asarray(image)))
+    apart, together = queues_of(image)
     (few, parts), (many, wholes) = cast(apart), cast(together)
     assert ((few + many)[image] == 1).all()
     assert (few[~image] == 0).all() and many.max(initial=0) <= 1
