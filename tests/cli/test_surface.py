@@ -12,6 +12,7 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli.commands import movie as cli_movie
 
 TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
 
@@ -118,6 +119,65 @@ def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, caps
     liquid()
     assert run(capsys, "render", "liquid.ply", *words, *TINY)[0] == 0
     assert asked[-1][0].surface is None
+
+
+@pytest.fixture
+def sources(monkeypatch):
+    """What movies are asked to render, and with which settings; no frame is made."""
+    asked = []
+
+    def render_frames(sources, cameras, settings, client, output):
+        asked.append((sources, settings))
+        return iter(())
+
+    monkeypatch.setattr(cli_movie, "render_frames", render_frames)
+    return asked
+
+
+ORBIT = ["--orbit", "90", "--frames", "2", "--size", "8x8", "--samples", "8", "-o", "m.mp4"]
+
+
+def test_a_movie_of_a_liquid_shows_its_surface_as_a_picture_does(asked, liquid, sources, capsys):
+    liquid()
+    code, out, err = run(capsys, "movie", "liquid.ply", *ORBIT)
+    assert (code, err) == (0, []) and "is 0.5, as of a liquid" in " ".join(out.split())
+    assert run(capsys, "movie", "liquid.ply", "--surface", "0.3", *ORBIT)[0] == 0
+    assert run(capsys, "movie", "liquid.ply", "--surface", "none", *ORBIT)[0] == 0
+    assert run(capsys, "movie", "liquid.ply", "--tolerance", "0.1", *ORBIT)[0] == 0
+    shown = [still() for still, _ in sources]
+    assert [scene.surface for scene in shown] == [js.Surface(), js.Surface(0.3), None, None]
+    assert len({still.fingerprint for still, _ in sources[:3]}) == 3  # a surface is part of what a frame is made of
+
+
+def test_a_sequence_is_shown_alike_in_all_frames_by_what_its_middle_file_is(asked, liquid, sources, capsys):
+    liquid()
+    even = Path("liquid.ply").read_text().split("\n")
+    rough = np.random.default_rng(0).normal(scale=1.5, size=(len(of_lattice()[0]), 3))
+    begin = even.index("end_header") + 1
+    for number in range(3):
+        rows = [f"{x} {y} {z} 0.5" for x, y, z in rough] if number == 0 else even[begin:-1]
+        Path(f"s_{number}.ply").write_text("\n".join([*even[:begin], *rows, ""]))
+    files = [f"s_{number}.ply" for number in range(3)]
+    code, out, err = run(capsys, "movie", *files, *ORBIT)
+    told = " ".join(out.split())
+    assert (code, err) == (0, []) and told.count("surface where") == 1 and "all frames alike, by s_1.ply" in told
+    assert run(capsys, "movie", *files, "--surface", "none", *ORBIT)[0] == 0
+    surfaces, media = (moments for moments, _ in sources)
+    assert [moment().surface for moment in surfaces] == [js.Surface()] * 2 and all(moment().surface is None for moment in media)
+    assert all(one.fingerprint != other.fingerprint for one, other in zip(surfaces, media, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "match"),
+    [
+        ("render", ["--tolerance", "0.1"], "--surface and --tolerance exclude each other"),
+        ("render", ["--integrator", "step_doubling"], "--surface and --integrator step_doubling exclude each other"),
+        ("movie", ["--tolerance", "0.1", "--orbit", "9"], "--surface and --tolerance exclude each other"),
+    ],
+)
+def test_a_surface_with_what_it_does_not_have_is_wrong_usage(command, words, match, asked, sources, capsys):
+    code, _, err = run(capsys, command, "drop.npz", "--surface", *words)
+    assert code == 2 and match in err[-1]
 
 
 def test_even_particles_of_other_kinds_of_files_are_a_medium(asked, capsys):

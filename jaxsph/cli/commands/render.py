@@ -33,11 +33,11 @@ from jaxsph.cli.console import (
 )
 from jaxsph.cli.options import groups, values, words
 from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, flag, option, output
-from jaxsph.cli.options.settings import devices_of, settings_of, stem_of
+from jaxsph.cli.options.settings import as_medium, devices_of, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
 from jaxsph.io.images.image_files import write_image
-from jaxsph.model import Image, Scene, Settings, registry
+from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
 
@@ -146,7 +146,7 @@ def _render(options: Any) -> None:
         _save(image, options, output)
         _say_written(output, image, camera, settings, options)
         return
-    scene, camera, labels = cli_scene.scene_of(_as_medium(options, settings))
+    scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
     say("camera", camera_line(camera, options))
     started = time.perf_counter()
     if options.progressive:
@@ -173,12 +173,6 @@ def _render(options: Any) -> None:
     _say_written(output, image, camera, settings, options)
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
         tell_if_unseen(options.command, output, [image.color])
-
-
-def _as_medium(options: Any, settings: Settings) -> Any:
-    """With no surface chosen for liquids where a tolerance is to be kept or media are asked at points: it has neither."""
-    needs = settings.tolerance is not None or registry.integrator_class(settings.integrator).asks_points
-    return dataclasses.replace(options, surface=False) if needs and options.surface is None else options
 
 
 def _how_wrong(image: Image, settings: Settings, progressive: bool) -> str:
