@@ -16,7 +16,7 @@ from cyclopts import Parameter
 import jaxsph
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
+from jaxsph.cli import seen, voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.commands import disk, merge
 from jaxsph.cli.console import (
@@ -43,7 +43,7 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: named after FILE, here)"
+WHERE = ".exr or .png, of a surface .ply; of several files a folder, or a name with {} in it (default: after FILE, here)"
 
 
 @Parameter(name="*")
@@ -122,7 +122,7 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in IMAGES:
+    if output.suffix.lower() in IMAGES or seen.is_points(output):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
@@ -135,7 +135,8 @@ def _render(options: Any) -> None:
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0].file
     output = options.output or Path(stem_of(first) + merge.suffix(options))
-    require_writable(output, "an image must be", IMAGES)
+    require_writable(output, "an image must be", IMAGES if not seen.is_points(output) else (output.suffix,))
+    seen.check(options, output)
     cli_look.check_key(options, output)
     merge.check_tile(options, settings, output)
     _check_background(options, output)
@@ -148,6 +149,9 @@ def _render(options: Any) -> None:
         return
     scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
     say("camera", camera_line(camera, options))
+    if seen.is_points(output):
+        seen.write(scene, camera, settings, options, output)
+        return
     started = time.perf_counter()
     if options.progressive:
         voice.release()
