@@ -87,7 +87,8 @@ def sweep(
         settings: of full rate, without tolerance, estimator and `relax`; default `Settings(integrator="samples")`.
         tolerances: each >= 0.
         estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, kept
-            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
+            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`;
+            none of scenes with a surface, which has no tolerance: of these baselines alone are measured.
         baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
             `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
         name: of the scene, for the table.
@@ -112,8 +113,15 @@ def sweep(
     if settings.tolerance is not None:
         raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
     asked = record_of(Effort, effort, "sweep")
-    groups = contenders(settings, tolerances, estimators, baselines)
     views = _views(scene, camera, frames)
+    if any(one.surface is not None for _, one, _ in views):
+        if estimators:
+            raise ValueError(
+                f"`estimators` must be (), got {estimators!r}: a surface of particles has no tolerance; leave the surface out, "
+                "or compare `baselines` alone"
+            )
+        estimators = ()
+    groups = contenders(settings, tolerances, estimators, baselines)
     shared = {"scene": name} | dataclasses.asdict(asked) | of_this_run()
     each = [
         _Frame(one, view, shared | of_frame(one, view, settings, asked.converged) | {"frame": number})
