@@ -113,6 +113,7 @@ def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, l
         ("--opacity-by", "speed"),
         ("--exposure", "1"),
         ("--support", "1.5"),
+        ("--clip", "plane:0,0,0,1,0,0"),
     ],
 )
 def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, capsys):
@@ -212,3 +213,21 @@ def test_even_particles_of_other_kinds_of_files_are_a_medium(asked, capsys):
     np.savez("even.npz", position=places, speed=speed)
     assert run(capsys, "render", "even.npz", *TINY)[0] == 0
     assert asked[-1][0].surface is None
+
+
+def stored(places, support):
+    np.savez("stored.npz", position=places, dye=places[:, 0], support_radius=support)
+    return io.read_scene("stored.npz", size=(8, 8))[0].surface
+
+
+def test_archives_are_liquids_where_particles_keep_apart_and_one_support_is_two_spacings(asked, capsys):
+    rng = np.random.default_rng(0)
+    stirred = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3) + rng.uniform(-0.2, 0.2, (512, 3))
+    spray = rng.uniform(9, 30, (10, 3))
+    liquid = np.concatenate([stirred, spray])
+    assert stored(liquid, 2.1) == js.Surface()
+    assert run(capsys, "render", "stored.npz", *TINY)[0] == 0 and asked[-1][0].surface == js.Surface()
+    assert stored(liquid, 5.0) is None  # supports of a smoother field
+    assert stored(liquid, rng.uniform(2.0, 2.2, len(liquid))) is None  # which adapt, as those of gas do
+    assert stored(rng.uniform(0, 8, (512, 3)), 2.1) is None  # at random: many are close to each other
+    assert stored(rng.normal(size=(512, 3)), 0.5) is None  # they cluster

@@ -250,7 +250,7 @@ def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded]:
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     center = cli_where.middle_of(survey, options)
-    surface = surface_of(survey.middle, survey.report, options, options)
+    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
     if surface is not None:
         say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
     snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)

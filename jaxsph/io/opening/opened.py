@@ -133,7 +133,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
-    surface = surface_of(loaded.shown, loaded.report, look, source)
+    surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
