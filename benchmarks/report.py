@@ -207,17 +207,18 @@ def surfaces(found: dict) -> str:
         "contender",
         "median",
         "90 %",
-        "found by us alone, by the mesh alone",
+        "found by us or the mesh alone",
         "volumes or mesh",
         "image or rays",
         "in all",
     )
     size = found["records"][0]["size"]
     return f"""## Surfaces of liquids beside a mesh
-`pysplashsurf` {found["machine"]["pysplashsurf"]} (marching cubes of so many particle radii, then Embree through the same pixels) and
-`jaxsph.Surface` of the same field and level, {size} x {size} pixels, {machine(found)}. How far depths are from each other, in
-supports; CPU seconds of all threads. They come together with the square of the cubes, so what is left is of the mesh. A mesh serves
-many views. What one finds alone are outlines and droplets, fewer with smaller cubes.
+`pysplashsurf` {found["machine"]["pysplashsurf"]} (marching cubes of so many particle radii, then Embree through the
+same pixels) and `jaxsph.Surface` of the same field and level, {size} x {size} pixels, {machine(found)}.
+How far depths are from each other, in supports; CPU seconds of all threads.
+They come together with the square of the cubes, so what is left is of the mesh. A mesh
+serves many views. What one finds alone are outlines and droplets, fewer with smaller cubes.
 
 {table(header, rows)}
 
@@ -401,7 +402,8 @@ over the tolerance and over three times it, `told / true` the 1 %, 50 % and 99 %
 
 SECTIONS: dict[str, Callable[[dict], str]] = {
     "truth": truths, "trade": trade, "sequences": sequences, "pilot": pilots, "convergence": convergence, "scaling": scaling,
-    "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients, "octree": accesses, "points_and_grids": points,
+    "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients, "octree": accesses,
+    "points_and_grids": points,
 }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
-"""Claim: where a mesh tool finds the surface of a liquid, we find it, a tenth of a support from there in the median, without a mesh.
+"""Claim: where a mesh tool finds the surface of a liquid, so do we without one, off by a tenth of a support in the median.
 
-Three files of liquids, once by `jaxsph.render` of a `jaxsph.Surface`, once by `pysplashsurf` (marching cubes; Loeschner et al. 2023)
-and a ray cast of its mesh by Embree, through the middles of the same pixels. Both have the same field and level: cubic splines of
+Three files of liquids, once by `jaxsph.render` of a `jaxsph.Surface`, once by `pysplashsurf` (marching cubes) and a ray cast of
+its mesh by Embree, through the middles of the same pixels. Both have the same field and level: cubic splines of
 support H = 4 radii, volumes 1 / sum of kernels, a half. Of both CPU time in one process, all threads together, in turns, without
 what is compiled; ours with volumes, theirs with neighbours and densities. Depths are compared in supports, where both find a
 surface; where one alone does are outlines, and what is thin. Writes `results/surfaces.json` and a picture beside it; ends in an
@@ -172,7 +172,7 @@ def measure(liquid: Liquid, size: int, repeats: int) -> tuple[list[dict[str, Any
 
 
 def difference(one: Seen, other: Seen, support: float) -> np.ndarray:
-    """Decades of the difference in supports, dark to bright; red where we alone find a surface, blue where the mesh alone has one."""
+    """Decades of the difference in supports, dark to bright; red where we alone find one, blue where the mesh alone does."""
     here, there = np.isfinite(one.depth), np.isfinite(other.depth)
     off = np.abs(np.where(here & there, one.depth, 0) - np.where(here & there, other.depth, 0)) / support
     gray = np.clip((np.log10(np.maximum(off, 10.0**DARKEST)) - DARKEST) / (BRIGHTEST - DARKEST), 0, 1)
