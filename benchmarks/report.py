@@ -192,6 +192,40 @@ Time of a frame over that of a Numba packet marcher on the same particles, 512 x
 """
 
 
+def surfaces(found: dict) -> str:
+    """Depths and CPU time beside a mesh and its rays."""
+    rows = []
+    for record in found["records"]:
+        first, second = record["cpu_seconds"].values()
+        own = "median" not in record
+        apart = ["-"] * 3 if own else [number(record["median"]), number(record["percent_90"])]
+        if not own:
+            apart.append(f"{record['ours_alone']} and {record['theirs_alone']} of {record['both']:,}")
+        rows.append([record["file"], record["contender"], *apart, f"{first:.2f}", f"{second:.2f}", f"{first + second:.2f}"])
+    header = (
+        "file",
+        "contender",
+        "median",
+        "90 %",
+        "found by us or the mesh alone",
+        "volumes or mesh",
+        "image or rays",
+        "in all",
+    )
+    size = found["records"][0]["size"]
+    return f"""## Surfaces of liquids beside a mesh
+`pysplashsurf` {found["machine"]["pysplashsurf"]} (marching cubes of so many particle radii, then Embree through the
+same pixels) and `jaxsph.Surface` of the same field and level, {size} x {size} pixels, {machine(found)}.
+How far depths are from each other, in supports; CPU seconds of all threads.
+They come together with the square of the cubes, so what is left is of the mesh. A mesh
+serves many views. What one finds alone are outlines and droplets, fewer with smaller cubes.
+
+{table(header, rows)}
+
+![Ours, the mesh of half radii, and decades of their difference](../benchmarks/results/surfaces.png)
+"""
+
+
 def grids(found: dict) -> str:
     rows = []
     for record in found["records"]:
@@ -368,7 +402,8 @@ over the tolerance and over three times it, `told / true` the 1 %, 50 % and 99 %
 
 SECTIONS: dict[str, Callable[[dict], str]] = {
     "truth": truths, "trade": trade, "sequences": sequences, "pilot": pilots, "convergence": convergence, "scaling": scaling,
-    "peers": peers, "vtk_grid": grids, "gradients": gradients, "octree": accesses, "points_and_grids": points,
+    "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients, "octree": accesses,
+    "points_and_grids": points,
 }  # fmt: skip
 
 

@@ -24,7 +24,7 @@ ASKED = (
     ("mean of energy by mass", DENSE, ["project", "--of", "InternalEnergy", "--weight", "mass", "--norm", "log"]),
     ("--clip plane:...", FLUID, ["render", "--clip", "plane:0,0,0,0.4,0,-1"]),
     ("jaxsph slice", FLUID, ["slice", "--plane", "0,0,0,0,0,-1"]),
-    ("--where 'hypot(x, z) > 0.5'", FLUID, ["render", "--where", "hypot(x, z) > 0.5"]),
+    ("--where 'hypot(x, z) > 0.5'", FLUID, ["render", "--where", "hypot(x, z) > 0.5", "--surface", "none"]),
     ("--annotate: bar, scale, axes, time", DENSE, ["render", "--annotate"]),
 )
 """What it says below, file, command and options."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.project import project
     from jaxsph.analysis.resample import resample
     from jaxsph.analysis.slices import slice
+    from jaxsph.analysis.surface_depth import surface_depth
     from jaxsph.analysis.visibility import visibility_histogram
     from jaxsph.engine.access.morton import prepare
     from jaxsph.engine.frame.progressive import progressive
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from jaxsph.model.camera.path import CameraPath
     from jaxsph.model.clips.shapes import Box, Plane, Sphere
     from jaxsph.model.image import Image
-    from jaxsph.model.particles.held import emission_measure
     from jaxsph.model.particles.particles import Particles
     from jaxsph.model.particles.surface import Surface
     from jaxsph.model.points import Points
@@ -65,7 +65,6 @@ __all__ = [
     "TransferFunction",
     "Volume",
     "Within",
-    "emission_measure",
     "explain",
     "io",
     "plan",
@@ -80,6 +79,7 @@ __all__ = [
     "scenes",
     "sequence",
     "slice",
+    "surface_depth",
     "sweep",
     "view",
     "visibility_histogram",
@@ -110,8 +110,8 @@ NAMES = {
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",
-    "emission_measure": "jaxsph.model.particles.held:emission_measure",
     "slice": "jaxsph.analysis.slices:slice",
+    "surface_depth": "jaxsph.analysis.surface_depth:surface_depth",
     "resample": "jaxsph.analysis.resample:resample",
     "explain": "jaxsph.analysis.explanation.explain:explain",
     "view": "jaxsph.viewer.widget:view",
@@ -148,7 +148,8 @@ FORMER = {
         "jaxsph.model.transfer.function:TransferFunction.control_values",
         "jaxsph.TransferFunction.control_values",
     ),
-    "emission": ("jaxsph.model.particles.held:emission_measure", "jaxsph.emission_measure"),
+    "emission": ("jaxsph.model.particles.held:emission_measure", "jaxsph.model.particles.held.emission_measure"),
+    "emission_measure": ("jaxsph.model.particles.held:emission_measure", "jaxsph.model.particles.held.emission_measure"),
     "in_octree": ("jaxsph.engine.media.in_octree:in_octree", "jaxsph.engine.media.in_octree.in_octree"),
     "merge": ("jaxsph.scale.parts:merge_tiles", "jaxsph.scale.merge_tiles"),
     "met": ("jaxsph.analysis.visibility:visibility_histogram", "jaxsph.visibility_histogram"),

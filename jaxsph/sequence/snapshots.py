@@ -20,6 +20,7 @@ from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
+from jaxsph.model.particles.surface import Surface
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
@@ -45,12 +46,14 @@ class Snapshots:
         transfer: what they look like, all of them.
         center: middle of the periodic box that all files have, where it is not their own.
         within: where they are shown; None is everywhere.
+        surface: by which they are shown, all of them; None shows a medium.
     """
 
     survey: Survey
     transfer: TransferFunction
     center: tuple[float, float, float] | None = None
     within: Clip | None = None
+    surface: Surface | None = None
     _loaded: dict[int, Loaded] = dataclasses.field(default_factory=dict, repr=False)
     _ways: dict[int, Way | str] = dataclasses.field(default_factory=dict, repr=False)
 
@@ -64,6 +67,7 @@ class Snapshots:
         within: Clip | None = None,
         transfer: TransferFunction | None = None,
         colormap: str = "viridis",
+        surface: Surface | None = None,
         gaps: bool = False,
         strict: bool = True,
         progress: Progress | None = None,
@@ -79,6 +83,7 @@ class Snapshots:
             transfer: what particles look like; by default `colormap` over nearly all values of all files, with an extinction
                 that suits the file in the middle.
             colormap: name of a colour map.
+            surface: by which particles are shown, in the colours of `transfer`; None shows a medium, of liquids, too.
             gaps: whether numbers may be missing in the names of the files.
             strict: whether files that cannot be read are refused. Else the sequence is that of all others, and times between
                 the two beside such a file have no scene.
@@ -98,7 +103,7 @@ class Snapshots:
         if transfer is None:
             ramp = None if survey.report.opacity_by is None else "steep"
             transfer = scenes.default_transfer(survey.middle, colormap, survey.span, ramp=ramp)
-        return cls(survey, transfer, center_of(survey, center), within)
+        return cls(survey, transfer, center_of(survey, center), within, surface)
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -121,7 +126,7 @@ class Snapshots:
         for the half of the time that is nearer to it. Where ids do not match, or are not there, it is the nearer file.
         """
         particles = self._particles(*self.place(time))
-        return Scene(particles=particles, transfer=self.transfer, within=self.within)
+        return Scene(particles=particles, transfer=self.transfer, within=self.within, surface=self.surface)
 
     def moments(self, times: Sequence[float]) -> list[Moment]:
         """Sources of frames at such times, each read when it is its turn."""
@@ -157,7 +162,7 @@ class Snapshots:
         before, share = self.place(time)
         files = [file.identity for file in self.survey.files[before : before + 1 + (share > 0)]]
         read = self.survey.source, self.survey.quantity, self.center
-        return fingerprint("s", files, share, *read, digest_of((self.transfer, self.within)))
+        return fingerprint("s", files, share, *read, digest_of((self.transfer, self.within, self.surface)))
 
     def _particles(self, before: int, share: float) -> Particles:
         first = self._load(before)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,22 @@ def suitable(settings: Settings) -> tuple[str, ...]:
     """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
     own = settings.integrator
     return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or registry.estimates(it["integrator"]))
+
+
+def estimators_of(scenes: Iterable[Scene], estimators: Sequence[str] | None) -> Sequence[str] | None:
+    """Those that are asked for; of scenes with a surface none.
+
+    Raises:
+        ValueError: some are asked for of a surface.
+    """
+    if all(scene.surface is None for scene in scenes):
+        return estimators
+    if estimators:
+        raise ValueError(
+            f"`estimators` must be (), got {estimators!r}: a surface of particles has no tolerance; leave the surface out, or "
+            "compare `baselines` alone"
+        )
+    return ()
 
 
 def contenders(

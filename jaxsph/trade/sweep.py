@@ -25,7 +25,17 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.numerics.checks import Progress, record_of
-from jaxsph.trade.contenders import BASELINES, FULL_RATE, TOLERANCES, Contender, IntegralAt, contenders, layers_of, scaled_up
+from jaxsph.trade.contenders import (
+    BASELINES,
+    FULL_RATE,
+    TOLERANCES,
+    Contender,
+    IntegralAt,
+    contenders,
+    estimators_of,
+    layers_of,
+    scaled_up,
+)
 from jaxsph.trade.measurement import JOURNAL, KEY, TABLE, Measurement, append, of_frame, of_this_run, read_journal, write_table
 
 STAGES = ("grid", "adapt", "cast", "image")
@@ -87,7 +97,8 @@ def sweep(
         settings: of full rate, without tolerance, estimator and `relax`; default `Settings(integrator="samples")`.
         tolerances: each >= 0.
         estimators: of `"interval"`, `"interval relaxed"` (`relax` = 1, as Hochstetter et al. 2016 relax) and `"pilot"`, kept
-            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`.
+            against full rate of point samples; and `"segments"`, against the light integral. Default all that suit `settings`; of
+            scenes with a surface none, as that has no tolerance.
         baselines: `"samples/K"` and `"segments/K"`, uniform point samples or segments, K times fewer than full rate has;
             `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
         name: of the scene, for the table.
@@ -112,8 +123,8 @@ def sweep(
     if settings.tolerance is not None:
         raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
     asked = record_of(Effort, effort, "sweep")
-    groups = contenders(settings, tolerances, estimators, baselines)
     views = _views(scene, camera, frames)
+    groups = contenders(settings, tolerances, estimators_of((one for _, one, _ in views), estimators), baselines)
     shared = {"scene": name} | dataclasses.asdict(asked) | of_this_run()
     each = [
         _Frame(one, view, shared | of_frame(one, view, settings, asked.converged) | {"frame": number})

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles.surface import Surface
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.pose import Pose
@@ -51,7 +52,9 @@ def python_of(source: Source, camera: Camera, pose: Pose | None, edited: Transfe
     return "\n".join(lines)
 
 
-def command_of(source: Source, camera: Camera, pose: Pose | None, edited: bool, settings: Settings) -> str:
+def command_of(
+    source: Source, camera: Camera, pose: Pose | None, edited: bool, settings: Settings, surface: Surface | None = None
+) -> str:
     """The command that makes the picture again, from a perspective; else why there is none."""
     if not source.file:
         return "# a scene of Python's has no command"
@@ -66,6 +69,8 @@ def command_of(source: Source, camera: Camera, pose: Pose | None, edited: bool, 
     if edited:
         words.append(f"--transfer={LOOK_FILE}")
     said = {word.partition("=")[0] for word in words}
+    if surface is not None and "--surface" not in said:  # else a transfer function shows a medium
+        words.append(f"--surface={float(surface.level):.9g}")
     if settings.tolerance is not None:
         chosen = {"--integrator": settings.integrator, "--tolerance": f"{settings.tolerance:g}"}
         words += [f"{name}={value}" for name, value in chosen.items() if name not in said]

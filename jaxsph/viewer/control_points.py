@@ -46,18 +46,22 @@ class ControlPoints:
         scale: of its values (of those of extinction, where these are others: colours then stay as they are).
         points: ascending by place, at least one; None is the function as it was given.
         capacity: points that there is room for.
+        flat: whether they are of colours alone, as those of a surface, which is opaque.
     """
 
     first: TransferFunction
     scale: Scale
     points: tuple[Point, ...] | None = None
     capacity: int = 0
+    flat: bool = False
 
     @classmethod
-    def of(cls, transfer: TransferFunction) -> ControlPoints:
-        """That of a function."""
+    def of(cls, transfer: TransferFunction, *, flat: bool = False) -> ControlPoints:
+        """That of a function; where it is to be `flat`, of its colours."""
+        if flat:
+            transfer = dataclasses.replace(transfer, extinction=jnp.ones_like(transfer.values), extinction_values=None)
         values = transfer.values if transfer.extinction_values is None else transfer.extinction_values
-        return cls(transfer, Scale.of(np.asarray(values, np.float64)), None, room_for(len(values) + SPARE))
+        return cls(transfer, Scale.of(np.asarray(values, np.float64)), None, room_for(len(values) + SPARE), flat)
 
     @property
     def is_split(self) -> bool:
@@ -104,6 +108,8 @@ class ControlPoints:
 
     def exposed(self, stops: float) -> ControlPoints:
         """More, or less, opaque by powers of two."""
+        if self.flat:
+            raise ValueError("a surface of particles is opaque: it has colours, and nothing to make it thinner or denser by")
         if not abs(stops) <= MAX_STOPS:
             raise ValueError(f"stops must lie within {MAX_STOPS:g}, got {stops:g}")
         return self.edited([dataclasses.replace(point, extinction=point.extinction * 2**stops) for point in self.shown])
@@ -135,7 +141,8 @@ class ControlPoints:
         values = self.scale.value(np.array([point.place for point in shown])).tolist()
         rows = [[point.place, point.extinction, *point.color, value] for point, value in zip(shown, values, strict=True)]
         ends = self.scale.value(np.linspace(0, 1, 5)).tolist()
-        return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, "split": self.is_split}
+        kind = {"split": self.is_split, "flat": self.flat}
+        return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, **kind}
 
 
 class Steps:
@@ -172,6 +179,11 @@ def room_for(points: int) -> int:
 def first_look(scene: Scene) -> TransferFunction | None:
     """What is edited of a scene: the look of its particles, else that of its first volume."""
     return scene.looks[0] if scene.looks else None
+
+
+def is_flat(scene: Scene) -> bool:
+    """Whether that is the look of a surface, of which colours are all there is."""
+    return scene.surface is not None and scene.transfer is not None
 
 
 def looking(scene: Scene, transfer: TransferFunction | None) -> Scene:

@@ -9,16 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.analysis.at_places import ParticleField
 from jaxsph.analysis.visibility import visibility_histogram
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import kernels
-from jaxsph.model.particles.particles import Particles
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, widened
 from jaxsph.model.transfer.domains import Scale
+from jaxsph.viewer.control_points import is_flat
 from jaxsph.viewer.picture import Picture
 
 RAYS, BINS = 300, 64
 """Of a histogram: a quarter of a second."""
+ON_SURFACE = 0.01
+"""Of its level, what the coverage may be off where a place is one of the surface, and not of what is in front of it."""
 
 
 def pixel_at(picture: Picture, right: float, down: float) -> tuple[int, int] | None:
@@ -55,49 +57,57 @@ def told_of_pixel(picture: Picture, right: float, down: float) -> dict[str, Any]
     }
     if picture.settings.tolerance is not None:
         told["error"] = _plain(np.asarray(image.error_bound)[found])
+    if picture.scene.surface is not None:
+        told["surface"] = True
     place = place_seen(picture, right, down)
     if place is not None:
         told["depth"] = float(np.asarray(image.depth)[found])
         told["place"] = place.tolist()
-        if picture.scene.particles is not None:
-            told["quantity"], told["neighbours"] = quantity_at(picture.scene.particles, place)
+        told |= _of_particles(picture.scene, place)
     return told
 
 
-def quantity_at(particles: Particles, place: np.ndarray) -> tuple[float | None, int]:
-    r"""The field $\sum q_j V_j W_j / \sum V_j W_j$ at a place (host side, float64), None outside of every support.
-
-    Args:
-        particles: of a periodic set those of one period, without their images.
-        place: (3,), length units.
-
-    Returns:
-        The quantity (of two, that of colours), and how many particles it is of.
-    """
-    valid = np.asarray(particles.valid)
-    support = np.asarray(particles.support, np.float64)
-    square = ((particles.exact_position() - place) ** 2).sum(-1)
-    near = np.flatnonzero(valid & (square < support**2))
-    if not near.size:
-        return None, 0
-    kernel = kernels.by_name(particles.kernel)
-    volume, quantity = (np.asarray(getattr(particles, name), np.float64)[near] for name in ("volume", "quantity"))
-    weight = volume / support[near] ** 3 * kernel.of_square(square[near] / support[near] ** 2, np)
-    total = float(weight.sum())
-    return (float((weight * quantity).sum() / total) if total > 0 else None), int(near.size)
+def _of_particles(scene: Scene, place: np.ndarray) -> dict[str, Any]:
+    """The field at a place, and how many particles it is of; of their surface, too, which way it faces."""
+    particles = widened(scene).particles
+    if particles is None:
+        return {}
+    there = ParticleField(particles).at(place[None])
+    told = {"quantity": _plain(there.quantity[0]), "neighbours": int(there.number[0])}
+    if scene.surface is not None and abs(there.coverage[0] / float(scene.surface.level) - 1) < ON_SURFACE:
+        told["normal"] = there.normal[0].tolist()
+    return told
 
 
-def histogram_of(scene: Scene, camera: Camera, scale: Scale) -> dict[str, Any] | None:
+def histogram_of(scene: Scene, camera: Camera, scale: Scale, picture: Picture | None = None) -> dict[str, Any] | None:
     """What rays meet by place on an axis, as JSON has it: path length, and light absorbed; each over its largest.
 
-    None of media that have no quantity.
+    Of a surface it is where rays of a picture meet it: both are one. None of media that have no quantity.
     """
     if scene.media or not scene.looks:
         return None
+    if scene.surface is not None:
+        return None if picture is None or not is_flat(scene) else _of_surface(scene, scale, picture)
     found = visibility_histogram(scene, camera, rays=RAYS, bins=BINS)
     places = np.clip(np.nan_to_num(scale.place(found.edges), neginf=-1.0, posinf=2.0), -1, 2)
     bars = {name: _shares(getattr(found, name)) for name in ("there", "absorbed")}
     return {"edges": places.tolist(), **bars, "rays": found.rays}
+
+
+def _of_surface(scene: Scene, scale: Scale, picture: Picture) -> dict[str, Any]:
+    """Of the quantity where some rays of a picture meet a surface."""
+    depth, particles = np.asarray(picture.image.depth), widened(scene).particles
+    assert particles is not None
+    height, width = depth.shape
+    chosen = np.random.default_rng(0).choice(depth.size, min(RAYS, depth.size), replace=False)
+    rows, columns = np.unravel_index(chosen[np.isfinite(depth.ravel()[chosen])], depth.shape)
+    at = zip((columns + 0.5 - width / 2) / height, (rows + 0.5) / height - 0.5, depth[rows, columns].tolist(), strict=True)
+    met = [picture.pose.place_at(*place) for place in at]
+    quantity = ParticleField(particles).at(np.reshape(met, (-1, 3))).quantity
+    place = np.clip(scale.place(quantity[np.isfinite(quantity)]), -1, 2)
+    counts, edges = np.histogram(place, BINS, (min(0.0, place.min(initial=0)), max(1.0, place.max(initial=1))))
+    shares = _shares(counts.astype(np.float64))
+    return {"edges": edges.tolist(), "there": shares, "absorbed": shares, "rays": len(chosen)}
 
 
 def _shares(values: np.ndarray) -> list[float]:

@@ -20,6 +20,7 @@ from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DRAFT, Stage
 
 JPEG_QUALITY = 85
+OF_SURFACE = "surface to rounding, thin parts may be missed"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,14 +87,14 @@ def jpeg_of(picture: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def described(stage: Stage, image: Image, camera: Camera, seconds: float) -> tuple[str, dict[str, Any]]:
+def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds: float) -> tuple[str, dict[str, Any]]:
     """What a picture is in words, and as numbers: the words say how wrong it is, or that nobody knows."""
     settings, (height, width) = stage.settings, image.shape
     left = camera.width * camera.height - height * width
     bound = np.nan_to_num(np.asarray(image.error_bound, np.float64), nan=0.0, neginf=0.0, posinf=1.0)
     facts: dict[str, Any] = {"rays_left": left, "milliseconds": round(1000 * seconds), "error": None}
     if settings.tolerance is None:
-        error = "error not estimated"
+        error = "error not estimated" if scene.surface is None else OF_SURFACE
         words = f"{width} x {height}, {settings.samples} samples a ray; {error}"
         return (f"draft: {words}; {left:,} rays left" if stage.name == DRAFT else f"full: {words}"), facts
     facts["error"] = largest = float(bound.max(initial=0))

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from jaxsph.engine.asked import require_asked
+from jaxsph.engine.request import along_rays
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -26,7 +27,7 @@ from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
 from jaxsph.viewer.inputs import InputError, number
 from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
 from jaxsph.viewer.state import State
 
 REST_SECONDS = 0.2
@@ -59,15 +60,17 @@ class Session:
 
         Args:
             scene, camera: what is looked at, and from where.
-            settings: of the last picture of a state; None is `stages.DEFAULT`.
+            settings: of the last picture of a state; None is `stages.default_of(scene)`.
             source: where the scene comes from, for the code that makes it again.
 
         Raises:
-            ValueError: a scene with nothing in it, or a camera that is none.
+            ValueError: a scene with nothing in it, or a camera that is none; a tolerance of a surface of particles.
         """
         require_asked(scene, camera, DEFAULT if settings is None else settings)
         scene.check()
-        self.settings, self.told = DEFAULT if settings is None else settings, ""
+        self.settings, self.told = default_of(scene) if settings is None else settings, ""
+        if scene.surface is not None:
+            along_rays(scene, self.settings)
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
         self._state = State(scene, camera)
         self._version, self._failed, self._changed = 1, 0, 0.0
@@ -223,7 +226,7 @@ class Session:
             raise InputError("there is no picture yet")
         place = place_seen(picture, right, down)
         if place is None:
-            raise InputError("nothing is seen there: less than half of the light is absorbed")
+            raise InputError("nothing is seen there: no surface, and less than half of the light is absorbed")
         return place
 
     def _picked(self, message: dict[str, Any]) -> dict[str, Any]:
@@ -292,7 +295,7 @@ class Session:
         except Exception as error:  # a view goes on: what is wrong is told
             self._tell(stage, state, error)
             return False
-        words, facts = described(stage, image, state.camera, time.perf_counter() - started)
+        words, facts = described(stage, image, state.scene, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
         made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
         picture = Picture(state.version, stage.name, words, final, *made, facts)
@@ -319,7 +322,7 @@ class Session:
         """Tell what rays of a view that stands met."""
         try:
             scale = self._state.scale
-            found = None if scale is None else histogram_of(state.scene, state.camera, scale)
+            found = None if scale is None else histogram_of(state.scene, state.camera, scale, self.picture)
         except Exception as error:  # a view goes on without it
             self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
             return

@@ -42,6 +42,11 @@ DEFAULT = Settings(integrator="segments", tolerance=0.01)
 """Of a view that was asked for nothing else: an error that is told, against the light integral."""
 
 
+def default_of(scene: Scene) -> Settings:
+    """Of a view of a scene that was asked for nothing else: a surface of particles has no tolerance."""
+    return DEFAULT if scene.surface is None else Settings()
+
+
 class Abandoned(Exception):
     """There is something newer to be shown."""
 

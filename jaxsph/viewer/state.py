@@ -17,7 +17,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source, command_of, python_of
-from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, looking
+from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
 from jaxsph.viewer.pose import Pose
 
@@ -43,7 +43,7 @@ class State:
         look = first_look(scene)
         self._given, self._first = camera, Pose.of(camera, scene)
         self.pose, self.moved = self._first, False
-        self._steps = None if look is None else Steps(ControlPoints.of(look))
+        self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
         self._base = scene
         self.scene = self._looked()
 
@@ -99,7 +99,7 @@ class State:
         look = self.transfer if self.edited else None
         return {
             "python": python_of(source, camera, pose, look, settings),
-            "command": command_of(source, camera, pose, self.edited, settings),
+            "command": command_of(source, camera, pose, self.edited, settings, self._base.surface),
         }
 
     def do(self, message: dict[str, Any], seen: Seen) -> None:

@@ -35,7 +35,7 @@ def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
 
     Args:
         scene, camera: as for `jaxsph.render`.
-        settings: of the picture once nothing moves; by default segments with a tolerance of 0.01.
+        settings: of the picture once nothing moves; by default segments with a tolerance of 0.01, of a surface all samples.
 
     Returns:
         A widget (`anywidget.AnyWidget`) that the notebook shows. Its `session` (`jaxsph.viewer.session.Session`) has the scene

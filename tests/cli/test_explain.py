@@ -80,3 +80,14 @@ def test_a_picture_made_by_what_explain_does_not_know_is_refused(capsys):
 def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, said):
     code, _, err = run(capsys, "explain", "a.npz", *arguments, *TINY)
     assert code == 2 and len(err) == 1 and said in err[0]
+
+
+def test_a_pixel_of_a_picture_of_a_surface_is_explained_as_one(capsys):
+    more = ["--color-by", "heat", "--surface", "0.2", "--size", "24x16", "--samples", 16]
+    assert run(capsys, "render", "a.npz", *more, "-o", "x.png")[0] == 0
+    code, out, _, wrong = apart(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 8, 12, "--json")
+    told = json.loads(out)
+    scene, camera = js.io.read_scene("a.npz", color_by="heat", surface=0.2, size=(24, 16))
+    made = js.explain(scene, camera, js.Settings(samples=16), pixel=(8, 12))
+    assert (code, wrong) == (0, []) and told["surface_depth"] == made.surface_depth and told["level"] == 0.2
+    assert told["particles"] == made.particles.tolist() and told["total"] is None

@@ -12,6 +12,7 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli.commands import movie as cli_movie
 
 TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
 
@@ -112,6 +113,7 @@ def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, l
         ("--opacity-by", "speed"),
         ("--exposure", "1"),
         ("--support", "1.5"),
+        ("--clip", "plane:0,0,0,1,0,0"),
     ],
 )
 def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, capsys):
@@ -120,8 +122,112 @@ def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, caps
     assert asked[-1][0].surface is None
 
 
+@pytest.fixture
+def sources(monkeypatch):
+    """What movies are asked to render, and with which settings; no frame is made."""
+    asked = []
+
+    def render_frames(sources, cameras, settings, client, output):
+        asked.append((sources, settings))
+        return iter(())
+
+    monkeypatch.setattr(cli_movie, "render_frames", render_frames)
+    return asked
+
+
+ORBIT = ["--orbit", "90", "--frames", "2", "--size", "8x8", "--samples", "8", "-o", "m.mp4"]
+
+
+def test_a_movie_of_a_liquid_shows_its_surface_as_a_picture_does(asked, liquid, sources, capsys):
+    liquid()
+    code, out, err = run(capsys, "movie", "liquid.ply", *ORBIT)
+    assert (code, err) == (0, []) and "is 0.5, as of a liquid" in " ".join(out.split())
+    assert run(capsys, "movie", "liquid.ply", "--surface", "0.3", *ORBIT)[0] == 0
+    assert run(capsys, "movie", "liquid.ply", "--surface", "none", *ORBIT)[0] == 0
+    assert run(capsys, "movie", "liquid.ply", "--tolerance", "0.1", *ORBIT)[0] == 0
+    shown = [still() for still, _ in sources]
+    assert [scene.surface for scene in shown] == [js.Surface(), js.Surface(0.3), None, None]
+    assert len({still.fingerprint for still, _ in sources[:3]}) == 3  # a surface is part of what a frame is made of
+
+
+def test_a_sequence_is_shown_alike_in_all_frames_by_what_its_middle_file_is(asked, liquid, sources, capsys):
+    liquid()
+    even = Path("liquid.ply").read_text().split("\n")
+    rough = np.random.default_rng(0).normal(scale=1.5, size=(len(of_lattice()[0]), 3))
+    begin = even.index("end_header") + 1
+    for number in range(3):
+        rows = [f"{x} {y} {z} 0.5" for x, y, z in rough] if number == 0 else even[begin:-1]
+        Path(f"s_{number}.ply").write_text("\n".join([*even[:begin], *rows, ""]))
+    files = [f"s_{number}.ply" for number in range(3)]
+    code, out, err = run(capsys, "movie", *files, *ORBIT)
+    told = " ".join(out.split())
+    assert (code, err) == (0, []) and told.count("surface where") == 1 and "all frames alike, by s_1.ply" in told
+    assert run(capsys, "movie", *files, "--surface", "none", *ORBIT)[0] == 0
+    surfaces, media = (moments for moments, _ in sources)
+    assert [moment().surface for moment in surfaces] == [js.Surface()] * 2 and all(moment().surface is None for moment in media)
+    assert all(one.fingerprint != other.fingerprint for one, other in zip(surfaces, media, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "match"),
+    [
+        ("render", ["--tolerance", "0.1"], "--surface and --tolerance exclude each other"),
+        ("render", ["--integrator", "step_doubling"], "--surface and --integrator step_doubling exclude each other"),
+        ("movie", ["--tolerance", "0.1", "--orbit", "9"], "--surface and --tolerance exclude each other"),
+    ],
+)
+def test_a_surface_with_what_it_does_not_have_is_wrong_usage(command, words, match, asked, sources, capsys):
+    code, _, err = run(capsys, command, "drop.npz", "--surface", *words)
+    assert code == 2 and match in err[-1]
+
+
+def test_points_of_a_surface_are_written_as_ply_and_said(asked, capsys):
+    words = ["drop.npz", "--surface", "0.2", "--size", "8x8", "--samples", "8", "-o", "points.ply"]
+    code, out, err = run(capsys, "render", *words)
+    assert (code, err) == (0, [])
+    found = js.surface_depth(*io.read_scene("drop.npz", surface=0.2, size=(8, 8)), js.Settings(samples=8))
+    count = int(found.met.sum())
+    assert count > 4 and f"points.ply, {count} of 64 rays meet the surface" in " ".join(out.split())
+    table = io.read_table("points.ply")
+    np.testing.assert_array_equal(table.position, found.position[found.met])
+    assert {"n", "quantity"} <= {name.lower() for name in table.columns} and not asked
+
+
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ([], "points.ply holds points of a surface, and drop.npz is shown as a medium; add --surface"),
+        (["--surface", "--background", "white"], "--background is of pictures"),
+        (["--surface", "--from-disk", "1"], "--from-disk is of pictures"),
+        (["--surface", "--tile", "1/2"], "--tile is of pictures"),
+        (["other.npz", "--surface"], "points.ply is one picture, but there are 2"),
+    ],
+)
+def test_points_of_what_has_none_are_wrong_usage(words, match, asked, capsys):
+    code, _, err = run(capsys, "render", "drop.npz", *words, "--size", "8x8", "-o", "points.ply")
+    assert code == 2 and match in err[-1] and not Path("points.ply").exists()
+
+
 def test_even_particles_of_other_kinds_of_files_are_a_medium(asked, capsys):
     places, speed = of_lattice()
     np.savez("even.npz", position=places, speed=speed)
     assert run(capsys, "render", "even.npz", *TINY)[0] == 0
     assert asked[-1][0].surface is None
+
+
+def stored(places, support):
+    np.savez("stored.npz", position=places, dye=places[:, 0], support_radius=support)
+    return io.read_scene("stored.npz", size=(8, 8))[0].surface
+
+
+def test_archives_are_liquids_where_particles_keep_apart_and_one_support_is_two_spacings(asked, capsys):
+    rng = np.random.default_rng(0)
+    stirred = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3) + rng.uniform(-0.2, 0.2, (512, 3))
+    spray = rng.uniform(9, 30, (10, 3))
+    liquid = np.concatenate([stirred, spray])
+    assert stored(liquid, 2.1) == js.Surface()
+    assert run(capsys, "render", "stored.npz", *TINY)[0] == 0 and asked[-1][0].surface == js.Surface()
+    assert stored(liquid, 5.0) is None  # supports of a smoother field
+    assert stored(liquid, rng.uniform(2.0, 2.2, len(liquid))) is None  # which adapt, as those of gas do
+    assert stored(rng.uniform(0, 8, (512, 3)), 2.1) is None  # at random: many are close to each other
+    assert stored(rng.normal(size=(512, 3)), 0.5) is None  # they cluster

@@ -68,3 +68,17 @@ def test_a_folder_that_cannot_be_is_exit_code_1_and_one_line(tmp_path, capsys):
 def test_wrong_usage_is_exit_code_2_and_one_line(capsys, arguments, message):
     code, _, err = run(capsys, "sweep", "scene:radial", *arguments)
     assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
+
+
+def test_a_surface_has_no_tolerances_to_compare(tmp_path, capsys):
+    words = [*SOURCE, "-o", tmp_path / "out", "--surface", 0.2, "--no-figures"]
+    code, _, err = run(capsys, "sweep", *words, "--estimators", "pilot")
+    assert code == 2 and "--surface and --estimators exclude each other" in err[-1]
+    scene, camera = js.scenes.load("radial", PARTICLES, width=WIDTH, height=HEIGHT)
+    shown = js.Scene(particles=scene.particles, transfer=scene.transfer, surface=js.Surface(0.2))
+    with pytest.raises(ValueError, match=r"`estimators` must be \(\)"):
+        js.sweep(shown, camera, js.Settings(samples=SAMPLES), estimators=("pilot",))
+    code, out, err = run(capsys, "sweep", *words, *LEAST_WORK[1:])
+    assert (code, err) == (0, []) and "samples/2" in out
+    found = read_journal(tmp_path / "out" / JOURNAL)
+    assert [row.method for row in found] == ["full rate", "samples/2"]

@@ -176,10 +176,12 @@ def test_what_is_shown_is_in_the_mark_of_a_moment(tmp_path):
     path = [periodic(tmp_path, 0, 0.0)]
     given = [{}, {"where": "temperature > 1e4"}, {"share": 0.5}, {"box": (1, 1, 1)}, {"within": js.Plane((0, 0, 0), (1, 0, 0))}]
     given += [{"box": (1, 1, 1), "center": (0, 0, 0)}, {"within": ~js.Plane((0, 0, 0), (1, 0, 0))}]
+    given += [{"surface": js.Surface()}, {"surface": js.Surface(0.4)}]
     marks = [Snapshots.from_files(path, **more).fingerprint(0.0) for more in given]
     assert len(set(marks)) == len(marks)
     clip = js.Sphere((0.5, 0.5, 0.5), 0.3)
-    assert Snapshots.from_files(path, within=clip).at(0.0).within is clip
+    shown = Snapshots.from_files(path, within=clip, surface=js.Surface(0.4)).at(0.0)
+    assert shown.within is clip and shown.surface == js.Surface(0.4)
 
 
 def test_volumes_and_densities_of_those_that_are_chosen_are_those_that_all_have_made(tmp_path):

@@ -1,5 +1,6 @@
 """A person in front of a real browser: opens, drags, zooms, edits colours, clicks, saves and closes."""
 
+import contextlib
 import io
 import json
 import re
@@ -24,11 +25,11 @@ SIZE, SAMPLES, PARTICLES = (96, 72), 16, 300
 SECONDS = 120
 
 
-@pytest.fixture(scope="module")
-def address():
-    """A view that is served, as the command line does it."""
+@contextlib.contextmanager
+def served(*more):
+    """A view that is served, as the command line does it: its address."""
     words = [f"scene:radial:particles={PARTICLES}", "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
-    more = ["--integrator", "samples", "--no-browser", "-q"]
+    more = ["--integrator", "samples", "--no-browser", "-q", *more]
     process = subprocess.Popen(
         [sys.executable, "-m", "jaxsph", "view", *words, *more], stdout=subprocess.PIPE, text=True, cwd=ROOT
     )
@@ -42,6 +43,12 @@ def address():
 
 
 @pytest.fixture(scope="module")
+def address():
+    with served() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     made = browsers.Browser(tmp_path_factory.mktemp("browser"))
     yield made
@@ -50,6 +57,13 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def page(browser, address):
+    with opened(browser, address) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def opened(browser, address):
+    """The page once its picture stands still; nothing may go wrong in it."""
     made = browser.page(address)
     made.until("document.body.dataset.final == 'true'", SECONDS)
     yield made
@@ -125,6 +139,22 @@ def test_drag_zoom_edit_and_click(page):
     page.click(x + (column + 0.5 - SIZE[0] / 2) * scale, y + (row + 0.5 - SIZE[1] / 2) * scale)
     page.until(f"document.querySelector('.numbers').innerText.includes('row {row}, column {column} of')")
     changed(page, lambda: page.click(x, y, clicks=2))
+
+
+def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
+    with served("--surface", "0.2") as address, opened(browser, address) as page:
+        assert shown(page).max() > 100
+        said = page.ask("document.querySelector('.panel').innerText.toLowerCase()")
+        assert "colour and opacity" not in said and "thinner" not in said and "extinction" not in said
+        assert "surface to rounding" in page.ask("document.querySelector('.status').innerText")
+        page.click(*page.middle(".picture"))
+        found = page.until("document.querySelectorAll('.numbers dt').length > 3 && document.querySelector('.numbers').innerText")
+        assert "depth of the surface" in found and "normal" in found
+        where = page.middle(".editor .point:nth-child(2)")
+        before = page.ask("document.querySelector('.editor .point:nth-child(2)').getAttribute('cy')")
+        changed(page, lambda: page.drag([where, (where[0] + 5, where[1] - 20), (where[0] + 10, where[1] - 45)]))
+        assert page.ask("document.querySelector('.editor .point:nth-child(2)').getAttribute('cy')") == before
+        assert near(shown(page), rendered(page))
 
 
 def test_keys_alone_suffice(page):

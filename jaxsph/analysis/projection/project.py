@@ -60,7 +60,7 @@ def project(
     Without a weight a pixel is $\sum_j a_j F_j$: an amount a unit of area, such as a column density where $a_j$ is a mass. $F_j$
     is the integral of the kernel, whose integral over space is 1, along the ray between two depths, in closed form. With a weight
     it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see
-    `emission_measure`.
+    `jaxsph.model.particles.held.emission_measure`.
 
     Args:
         particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.

@@ -13,13 +13,14 @@ from cyclopts import Parameter
 
 from jaxsph.analysis.explanation.explain import Explanation, pixel_of
 from jaxsph.analysis.explanation.explain import explain as explained
+from jaxsph.analysis.explanation.surface import SurfaceExplanation
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli.console import UsageError, camera_line, wrong_usage
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OWN, option, output
-from jaxsph.cli.options.settings import settings_of
+from jaxsph.cli.options.settings import as_medium, settings_of
 from jaxsph.cli.voice import say
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -27,7 +28,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Explain(groups.Options, groups.Draft, groups.Look, groups.View, groups.Beside, groups.Source):
+class Explain(groups.Options, groups.Draft, groups.SurfaceLook, groups.View, groups.Beside, groups.Source):
     """Options of the command."""
 
     pixel: Annotated[Any, option("--pixel", "R C", values.pixel, OWN, "row and column, from 0 at the top and the left")] = None
@@ -46,6 +47,7 @@ def explain(
     """Say what the error bound of a pixel is made of, and what its ray meets."""
     options = dataclasses.replace(asked, source=file)
     settings = settings_of(options)
+    options = as_medium(options, settings)
     cli_scene.require_something(options)
     if options.pixel is None:
         raise UsageError("--pixel R C says which pixel is to be explained: its row and its column")
@@ -63,6 +65,7 @@ def explain(
         voice.written(options.output)
 
 
-def _values(made: Explanation) -> dict[str, Any]:
+def _values(made: Explanation | SurfaceExplanation) -> dict[str, Any]:
     """All that is known, for a program."""
-    return {field.name: getattr(made, field.name) for field in dataclasses.fields(made)} | {"off_integral": made.off_integral}
+    known = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
+    return known if isinstance(made, SurfaceExplanation) else known | {"off_integral": made.off_integral}

@@ -36,10 +36,11 @@ from jaxsph.cli.console import (
 )
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, settings_of, stem_of
+from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
 from jaxsph.io.opening import options as opening
+from jaxsph.io.opening.surfaces import surface_of, told_of_surface
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -66,7 +67,7 @@ FORMATS = ("png", "exr")
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Movie(groups.Options, groups.Control, groups.Look, groups.View, groups.Mixed, groups.Source):
+class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
 
     size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")] = None
@@ -118,6 +119,7 @@ def movie(
     """
     options = dataclasses.replace(asked, source=list(files))
     settings, output = settings_of(options), _checked(options)
+    options = as_medium(options, settings)
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
@@ -248,7 +250,10 @@ def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded]:
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     center = cli_where.middle_of(survey, options)
-    snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options))
+    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
+    if surface is not None:
+        say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
+    snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)
     placed = dataclasses.replace(options, center=None) if center is not None else options
     return snapshots, cli_where.camera_of(snapshots, placed), cli_where.framed(snapshots, options)
 

@@ -16,7 +16,7 @@ from cyclopts import Parameter
 import jaxsph
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
+from jaxsph.cli import seen, voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.commands import disk, merge
 from jaxsph.cli.console import (
@@ -33,17 +33,17 @@ from jaxsph.cli.console import (
 )
 from jaxsph.cli.options import groups, values, words
 from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, flag, option, output
-from jaxsph.cli.options.settings import devices_of, settings_of, stem_of
+from jaxsph.cli.options.settings import as_medium, devices_of, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
 from jaxsph.io.images.image_files import write_image
-from jaxsph.model import Image, Scene, Settings, registry
+from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: named after FILE, here)"
+WHERE = ".exr or .png, of a surface .ply; of several files a folder, or a name with {} in it (default: after FILE, here)"
 
 
 @Parameter(name="*")
@@ -122,7 +122,7 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in IMAGES:
+    if output.suffix.lower() in IMAGES or seen.is_points(output):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
@@ -135,7 +135,8 @@ def _render(options: Any) -> None:
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0].file
     output = options.output or Path(stem_of(first) + merge.suffix(options))
-    require_writable(output, "an image must be", IMAGES)
+    require_writable(output, "an image must be", IMAGES if not seen.is_points(output) else (output.suffix,))
+    seen.check(options, output)
     cli_look.check_key(options, output)
     merge.check_tile(options, settings, output)
     _check_background(options, output)
@@ -146,8 +147,11 @@ def _render(options: Any) -> None:
         _save(image, options, output)
         _say_written(output, image, camera, settings, options)
         return
-    scene, camera, labels = cli_scene.scene_of(_as_medium(options, settings))
+    scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
     say("camera", camera_line(camera, options))
+    if seen.is_points(output):
+        seen.write(scene, camera, settings, options, output)
+        return
     started = time.perf_counter()
     if options.progressive:
         voice.release()
@@ -173,12 +177,6 @@ def _render(options: Any) -> None:
     _say_written(output, image, camera, settings, options)
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
         tell_if_unseen(options.command, output, [image.color])
-
-
-def _as_medium(options: Any, settings: Settings) -> Any:
-    """With no surface chosen for liquids where a tolerance is to be kept or media are asked at points: it has neither."""
-    needs = settings.tolerance is not None or registry.integrator_class(settings.integrator).asks_points
-    return dataclasses.replace(options, surface=False) if needs and options.surface is None else options
 
 
 def _how_wrong(image: Image, settings: Settings, progressive: bool) -> str:

@@ -53,7 +53,7 @@ _BASELINES = ",".join(contenders.BASELINES)
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sweep(groups.Options, groups.Quality, groups.Look, groups.View, groups.Source):
+class Sweep(groups.Options, groups.Quality, groups.SurfaceLook, groups.View, groups.Source):
     """Options of the command."""
 
     integrator: Annotated[
@@ -98,8 +98,12 @@ SWEEP = Sweep()
 def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, asked: Sweep = SWEEP) -> None:
     """Sweep, write, and say: append to DIR/sweep.jsonl what it does not hold yet, and write sweep.csv and figures."""
     options = dataclasses.replace(asked, source=file)
+    if options.surface is None:  # of a liquid tolerances are compared, which its surface does not have
+        options = dataclasses.replace(options, surface=False)
     if options.output is None:
         raise UsageError("-o DIR is needed: where should table and figures go?")
+    if options.surface is not False and options.estimators:
+        raise UsageError("--surface and --estimators exclude each other: a surface has no tolerance; leave one of them out")
     settings, moments = settings_of(options), _moments(options)
     if not options.no_figures:
         figures.require_matplotlib()  # before anything is read

@@ -17,10 +17,10 @@ from jaxsph.cli import voice
 from jaxsph.cli.console import UsageError, camera_line
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
-from jaxsph.cli.options.settings import SCENE, settings_of
+from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
-from jaxsph.model import Settings
+from jaxsph.model import Scene, Settings
 from jaxsph.viewer.code import Source
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
@@ -33,7 +33,7 @@ SECONDS = 1.0
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View(groups.Options, groups.Control, groups.Look, groups.View, groups.Mixed, groups.Source):
+class View(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
 
     size: Annotated[tuple[int, int], option("--size", "WxH", values.size, CAMERA, "pixels (default 960x720)")] = (960, 720)
@@ -61,8 +61,9 @@ def view(
     if options.json:
         raise UsageError("--json is for commands that end by themselves; the one line of stdout is the address")
     require("websockets", "an interactive view", "view")
-    settings = _settings(options)
+    options = as_medium(options, settings_of(options))
     scene, camera, _ = cli_scene.scene_of(options)
+    settings = _settings(options, scene)
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
     session = Session(scene, camera, settings, _source(options))
@@ -83,10 +84,11 @@ def view(
     return not ended
 
 
-def _settings(options: Any) -> Settings:
+def _settings(options: Any, scene: Scene) -> Settings:
     """Those that are asked for; where nothing says how well, those of a view."""
     made = settings_of(options)
-    if any(getattr(options, name) is not None for name in ("integrator", "estimator", "relax", "screen")):
+    how = "integrator", "estimator", "relax", "screen"
+    if scene.surface is not None or any(getattr(options, name) is not None for name in how):
         return made
     tolerance = DEFAULT.tolerance if made.tolerance is None else made.tolerance
     return dataclasses.replace(made, integrator=DEFAULT.integrator, tolerance=tolerance)
@@ -98,7 +100,10 @@ def _source(options: Any) -> Source:
     if options.source.startswith(SCENE):
         name, behind = values.file_and_options(options.source)
         more = "".join(f"{key}={value}, " for key, value in behind.items())
-        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more}width={width}, height={height})"
+        more += f"width={width}, height={height}"
+        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more})"
+        if options.surface not in (None, False):
+            python += f"\nscene = dataclasses.replace(scene, surface=js.Surface({options.surface!r}))"
     else:
         names = (
             "color_by",
@@ -111,6 +116,7 @@ def _source(options: Any) -> Source:
             "norm",
             "range",
             "preset",
+            "surface",
             "eye",
             "target",
         )

@@ -5,12 +5,13 @@ Flow: options -> [settings] -> Settings, devices, names -> commands.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.engine.runtime.devices import chosen_devices
-from jaxsph.model import Settings
+from jaxsph.model import Settings, registry
 
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
@@ -29,6 +30,22 @@ def settings_of(options: Any) -> Settings:
     given["memory_limit"] = None if options.memory is None else int(options.memory * 2**30)
     with wrong_usage():
         return Settings(**{name: value for name, value in given.items() if value is not None})
+
+
+def as_medium(options: Any, settings: Settings) -> Any:
+    """Options that choose no surface for liquids where a tolerance is to be kept or media are asked at points: it has neither.
+
+    Raises:
+        UsageError: a surface is asked for as well.
+    """
+    asks_points = registry.integrator_class(settings.integrator).asks_points
+    if settings.tolerance is None and not asks_points:
+        return options
+    by_rays = settings.screen != "pixels" or getattr(options, "progressive", False)  # a tolerance of the screen alone
+    if options.surface not in (None, False) and (asks_points or not by_rays):
+        other = f"--integrator {settings.integrator}" if asks_points else "--tolerance"
+        raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
+    return dataclasses.replace(options, surface=False) if options.surface is None else options
 
 
 def devices_of(options: Any) -> str | int | None:

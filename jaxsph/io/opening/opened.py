@@ -18,6 +18,7 @@ import numpy as np
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, look_of
 from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.surfaces import surface_of, told_of_surface
 from jaxsph.io.opening.views import Said, camera_and_clip, place_of
 from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
@@ -28,7 +29,6 @@ from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.exposure import exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
@@ -36,8 +36,6 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
 NEEDS_ROWS = ("face-on", "edge-on")
-OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY"
-"""Formats that liquids are kept in, by tools that draw their surface."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -135,7 +133,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
-    surface = _surface_of(loaded, look, source)
+    surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
@@ -148,35 +146,11 @@ def staged(
         scene = exposed(scene, camera, look)
     else:
         scene = dataclasses.replace(scene, surface=surface)
-        smoothed = "" if surface.smoothing == 1 else f", supports times {surface.smoothing:g}"
-        chosen = "" if look.surface is not None else ", as of a liquid; --surface none shows a medium"
-        said = [("surface", f"where the coverage by particles is {surface.level:g}{smoothed}{chosen}"), *said]
+        said = [("surface", told_of_surface(surface, look)), *said]
     transfer = scene.looks[0]
     span = f"{float(transfer.values[0]):.6g} .. {float(transfer.values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or _labels(loaded), tuple(said))
-
-
-def _surface_of(loaded: Loaded, look: Look, source: Source | None) -> Surface | None:
-    """The surface that is asked for, or that of a liquid; that of a volume is another."""
-    if look.surface is None:
-        return Surface() if _is_liquid(loaded) and not _of_medium(look, source) else None
-    if look.surface is False:
-        return None
-    if isinstance(loaded.shown, Volume):
-        raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
-    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
-
-
-def _is_liquid(loaded: Loaded) -> bool:
-    """Whether particles lie evenly, without supports of their own, in a file of a kind that liquids are kept in."""
-    return loaded.report is not None and loaded.report.evenly and loaded.report.source in OF_LIQUIDS
-
-
-def _of_medium(look: Look, source: Source | None) -> bool:
-    """Whether anything was asked for that only a medium has."""
-    own = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
-    return any(one is not None for one in own)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

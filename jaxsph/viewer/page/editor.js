@@ -22,7 +22,7 @@ export function editor(send) {
   const element = made("div", {}, svg, made("div", { class: "row" }, color, value, add, remove));
 
   const x = (place) => PAD + Math.max(0, Math.min(1, place)) * (WIDTH - 2 * PAD);
-  const y = (extinction) => HEIGHT - PAD - Math.min(1, Math.sqrt(Math.max(0, extinction) / look.top)) * (HEIGHT - 2 * PAD);
+  const y = (extinction) => look.flat ? HEIGHT / 2 : HEIGHT - PAD - Math.min(1, Math.sqrt(Math.max(0, extinction) / look.top)) * (HEIGHT - 2 * PAD);
   const placeAt = (at) => Math.max(0, Math.min(1, (at - PAD) / (WIDTH - 2 * PAD)));
   const opaqueAt = (at) => look.top * Math.max(0, Math.min(1, (HEIGHT - PAD - at) / (HEIGHT - 2 * PAD))) ** 2;
   const css = (row) => `rgb(${row.slice(2, 5).map((part) => Math.round(255 * part)).join(" ")})`;
@@ -46,7 +46,7 @@ export function editor(send) {
   function insert(place, extinction, done = true) {
     const row = between(place);
     row[0] = place;
-    if (extinction != null) row[1] = extinction;
+    if (extinction != null && !look.flat) row[1] = extinction;
     points.push(row);
     points.sort((one, other) => one[0] - other[0]);
     chosen = points.indexOf(row);
@@ -66,7 +66,7 @@ export function editor(send) {
   function move(place, extinction) {
     const low = chosen ? points[chosen - 1][0] : 0, high = chosen < points.length - 1 ? points[chosen + 1][0] : 1;
     points[chosen][0] = Math.max(low, Math.min(high, place));
-    points[chosen][1] = Math.max(0, Math.min(look.top, extinction));
+    if (!look.flat) points[chosen][1] = Math.max(0, Math.min(look.top, extinction));
   }
   function draw() {
     if (!look) return;
@@ -79,6 +79,8 @@ export function editor(send) {
         });
       }
     }
+    line.toggleAttribute("hidden", look.flat);
+    svg.setAttribute("aria-label", look.flat ? "control points of colour" : "control points of colour and opacity");
     const corners = [[0, points[0][1]], ...points, [1, points[points.length - 1][1]]];
     const path = [];
     for (let i = 0; i + 1 < corners.length; i++) {
@@ -104,12 +106,13 @@ export function editor(send) {
       one.setAttribute("cy", y(row[1]));
       one.setAttribute("fill", look.split ? "#cfd6df" : css(row));
       one.classList.toggle("chosen", i === chosen);
-      one.setAttribute("aria-label", `point ${i + 1} of ${points.length}: extinction ${short(row[1])}`);
+      one.setAttribute("aria-label", `point ${i + 1} of ${points.length}: ${look.flat ? `at ${short(row[5])}` : `extinction ${short(row[1])}`}`);
     });
     const row = points[chosen];
     color.disabled = look.split;
     if (document.activeElement !== color) color.value = hex(row);
-    value.textContent = `${row[5] == null || held ? "" : `at ${short(row[5])}, `}extinction ${short(row[1])}`;
+    const at = row[5] == null || held ? [] : [`at ${short(row[5])}`];
+    value.textContent = [...at, ...(look.flat ? [] : [`extinction ${short(row[1])}`])].join(", ");
     remove.disabled = points.length < 2;
   }
   const which = (element) => [...marks.children].indexOf(element);

@@ -31,8 +31,9 @@ export function mount(root, link) {
   const edit = editor(send);
   const maps = made("select", { "aria-label": "colour map", onchange: () => { if (maps.value) send({ do: "colormap", name: maps.value }); maps.value = ""; } },
     made("option", { value: "" }, "Colour map…"), ...MAPS.map((name) => made("option", { value: name }, name)));
+  const opaque = [button("Thinner", "half as opaque", () => send({ do: "exposure", stops: -1 })), button("Denser", "twice as opaque", () => send({ do: "exposure", stops: 1 }))];
   const look = section("Colour and opacity", edit.element,
-    made("div", { class: "row" }, maps, button("Thinner", "half as opaque", () => send({ do: "exposure", stops: -1 })), button("Denser", "twice as opaque", () => send({ do: "exposure", stops: 1 }))),
+    made("div", { class: "row" }, maps, ...opaque),
     made("div", { class: "row" }, button("Undo", "undo (u)", () => send({ do: "undo" })), button("Redo", "redo (y)", () => send({ do: "redo" })), button("Reset", "as it was", () => send({ do: "reset_look" }))));
   const numbers = made("dl", { class: "numbers" }, made("dt", {}, "click the picture"), made("dd", {}, "for its numbers"));
   const pixel = section("Pixel", numbers);
@@ -40,7 +41,7 @@ export function mount(root, link) {
   const texts = made("dialog", { class: "dialog", "aria-label": "code" }, made("h2", {}, "This view, again"), code, closing());
   const help = made("dialog", { class: "dialog", "aria-label": "help" }, made("h2", {}, "Help"),
     made("table", {}, ...KEYS.map(([keys, does]) => made("tr", {}, made("th", { scope: "row" }, keys), made("td", {}, does)))),
-    made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots."), closing());
+    made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots. A surface is opaque: its bars are where rays met it, and its points have colours alone."), closing());
   const files = link.files ? [made("a", { class: "button", href: "view.exr", download: "view.exr" }, "EXR"), made("a", { class: "button", href: "look.json", download: "look.json" }, "Look")] : [];
   const keep = section("Keep", made("div", { class: "row" }, button("PNG", "save the picture (s)", save), ...files, button("Code", "Python and command", () => send({ do: "code" })), button("Help", "help (?)", () => help.showModal())));
   root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, look, pixel, keep)), texts, help);
@@ -115,10 +116,11 @@ export function mount(root, link) {
       row("alpha", (1 - found.transmittance).toFixed(4));
       if (found.error != null) row("error", `at most ${short(found.error)}`);
       if (found.place) {
-        row("depth at half light", short(found.depth));
+        row(found.normal ? "depth of the surface" : "depth at half light", short(found.depth));
         row("place", found.place.map(short).join(", "));
+        if (found.normal) row("normal", found.normal.map((part) => part.toFixed(3)).join(", "));
         if (found.neighbours != null) row("quantity", `${short(found.quantity)}, of ${found.neighbours} particles`);
-      } else row("depth", "less than half of the light is absorbed");
+      } else row("depth", found.surface ? "no surface there" : "less than half of the light is absorbed");
     }
     numbers.replaceChildren(...rows);
     numbers.classList.remove("stale");
@@ -135,6 +137,8 @@ export function mount(root, link) {
       complain(message.told);
       edit.show(message.look);
       look.hidden = !message.look;
+      look.firstChild.textContent = message.look?.flat ? "Colour" : "Colour and opacity"; // a surface is opaque
+      opaque.forEach((one) => { one.hidden = Boolean(message.look?.flat); });
       place();
     } else if (message.is === "histogram") edit.over(message);
     else if (message.is === "picked") pick(message);

@@ -1,0 +1,90 @@
+"""Particles by their surface where that was asked for, or where nobody chose and they are a liquid.
+
+Flow: Particles or Volume, Report, Look -> [surfaces] -> Surface or None, what was chosen.
+
+A liquid is told by its data: particles lie evenly, hardly two of them closer than half a spacing, as pressure keeps them apart,
+and all supports are one length, of about two spacings; spray lies farther apart. Particles at random lie evenly in the large, but
+30 of 100 have a neighbour that near. Files of gas, in formats of codes for it, are never taken for liquids.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.spatial
+
+from jaxsph.io.opening.options import Look, Source
+from jaxsph.io.settle.assemble import Report
+from jaxsph.io.settle.supports import even_spacing
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.surface import Surface
+from jaxsph.model.volume import Volume
+
+OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY"
+"""Formats that liquids are kept in, by tools that draw their surface: points that lie evenly are one, without supports, too."""
+ALSO = (*OF_LIQUIDS, "NumPy archive")
+"""Formats in which particles with supports may be a liquid."""
+LEAST, MOST = 1.5, 3.0
+"""Support of a liquid over its spacing; mixed and splashing ones have 2.0 to 2.3."""
+NEAR, FEW = 0.5, 0.05
+"""Of the spacing, within which at most such a share of particles has a neighbour: up to 0.014 of liquids, 0.3 at random."""
+ONE, SAMPLED = 1e-6, 1 << 14
+"""Of a support, by which others may differ and be the same; and particles whose nearest neighbour is looked at."""
+
+
+def surface_of(
+    shown: Particles | Volume, report: Report | None, look: Look, source: Source | None, *, clipped: bool = False
+) -> Surface | None:
+    """The surface that is asked for, or that of a liquid; None shows a medium.
+
+    Args:
+        shown: what is looked at; of a sequence the particles of one of its files, by which all are shown alike.
+        report: how particles were settled.
+        look, source: what was asked for.
+        clipped: whether clips cut what is shown: nothing closes a surface there, and what was asked for is to see inside.
+
+    Raises:
+        ValueError: a surface of a volume, which is another.
+    """
+    if look.surface is None:
+        if clipped or _of_medium(look, source) or not isinstance(shown, Particles):
+            return None
+        return Surface() if _is_liquid(shown, report, source) else None
+    if look.surface is False:
+        return None
+    if isinstance(shown, Volume):
+        raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
+    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
+
+
+def told_of_surface(surface: Surface, look: Look) -> str:
+    """Where it is, and whether it was chosen, for people."""
+    smoothed = "" if surface.smoothing == 1 else f", supports times {surface.smoothing:g}"
+    chosen = "" if look.surface is not None else ", as of a liquid, which lies evenly; --surface none shows a medium"
+    return f"where the coverage by particles is {surface.level:g}{smoothed}{chosen}"
+
+
+def _is_liquid(particles: Particles, report: Report | None, source: Source | None) -> bool:
+    """Whether particles are those of a liquid, by the format of their file, and by how they lie."""
+    if report is None or report.source not in ALSO or (source is not None and source.support is not None):
+        return False
+    if report.evenly:
+        return report.source in OF_LIQUIDS
+    columns = particles.to_numpy()
+    support, position = columns["support"].astype(np.float64), columns["position"].astype(np.float64)
+    if not len(support) or np.ptp(support) > ONE * support[0]:
+        return False
+    spacing = even_spacing(position)
+    return spacing is not None and LEAST <= support[0] / spacing <= MOST and _are_apart(position, spacing)
+
+
+def _are_apart(position: np.ndarray, spacing: float) -> bool:
+    """Whether hardly any have a neighbour within half of a spacing."""
+    some = position[:: -(-len(position) // SAMPLED)]
+    nearest = scipy.spatial.cKDTree(position).query(some, 2)[0][:, 1]
+    return float((nearest < NEAR * spacing).mean()) <= FEW
+
+
+def _of_medium(look: Look, source: Source | None) -> bool:
+    """Whether anything was asked for that only a medium has."""
+    own = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
+    return any(one is not None for one in own)
