@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import jaxsph
+
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = PROJECT["project"]["optional-dependencies"]
@@ -35,6 +37,12 @@ def test_what_tests_read_is_in_the_source_distribution():
     read = {path for path in re.findall(r'(?:ROOT|parent) / "([\w.]+)"', code) if (ROOT / path).exists()}
     assert {"docs", "notebooks", "benchmarks", "Makefile", "README.md"} <= read
     assert read - {"pyproject.toml"} <= included  # that one is always there
+
+
+def test_the_version_has_one_place_that_citations_and_changes_agree_with():
+    assert "version" in PROJECT["project"]["dynamic"]
+    assert re.search(rf"^version: {re.escape(jaxsph.__version__)}$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert re.search(rf"^## {re.escape(jaxsph.__version__)}$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_libraries_that_tests_alone_import_come_with_the_tests():
