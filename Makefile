@@ -1,4 +1,4 @@
-# make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README. make demo: one picture.
+# make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README and of the pages. make demo: one picture.
 # make docs: the site in site/, to be opened from there.
 # Nothing but Python is needed.
 # make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
@@ -76,7 +76,7 @@ test-endurance: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q --timeout 0 -m endurance $(PYTEST_ARGS) tests/test_endurance.py
 
 notebooks: $(VENV)/.installed-test
-	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py
+	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py tests/test_site.py
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .
