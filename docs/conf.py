@@ -20,6 +20,7 @@ from jaxsph import __version__ as release  # noqa: E402
 project, author, copyright = "jaxsph", "jaxsph contributors", "jaxsph contributors"
 root_doc = "README"
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/*.md", "notebooks/*.ipynb"]
+exclude_patterns = [".*", "benchmarks", "build", "dist", "jaxsph", "site", "tests"]  # folders not to be walked through
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 suppress_warnings = ["misc.highlighting_failure"]  # of examples with placeholders
 
@@ -40,16 +41,17 @@ napoleon_custom_sections = ["Differentiation"]
 napoleon_use_ivar, napoleon_attr_annotations = True, False
 
 CONTENTS = {
-    "How to": "rendering colours selecting projections surfaces volumes points movies viewing error_control python gradients "
-    "many_machines",
     "Tutorials": "/notebooks/000_first_image /notebooks/100_tolerance /notebooks/200_inverse /notebooks/300_the_trade "
     "/notebooks/400_progressive /notebooks/500_points_and_grids",
+    "How to": "rendering colours selecting projections surfaces volumes points movies viewing error_control python gradients "
+    "many_machines",
     "Reference": "api command_line files glossary packaging /CHANGELOG",
     "Explanation": "what_is_computed accuracy_and_limits speed scale for_jax_users extending /CONTRIBUTING",
     "Results": "how_accurate_how_fast gallery",
 }
 HIDDEN = "\n\n```{{toctree}}\n:hidden:\n:caption: {}\n\n{}\n```\n"
 REDIRECT = '<!DOCTYPE html><meta http-equiv="refresh" content="0; url=README.html"><a href="README.html">jaxsph</a>\n'
+INNER = "jaxlib._jax.Array"  # what `jax.Array` says it is
 MARKED = re.compile(r"(``.+?``|`[^`\n]+`|\$[^$]+\$|\[[^]]+\]\(https?://[^)]+\))")
 
 
@@ -111,11 +113,11 @@ def joined_equations(app: Any, what: str, name: str, thing: Any, options: Any, l
     lines[:] = whole
 
 
-def shorter(app: Any, what: str, name: str, thing: Any, options: Any, signature: str, returns: str) -> tuple[str, str]:
+def shorter(app: Any, page: nodes.document) -> None:
     """Signatures name JAX's array as its users do."""
-    return tuple(
-        text and text.replace("jaxlib._jax.Array", "Array").replace("jax.Array", "Array") for text in (signature, returns)
-    )
+    for text in list(page.findall(nodes.Text)):
+        if INNER in text:
+            text.parent.replace(text, nodes.Text(text.replace(INNER, "Array")))
 
 
 def inline_math(writer: Any, node: nodes.math) -> None:
@@ -142,5 +144,5 @@ def setup(app: Any) -> None:
     app.connect("source-read", with_contents)
     app.connect("autodoc-process-docstring", joined_equations, priority=100)
     app.connect("autodoc-process-docstring", as_restructured, priority=200)
-    app.connect("autodoc-process-signature", shorter)
+    app.connect("doctree-read", shorter)
     app.connect("build-finished", with_entry)
