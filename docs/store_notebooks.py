@@ -18,7 +18,9 @@ import numpy as np
 from PIL import Image
 
 NOTEBOOKS = pathlib.Path(__file__).resolve().parent.parent / "notebooks"
-PICTURE = "image/png"
+PICTURE, PACKED = "image/png", "image/jpeg"
+MAX_WIDTH, QUALITY, LARGE = 800, 85, 20_000
+"""Pictures are stored no wider than this, as PNG, or where that has so many bytes as JPEG of this quality if it is smaller."""
 MEASURED = "measured"
 """Tag of cells whose pictures show times: another run makes others."""
 
@@ -31,15 +33,33 @@ def executed(path: pathlib.Path, folder: pathlib.Path) -> Any:
     return notebook
 
 
-def pictures(cell: Any) -> list[str]:
-    """What a cell shows, as PNG in base64."""
-    outputs = cell.get("outputs", ())
-    return ["".join(output["data"][PICTURE].split()) for output in outputs if PICTURE in output.get("data", {})]
+def pictures(cell: Any) -> list[bytes]:
+    """What a cell shows, as files."""
+    shown = (output.get("data", {}) for output in cell.get("outputs", ()))
+    return [base64.b64decode(data[kind]) for data in shown for kind in (PICTURE, PACKED) if kind in data]
 
 
-def numbers(picture: str) -> np.ndarray:
-    """A picture in base64 as (height, width, 3) of 0 to 255."""
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB"), np.float64)
+def numbers(picture: bytes) -> np.ndarray:
+    """A picture as (height, width, 3) of 0 to 255."""
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"), np.float64)
+
+
+def packed(picture: bytes) -> tuple[str, bytes]:
+    """The kind of file and the file of a picture that a notebook holds."""
+    image = Image.open(io.BytesIO(picture)).convert("RGB")
+    image.thumbnail((MAX_WIDTH, image.height), Image.Resampling.LANCZOS)
+    files = {kind: io.BytesIO() for kind in (PICTURE, PACKED)}
+    image.save(files[PICTURE], "PNG", optimize=True)
+    image.save(files[PACKED], "JPEG", optimize=True, quality=QUALITY)
+    kind = min(files, key=lambda kind: len(files[kind].getvalue()))
+    kind = kind if len(files[PICTURE].getvalue()) > LARGE else PICTURE
+    return kind, files[kind].getvalue()
+
+
+def output(picture: bytes) -> Any:
+    """What a notebook holds of a picture."""
+    kind, file = packed(picture)
+    return nbformat.v4.new_output("display_data", data={kind: base64.b64encode(file).decode()})
 
 
 def stored(path: pathlib.Path, run: Any) -> Any:
@@ -48,7 +68,7 @@ def stored(path: pathlib.Path, run: Any) -> Any:
     for cell, made in zip(notebook.cells, run.cells, strict=True):
         if cell.cell_type == "code":
             cell.execution_count = None
-            cell.outputs = [nbformat.v4.new_output("display_data", data={PICTURE: picture}) for picture in pictures(made)]
+            cell.outputs = [output(picture) for picture in pictures(made)]
     return notebook
 
 
