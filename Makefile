@@ -1,4 +1,5 @@
-# make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README. make demo: one picture.
+# make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README and of the pages. make demo: one picture.
+# make docs: the site in site/, to be opened from there.
 # Nothing but Python is needed.
 # make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
 SHELL := /bin/bash
@@ -12,7 +13,7 @@ PYTEST_ARGS ?=
 SHARE_COMPILED = JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 JAX_COMPILATION_CACHE_DIR
 PIP := $(VENV)/bin/python -m pip -qq --disable-pip-version-check
 
-.PHONY: setup check test test-slow test-slow-share test-nightly test-endurance notebooks lint format demo results clean
+.PHONY: setup check test test-slow test-slow-share test-nightly test-endurance notebooks lint format demo docs results clean
 
 setup: $(VENV)/.installed-all
 
@@ -35,6 +36,11 @@ $(VENV)/.installed-all: pyproject.toml | $(VENV)/.python
 	@echo "installing jaxsph[all] into $(VENV)"
 	@$(PIP) install --editable '.[all]'
 	@touch $(VENV)/.installed-test $@
+
+$(VENV)/.installed-docs: pyproject.toml | $(VENV)/.python
+	@echo "installing jaxsph[docs] into $(VENV)"
+	@$(PIP) install --editable '.[docs]'
+	@touch $@
 
 # What the tests compile is kept for the next run: `make clean` or another COMPILED begins anew.
 COMPILED ?= $(VENV)/compiled-tests
@@ -71,7 +77,7 @@ test-endurance: $(VENV)/.installed-test
 	@$(VENV)/bin/python -m pytest -q --timeout 0 -m endurance $(PYTEST_ARGS) tests/test_endurance.py
 
 notebooks: $(VENV)/.installed-test
-	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py
+	@$(SUITE) -m notebook $(PYTEST_ARGS) tests/test_notebooks.py tests/test_docs.py tests/test_site.py
 
 lint: $(VENV)/.installed-test
 	@$(VENV)/bin/ruff check --quiet --output-format concise .
@@ -85,6 +91,12 @@ format: $(VENV)/.installed-test
 
 demo: $(VENV)/.installed-all
 	@$(VENV)/bin/jaxsph demo -o demo
+
+# Warnings are errors, and links are followed; nothing of it needs a network.
+docs: $(VENV)/.installed-docs
+	@$(VENV)/bin/python -m sphinx -q -W --keep-going -E -b html -c docs -d build/doctrees . build/html
+	@rm -rf site && mv build/html site
+	@$(VENV)/bin/python docs/check_site.py site
 
 # The last two tell how long compiling takes, and so share nothing.
 MEASURE = $(SHARE_COMPILED)=$(VENV)/compiled $(VENV)/bin/python
@@ -107,5 +119,5 @@ results: $(VENV)/.installed-all
 	$(VENV)/bin/python benchmarks/report.py
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache demo.exr demo.png
+	rm -rf $(VENV) build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache demo.exr demo.png
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

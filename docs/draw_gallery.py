@@ -1,10 +1,11 @@
-"""Draws the sheets of docs/gallery.md: every particle file of a folder as `jaxsph render FILE` shows it, and what else is asked.
+"""Draws the pictures of docs/gallery.md and of the README: what commands show, and every particle file of a folder by default.
 
-python docs/draw_gallery.py FOLDER
+python docs/draw_gallery.py FOLDER [files|front|NAME_OF_A_CARD ...]
 """
 
 from __future__ import annotations
 
+import os
 import pathlib
 import sys
 import tempfile
@@ -13,31 +14,62 @@ from PIL import Image, ImageDraw
 
 from jaxsph.cli import main as cli
 
-HERE = pathlib.Path(__file__).parent / "gallery"
+HERE = pathlib.Path(__file__).parent.resolve() / "gallery"
+GALAXY = HERE.parent.parent / "notebooks" / "gallery" / "galaxy.png"
 CELL, CAPTION, COLUMNS = 300, 34, 4
+CARD, SQUARE, FRONT = (480, 360), (400, 400), (1600, 400)
 REFUSED = "BROKEN"
-DENSE, SPIRAL, FLUID = "gadget4_lcdm_gas_snapshot_002.hdf5", "gadget2_binary_gas_9030.gadget", "mixer_001.npz"
-ASKED = (
-    ("colour by heat, opacity by density", SPIRAL, ["render", "--preset", "temperature", "--opacity-by", "log10:density"]),
-    ("--center densest: the box wraps", DENSE, ["render", "--center", "densest"]),
-    ("column density: jaxsph project", DENSE, ["project", "--norm", "log"]),
-    ("mean of energy by mass", DENSE, ["project", "--of", "InternalEnergy", "--weight", "mass", "--norm", "log"]),
-    ("--clip plane:...", FLUID, ["render", "--clip", "plane:0,0,0,0.4,0,-1"]),
-    ("jaxsph slice", FLUID, ["slice", "--plane", "0,0,0,0,0,-1"]),
-    ("--where 'hypot(x, z) > 0.5'", FLUID, ["render", "--where", "hypot(x, z) > 0.5", "--surface", "none"]),
-    ("--annotate: bar, scale, axes, time", DENSE, ["render", "--annotate"]),
-)
-"""What it says below, file, command and options."""
+BOX, DISC, FLUID = "gadget4_lcdm_gas_snapshot_002.hdf5", "gadget2_binary_gas_9030.gadget", "mixer_001.npz"
+CLOSE = "--eye", "0.9,2.0,3.6", "--target", "-0.17,-0.2,0.27"
+CARDS = {
+    "render": (BOX, "render", "--center", "densest"),
+    "annotate": (BOX, "render", "--center", "densest", "--annotate", "--background", "white"),
+    "project": (BOX, "project", "--norm", "log"),
+    "surface": ("scene:dam_break", "render", "--surface", *CLOSE),
+    "mean": (BOX, "project", "--of", "InternalEnergy", "--weight", "mass", "--norm", "log", "--colormap", "magma"),
+    "arrows": (DISC, "project", "--center", "densest", "--width", "12", "--norm", "log", "--annotate", "--arrows", "velocity"),
+    "temperature": (DISC, "render", "--preset", "temperature", "--opacity-by", "log10:density"),
+    "halo": ("sphviewer_dm_halo.hdf5", "render", "--center", "densest", "--width", "0.2"),
+    "clip": (FLUID, "render", "--clip", "plane:0,0,0,0.4,0,-1"),
+    "slice": (FLUID, "slice", "--plane", "0,0,0,0,0,-1"),
+    "where": (FLUID, "render", "--where", "hypot(x, z) > 0.5", "--surface", "none"),
+    "letters": ("scene:letters", "render", "--tolerance", "0.01", "--integrator", "segments"),
+    "transfer": (BOX, "transfer"),
+    "explain": ("scene:checker_board", "explain", "--pixel", "180", "240", "--integrator", "segments", "--tolerance", "0.01"),
+}
+"""File or scene, command and options of every card."""
 
 
-def drawn(command: list[str], file: pathlib.Path, folder: pathlib.Path, number: int) -> Image.Image:
-    """The picture of a command."""
-    output = folder / f"{number}.png"
-    name, *options = command
-    arguments = [name, str(file), "-o", str(output), "--size", f"{CELL}x{CELL}", *options]
-    if cli.main(arguments):
-        raise SystemExit(f"{file.name}: the command failed: jaxsph {' '.join(arguments)}")
-    return Image.open(output).convert("RGB")
+def drawn(command: list[str], output: pathlib.Path) -> Image.Image:
+    """The picture that a command writes."""
+    if cli.main([*command, "-o", str(output)]):
+        raise SystemExit(f"the command failed: jaxsph {' '.join(command)}")
+    picture = Image.open(output)
+    return Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture.convert("RGBA")).convert("RGB")
+
+
+def card(name: str, size: tuple[int, int], folder: pathlib.Path, *more: str) -> Image.Image:
+    """What the command of a card shows, at a size, with more options."""
+    source, command, *options = CARDS[name]
+    shape = () if command == "transfer" else ("--size", f"{size[0]}x{size[1]}")
+    return drawn([command, source, *options, *shape, *more], folder / f"{name}.png")
+
+
+def draw_front(folder: pathlib.Path) -> None:
+    """The wide picture of the README: cosmic gas, a galaxy of points in gas, a fluid's surface, a column density."""
+    made = Image.new("RGB", FRONT, "black")
+    galaxy = Image.open(GALAXY).convert("RGB")
+    galaxy = galaxy.resize((galaxy.width * SQUARE[1] // galaxy.height, SQUARE[1]), Image.Resampling.LANCZOS)
+    aside = (galaxy.width - SQUARE[0]) // 2
+    pictures = (
+        card("render", SQUARE, folder, "--width", "42000"),
+        galaxy.crop((aside, 0, aside + SQUARE[0], SQUARE[1])),
+        card("surface", SQUARE, folder, "--fov", "56"),
+        card("project", SQUARE, folder),
+    )
+    for place, picture in enumerate(pictures):
+        made.paste(picture, (place * SQUARE[0], 0))
+    made.save(HERE / "front.jpg", quality=88, optimize=True)
 
 
 def sheet(pictures: list[tuple[str, Image.Image]], path: pathlib.Path) -> None:
@@ -50,22 +82,33 @@ def sheet(pictures: list[tuple[str, Image.Image]], path: pathlib.Path) -> None:
         picture.thumbnail((CELL, CELL))
         made.paste(picture, (x + (CELL - picture.width) // 2, y + (CELL - picture.height) // 2))
         draw.text((x + CELL // 2, y + CELL + CAPTION // 2), text, fill="white", anchor="mm", font_size=12)
-    path.parent.mkdir(exist_ok=True)
     made.save(path, optimize=True)
 
 
+def draw_card(name: str, folder: pathlib.Path) -> None:
+    """One picture of the gallery; parallel rays along an axis of a box fill a square."""
+    picture = card(name, SQUARE if name in ("project", "mean") else CARD, folder)
+    picture.thumbnail(CARD, Image.Resampling.LANCZOS)
+    picture.save(HERE / f"{name}.jpg", quality=88, optimize=True)
+
+
+def draw_files(folder: pathlib.Path) -> None:
+    """Every file of the folder, with nothing chosen by hand."""
+    names = sorted(file.name for file in pathlib.Path().iterdir() if file.suffix != ".md" and not file.name.startswith(REFUSED))
+    asked = [(name, ["render", name]) for name in names]
+    asked.append((f"{BOX} --part-type 1", ["render", BOX, "--part-type", "1"]))
+    size = "--size", f"{CELL}x{CELL}"
+    shown = [(text, drawn([*words, *size], folder / f"{number}.png")) for number, (text, words) in enumerate(asked)]
+    sheet(shown, HERE / "files.png")
+
+
 def main() -> None:
-    """Draw both."""
-    data = pathlib.Path(sys.argv[1])
-    files = sorted(file for file in data.iterdir() if file.suffix != ".md" and not file.name.startswith(REFUSED))
+    """Draw all, or what is named."""
+    os.chdir(sys.argv[1])  # figures name the files that they show
     with tempfile.TemporaryDirectory() as folder:
-        place = pathlib.Path(folder)
-        shown = [(file.name, drawn(["render"], file, place, number)) for number, file in enumerate(files)]
-        dark = data / DENSE
-        shown.append((f"{dark.name} --part-type 1", drawn(["render", "--part-type", "1"], dark, place, len(files))))
-        sheet(shown, HERE / "files.png")
-        asked = [(text, drawn(command, data / file, place, number)) for number, (text, file, command) in enumerate(ASKED)]
-        sheet(asked, HERE / "asks.png")
+        for name in sys.argv[2:] or ["files", "front", *CARDS]:
+            place = pathlib.Path(folder)
+            {"files": draw_files, "front": draw_front}.get(name, lambda place, name=name: draw_card(name, place))(place)
 
 
 if __name__ == "__main__":

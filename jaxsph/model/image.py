@@ -130,7 +130,13 @@ class Image:
         type(self).writer(path, self, background)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
-        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time. See `jaxsph.plot.image_figure`."""
+        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time.
+
+        Args:
+            scene: gives colour bars and the outline; without it there are none.
+            camera: that of the picture, gives scale bar, axes and outline.
+            more: `labels`, `target`, `outline`, `triad` and `title` of `jaxsph.plot.image_figure.image_figure`.
+        """
         return type(self).drawer(self, scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:

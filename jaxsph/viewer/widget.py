@@ -28,7 +28,7 @@ MAX_UNSEEN = 2
 
 
 def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
-    """ControlPoints around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
+    """Look around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
 
     `jaxsph view FILE` shows the same in a browser. A draft comes while something moves; then every pixel gets its ray; then the
     tolerance is kept. The widget always says which of these is seen, and how far it may be off.

@@ -1,4 +1,4 @@
-"""The README's words on gradients lead back to the scene: its own example with an optimiser, and a camera."""
+"""The words on gradients lead back to the scene: its own example with an optimiser, and a camera."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ import pytest
 
 import jaxsph as js
 
-README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "gradients.md").read_text(encoding="utf-8")
 STARTS = [(0.25, 0.0, 0.2), (-0.2, 0.15, 0.0), (0.1, -0.25, -0.2), (-0.1, -0.1, 0.3)]
 
 
@@ -33,14 +33,14 @@ def descended(of, unknown, steps, rate):
     return float(value), unknown
 
 
-def losses_of_the_readme(tmp_path, monkeypatch):
+def losses_of_the_page(tmp_path, monkeypatch):
     """Of its example, smaller: the last loss."""
     monkeypatch.chdir(tmp_path)
-    (block,) = re.findall(r"```python\n((?:(?!```).)*jax\.nn\.sigmoid.*?)```", README, re.DOTALL)
+    (block,) = re.findall(r"```python\n((?:(?!```).)*jax\.nn\.sigmoid.*?)```", PAGE, re.DOTALL)
     for many, few in (("20_000", "200"), ("256", "16"), ("128", "16")):
         block = block.replace(many, few)
     names = {}
-    exec(compile(block, "README.md", "exec"), names)
+    exec(compile(block, "gradients.md", "exec"), names)
     return descended(lambda unknown: names["loss"](*unknown), names["start"], 200, 0.2)[0]
 
 
@@ -67,7 +67,7 @@ def cameras_found():
 
 @pytest.mark.slow
 def test_the_example_of_the_readme_ends_where_it_is_told_to(tmp_path, monkeypatch):
-    assert losses_of_the_readme(tmp_path, monkeypatch) < 1e-4
+    assert losses_of_the_page(tmp_path, monkeypatch) < 1e-4
 
 
 @pytest.mark.slow

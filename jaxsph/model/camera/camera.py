@@ -154,7 +154,15 @@ class Camera:
         near: Any = None,
         far: Any = None,
     ) -> Camera:
-        """Camera with parallel rays; `view_height` is the visible height (length units), depths may be negative or None.
+        """Camera with parallel rays.
+
+        Args:
+            eye: (3,) world position from which depths are counted, length units.
+            target: (3,) world position in the middle of the image, not the eye.
+            up: (3,) direction that points upwards in the image; not parallel to the line of sight.
+            view_height: visible height, > 0, length units.
+            width, height: size in pixels, at least 1.
+            near, far: depths between which samples are taken, linearly; may be negative. None is as in `look_at`.
 
         Raises:
             ValueError: as `look_at`, and for `view_height` <= 0.

@@ -153,7 +153,13 @@ class TransferFunction:
 
     @classmethod
     def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:
-        """One that suits a kind of data, `"fluid"`, `"density"`, ..., of particles or a volume; see `jaxsph.scenes.preset`."""
+        """One that suits a kind of data.
+
+        Args:
+            name: `"fluid"`, `"density"`, `"temperature"`, `"velocity"`, `"magnetic"` or `"scan"`.
+            shown: particles or a volume.
+            more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
+        """
         return cls.presets(name, shown, **more)
 
     @classmethod
