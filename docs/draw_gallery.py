@@ -20,7 +20,7 @@ CELL, CAPTION, COLUMNS = 300, 34, 4
 CARD, SQUARE, FRONT = (480, 360), (400, 400), (1600, 400)
 REFUSED = "BROKEN"
 BOX, DISC, FLUID = "gadget4_lcdm_gas_snapshot_002.hdf5", "gadget2_binary_gas_9030.gadget", "mixer_001.npz"
-CLOSE = "--eye", "0.9,2.0,3.6", "--target", "-0.17,-0.2,0.27"
+CLOSE = "--eye", "0.9,2.0,4.1", "--target", "0.25,-0.35,0.2"
 CARDS = {
     "render": (BOX, "render", "--center", "densest"),
     "annotate": (BOX, "render", "--center", "densest", "--annotate", "--background", "white"),

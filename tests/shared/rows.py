@@ -114,7 +114,7 @@ def _surface(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
 
 
 def _fluid(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
-    return dataclasses.replace(_particles(frames, rng, kernel), surface=js.Surface(0.02, smoothing=1.2))
+    return dataclasses.replace(_particles(frames, rng, kernel), surface=_double(js.Surface(0.02, smoothing=1.2)))
 
 
 def _all(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
