@@ -208,7 +208,7 @@ def compare() -> Callable[..., None]:
     return check
 
 
-@functools.partial(jax.jit, static_argnames="plan")
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
 def grid_of(particles, camera, *, plan):
     """The grid of a frame of one band, and what its sums are taken relative to."""
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
