@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import QUICKLY as UNOPTIMIZED
+from derivatives import QUICKLY
 from examples import EXAMPLES, USUAL
 
 import jaxsph as js
@@ -29,8 +29,6 @@ from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory_maps, programs
 
 pytest_plugins = ["compiled", "core", "share"]
-
-QUICKLY = UNOPTIMIZED | {"xla_cpu_parallel_codegen_split_count": 1}
 
 # `dev` tries other examples each time, and what failed before first; `ci` the same ones; `nightly` (`--hypothesis-profile`) ten
 # times as many.
@@ -181,7 +179,7 @@ def own_programs() -> Iterator[None]:
 
 @pytest.fixture
 def quick_programs(own_programs: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Programs of eager images compiled in half the time, and slower: those of slow tests are as everyone has them."""
+    """Programs of eager images compiled in less than half the time, and slower: those of slow tests are as everyone has them."""
     if request.node.get_closest_marker("slow") is None:
         monkeypatch.setattr(programs, "_compile", lambda lowered, _: lowered.compile(compiler_options=QUICKLY))
 
@@ -210,7 +208,7 @@ def compare() -> Callable[..., None]:
     return check
 
 
-@functools.partial(jax.jit, static_argnames="plan")
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
 def grid_of(particles, camera, *, plan):
     """The grid of a frame of one band, and what its sums are taken relative to."""
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]

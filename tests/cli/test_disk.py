@@ -8,6 +8,8 @@ from snapshots_made import particles, write
 import jaxsph as js
 from jaxsph import io
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x32", "--samples", "16"]
 
 

@@ -8,6 +8,8 @@ from jaxsph import io
 from jaxsph.cli import main as cli
 from jaxsph.cli.options.former import rewritten
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x16", "--samples", "16"]
 
 

@@ -14,6 +14,8 @@ import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import demo
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x16", "--samples", "16"]
 
 

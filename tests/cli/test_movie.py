@@ -17,6 +17,8 @@ from jaxsph.cli.commands import movie as cli_movie
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.options import Look
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x16", "--samples", "16"]
 
 

@@ -8,6 +8,8 @@ from commanded import run
 import jaxsph as js
 from jaxsph.trade.measurement import JOURNAL, TABLE, read_journal
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
 SOURCE = [f"scene:radial:particles={PARTICLES}", "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
 LEAST_WORK = ["--estimators=", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]

@@ -8,6 +8,8 @@ from commanded import run
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x16", "--samples", "8"]
 
 

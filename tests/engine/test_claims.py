@@ -130,7 +130,7 @@ _BY_TOLERANCE = jax.jit(
 )
 
 
-def test_only_point_samples_know_their_error_at_full_rate(frames):
+def test_only_point_samples_know_their_error_at_full_rate(frames, quick_programs):
     rng = np.random.default_rng(1)
     scene, camera = frames.scene(rng), frames.camera(rng)
     reference = js.render(scene, camera, frames.settings, plan=frames.plan())

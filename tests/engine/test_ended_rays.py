@@ -9,6 +9,8 @@ import pytest
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 ROUNDING = 1e-6
 LEAST = 0.02
 

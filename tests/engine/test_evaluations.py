@@ -10,6 +10,8 @@ from scipy.optimize import nnls
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SLAB = 4
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
+from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given, target
 from hypothesis import strategies as st
@@ -16,7 +17,6 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.control.adapt import ControlPlan
 
-QUICKLY = {"xla_backend_optimization_level": 0}  # a program that runs twice: compiling it is what takes time
 ADAPTIVE = {
     "budget": ControlPlan(True, True, "budget"),
     "levels": ControlPlan(False, True, "budget"),

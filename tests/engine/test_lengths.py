@@ -12,6 +12,8 @@ from jaxsph.engine.lengths import POWERS, digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.request import Request
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 DIGITS = (-80, -61, -42, -7, 7, 42, 61, 80)
 UNSCALED = ("color", "transmittance", "error_bound", "evaluations")
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 
-QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run once: compiling them is what takes time
 ROUNDING = 64 * np.finfo(np.float32).eps  # programs differ in which products they fuse into a sum
 
 

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.model.medium import Medium
 
-QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
 STEP, CLOSE = 1e-6, 1e-6
 
 

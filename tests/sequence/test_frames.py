@@ -13,6 +13,8 @@ import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.sequence.task import FINGERPRINT, FrameTask, fingerprint_of
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=16)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=24, height=16, near=2, far=6)
 LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])

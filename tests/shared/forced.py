@@ -9,8 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import derivatives
+
 ROOT = Path(__file__).parent.parent.parent
-QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+QUICKLY = " ".join(f"--{name}={str(value).lower()}" for name, value in derivatives.QUICKLY.items())
 
 
 def begun(program: str, devices: int, *arguments: str, quickly: bool = True) -> subprocess.Popen:

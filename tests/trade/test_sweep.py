@@ -15,6 +15,8 @@ from jaxsph.trade import measurement
 from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
 from jaxsph.trade.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
 CHOSEN = {"tolerances": (0.02, 0.3), "estimators": ("interval", "interval relaxed"), "baselines": ("samples/2",)}
 ONCE = {"repeats": 1, "converged": 1, "integral": 0}

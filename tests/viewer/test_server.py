@@ -28,6 +28,8 @@ from jaxsph.cli.commands import view as command
 from jaxsph.viewer.server import MAX_MESSAGE, MAX_RECEIVED, MAX_TABS, Server
 from jaxsph.viewer.session import Session
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SECONDS = 240
 ROOT = Path(__file__).parent.parent.parent
 

@@ -16,6 +16,8 @@ from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SECONDS = 240
 
 

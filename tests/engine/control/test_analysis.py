@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
+from derivatives import QUICKLY
 from enclosure import bundle_bounds
 from examples import examples
 from hypothesis import currently_in_test_context, given, target
@@ -25,7 +26,6 @@ from jaxsph.engine.media.shown import Shown
 from jaxsph.model import registry
 
 CANDIDATES = range(SUPER_PIXEL + 1)
-QUICKLY = {"xla_backend_optimization_level": 0}  # programs that run some times only: compiling them is what takes time
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,6 +19,8 @@ from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=32)
 FIELD = np.random.default_rng(4).uniform(0, 1, (9, 7, 12)).astype(np.float32)
 LOWER, SPACING = (-1.1, -0.8, -0.9), (0.27, 0.25, 0.16)

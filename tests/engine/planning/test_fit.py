@@ -17,6 +17,8 @@ from jaxsph.model import registry
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.particles import capacity_class
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=24)
 
 
