@@ -48,8 +48,7 @@ def render(
     """Render a scene.
 
     Eagerly, capacities are planned for the frame (or those of an earlier, similar frame taken), stages are timed apart, and
-    faults raise. Under `jax.jit` or `jax.vmap` the
-    function is pure, needs a `plan`, and reports faults in `image.faults`.
+    faults raise. Under `jax.jit` or `jax.vmap` the function is pure, needs a `plan`, and reports faults in `image.faults`.
 
     Args:
         scene: particles and transfer function.
@@ -69,9 +68,9 @@ def render(
         `color` and `transmittance` have derivatives in both modes by everything that floats in particles, transfer function and
         camera (its axes need not stay orthonormal: a tangent of rotations keeps them so). Decisions are held fixed: plan,
         grid, lists, windows, levels, merges and the image's other layers. In reverse mode the slabs are marched again, so
-        memory does not grow with samples or particles in a cell. Of a surface of particles `normal` has derivatives as well,
-        and so has `depth` where a ray ends at it; which rays meet it is held fixed, so silhouettes do not move. Images with
-        super-pixels or of the pilot estimator have no derivatives and raise `NotImplementedError`, as do second derivatives.
+        memory does not grow with samples or particles in a cell. Of a surface of particles `normal` and `depth` have
+        derivatives as well, silhouettes none. Images with super-pixels or of the pilot estimator have no derivatives and
+        raise `NotImplementedError`, as do second derivatives.
 
     Raises:
         ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,

@@ -15,6 +15,8 @@ from rows import HEIGHT, WIDTH, Row
 
 import jaxsph as js
 
+# XLA's older emitter, at no optimisation, makes gradients of two quantities by a plane and a ball 8e-4 wrong; the newer does not.
+RIGHTLY = {"xla_backend_optimization_level": 0}
 ALIKE = 1e-8  # of a slope's size: forward and reverse mode add up the same terms
 DIFFERENCE = 1e-5  # and what differences make of it; of iso-surfaces, whose roots are found to a tolerance, 1e-3
 OF_SURFACES = 1e-3
@@ -133,7 +135,7 @@ def check_figures(row, found):
 
 @pytest.mark.parametrize("row", rows(DERIVATIVES))
 def test_both_modes_are_alike_and_those_of_differences_and_an_empty_view_is_finite(row, frames, x64):
-    check_figures(row, figures(row, frames, QUICKLY))
+    check_figures(row, figures(row, frames, RIGHTLY))
 
 
 def ways(row, frames):

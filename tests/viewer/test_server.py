@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import http.client
 import json
 import os
@@ -24,6 +25,7 @@ from commanded import run as commanded
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+import jaxsph as js
 from jaxsph.cli.commands import view as command
 from jaxsph.viewer.server import MAX_MESSAGE, MAX_RECEIVED, MAX_TABS, Server
 from jaxsph.viewer.session import Session
@@ -270,9 +272,16 @@ def test_an_interrupt_ends_it_with_exit_code_0(late):
 
 
 def test_settings_of_the_command():
-    assert command._settings(command.View()).tolerance == 0.01
-    assert command._settings(command.View(samples=64)).samples == 64
-    asked = command._settings(command.View(tolerance=0.1))
+    fog = scene()
+    fluid = dataclasses.replace(fog, surface=js.Surface())
+
+    def made(asked, shown=fog):
+        return command._settings(asked, shown)
+
+    assert made(command.View()).tolerance == 0.01
+    assert made(command.View(samples=64)).samples == 64
+    asked = made(command.View(tolerance=0.1))
     assert (asked.tolerance, asked.integrator) == (0.1, "segments")
-    assert command._settings(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
-    assert command._settings(command.View(integrator="samples")).tolerance is None
+    assert made(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
+    assert made(command.View(integrator="samples")).tolerance is None
+    assert made(command.View(), fluid).tolerance is None  # a surface has none

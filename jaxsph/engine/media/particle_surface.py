@@ -7,7 +7,7 @@ level at both ends of an interval, particles' largest weights bound it in betwee
 below the level there is no surface, a theorem but for the rounding of sums that are within some eps of the level. Else the field
 is asked for at one place more, where it may be largest, and then, if it is not reached there, at the vertex of the parabola
 through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the
-Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and a step of Newton's (`surface_root`), to some roundings of a support.
+Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and steps of Newton's (`surface_root`), to some roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
@@ -51,7 +51,7 @@ from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
 STEPS = 10  # of false position, at most
-ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: Newton's step squares that
+ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step of Newton's squares that
 
 
 class Hit(NamedTuple):

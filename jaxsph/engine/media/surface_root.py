@@ -25,6 +25,7 @@ from jaxsph.model.medium import COLORS
 from jaxsph.model.transfer.function import Segments, find, read
 from jaxsph.numerics.trees import tree
 
+POLISHED = 2  # steps: the last has the derivatives, and they are as good as the root before it
 Vectors = list[Float[Array, "tasks rays"]]
 
 
@@ -85,7 +86,7 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
 
 
 def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""]) -> Root:
-    """The root that a place is near to, by a step of Newton's, and what is found there.
+    """The root that a place is near to, by steps of Newton's, and what is found there.
 
     Args:
         between: where it lies, relative to the middle of the slab as places are.
@@ -93,12 +94,14 @@ def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[
     Differentiation:
         By the particles, the rays and the level, as of an implicit function; `place` and `between` have none.
     """
-    place, between = lax.stop_gradient((place, between))
-    here = rays.found(place)
-    slope = lax.stop_gradient(slope_along(here, rays.ray()))
-    root = place + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
-    root = root + lax.stop_gradient(jnp.clip(root, *between) - root)
-    return Root(root, rays.found(root))
+    low, high = lax.stop_gradient(between)
+    for _ in range(POLISHED):
+        place = lax.stop_gradient(place)
+        here = rays.found(place)
+        slope = lax.stop_gradient(slope_along(here, rays.ray()))
+        place = place + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
+        place = place + lax.stop_gradient(jnp.clip(place, low, high) - place)
+    return Root(place, rays.found(place))
 
 
 def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
