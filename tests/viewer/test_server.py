@@ -156,6 +156,7 @@ GARBAGE += ['{"do": "orbit", "right": 1e999, "down": 0}', '{"do": "orbit", "righ
 def test_garbage_is_answered_and_ends_nothing(server, message):
     version = server.session.version
     with tab(server) as page:
+        heard(page, "picture")
         page.send(message)
         assert heard(page, "error")[0]["text"]
         page.send(json.dumps({"do": "pick", "right": 0, "down": 0}))
