@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.trees import tree
 
@@ -109,7 +110,7 @@ class Table(Profile):
         """See `Profile`."""
         last = self.values.shape[0] - 1
         solid = square > 0
-        place = jnp.minimum(jnp.where(solid, jnp.sqrt(jnp.where(solid, square, 1)), 0) * last, last)
+        place = lesser(jnp.where(solid, jnp.sqrt(jnp.where(solid, square, 1)), 0) * last, last)
         whole = jnp.minimum(place.astype(jnp.int32), max(last - 1, 0))
         low, high = self.values[whole], self.values[jnp.minimum(whole + 1, last)]
         return low + (place - whole) * (high - low)

@@ -15,8 +15,6 @@ from rows import HEIGHT, WIDTH, Row
 
 import jaxsph as js
 
-# XLA's older emitter, at no optimisation, makes gradients of two quantities by a plane and a ball 8e-4 wrong; the newer does not.
-RIGHTLY = {"xla_backend_optimization_level": 0}
 ALIKE = 1e-8  # of a slope's size: forward and reverse mode add up the same terms
 DIFFERENCE = 1e-5  # and what differences make of it; of iso-surfaces, whose roots are found to a tolerance, 1e-3
 OF_SURFACES = 1e-3
@@ -101,11 +99,11 @@ def along(gradient, move):
     return float(sum(term.sum() for term in terms)), float(sum(np.abs(term).sum() for term in terms))
 
 
-def figures(row, frames, options):
+def figures(row, frames):
     """How far both modes are apart, and from differences, of the size of the slope; and what an empty view has."""
     plan, settings, rng = row.plan(frames), row.settings, np.random.default_rng(row.seed + 100)
     inputs, cotangent = row.inputs(frames), jnp.asarray(rng.normal(size=(HEIGHT, WIDTH, 4)))
-    at = jax.jit(slopes, static_argnames="plan", compiler_options=options)
+    at = jax.jit(slopes, static_argnames="plan", compiler_options=QUICKLY)
     move = everywhere(inputs, rng)
     _, pushed, gradient = at(inputs, move, cotangent, settings, plan=plan)
     pulled, size = along(gradient, move)
@@ -135,7 +133,7 @@ def check_figures(row, found):
 
 @pytest.mark.parametrize("row", rows(DERIVATIVES))
 def test_both_modes_are_alike_and_those_of_differences_and_an_empty_view_is_finite(row, frames, x64):
-    check_figures(row, figures(row, frames, RIGHTLY))
+    check_figures(row, figures(row, frames))
 
 
 def ways(row, frames):

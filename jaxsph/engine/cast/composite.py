@@ -22,6 +22,7 @@ from jaxsph.engine.cast.samples import transmitted
 from jaxsph.engine.media.mixture import first_stops
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.medium import Stops
+from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -207,7 +208,7 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segme
         filled = thickness[:, k] > 0
         share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
         here = crossed & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
-        place = start + jnp.minimum(share, 1) * (end - start)
+        place = start + lesser(1, share) * (end - start)
         if stop is not None:
             place = jnp.where((stop >= start) & (stop <= end), stop, place)
         depth = jnp.where(here, place, depth)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.cast.batches import Batch
 from jaxsph.engine.cast.composite import Together, over_layers, rows
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -95,7 +96,7 @@ def _pull_slabs(rays: ReplayState, light: list[Array]) -> tuple[dict[str, Array]
     (*emission, left), stops = light[:4], light[4:]
     behind = rays.transmittance_so_far * left
     color = rays.color_so_far + rays.transmittance_so_far * jnp.stack(emission)
-    remaining = jnp.clip(rays.color - color, 0, behind)
+    remaining = clamped(rays.color - color, 0, behind)
     hidden = (rays.cotangent[:3] * remaining).sum(0) + rays.cotangent[3] * rays.transmittance
     found = [rays.cotangent[:3] * rays.transmittance_so_far, -hidden[None]]
     made = {"color_so_far": color, "transmittance_so_far": behind}

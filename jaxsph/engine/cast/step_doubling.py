@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
+from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 SHORTEST = 1 / 256  # of a sample: the least step, which is accepted whatever it differs by
@@ -150,7 +151,7 @@ class _Slabs:
         enough = (difference <= allowed) | (steps.far - steps.near <= self.least(steps))
         ended = steps._replace(known=jnp.ones_like(steps.known), at_far=found)
         halved = steps._replace(far=middle, step=middle - steps.near, at_far=found)
-        spent = jnp.minimum(difference, jnp.maximum(allowed, 0))  # what the least step cannot help is not taken from others
+        spent = lesser(difference, greater(0, allowed))  # what the least step cannot help is not taken from others
         moved = self.behind(steps._replace(color=color, spent=steps.spent + spent), taken, EASY * difference <= allowed)
         cases = (~steps.known, ended), (steps.known & ~enough, halved), (steps.known & enough, moved)
         for case, then in cases:
@@ -165,9 +166,9 @@ class _Slabs:
         halves = first + jnp.exp(-front) * second
         left = jnp.exp(-steps.thickness.sum(0))
         of_color, through = whole - halves, jnp.expm1(-thickness) - jnp.expm1(-front - back)
-        most = jnp.maximum(jnp.abs(of_color), jnp.abs(of_color + through)).max(0)
+        most = greater(jnp.abs(of_color), jnp.abs(of_color + through)).max(0)
         noise = -ROUNDING * jnp.finfo(path.dtype).eps * jnp.expm1(-thickness)
-        difference = left * jnp.maximum(jnp.maximum(most, jnp.abs(through)) - noise, 0)
+        difference = left * greater(0, greater(most, jnp.abs(through)) - noise)
         return steps.color + left * halves, front + back, difference
 
     def allowed(self, steps: Steps) -> Float[Array, " rays"]:
@@ -179,7 +180,7 @@ class _Slabs:
     def least(self, steps: Steps) -> Float[Array, " rays"]:
         """A step that is accepted as it is."""
         width = self.at(steps.sample + 1) - self.at(steps.sample)
-        return jnp.maximum(SHORTEST * width, RESOLVED * jnp.finfo(width.dtype).eps * jnp.abs(steps.far))
+        return greater(SHORTEST * width, RESOLVED * jnp.finfo(width.dtype).eps * jnp.abs(steps.far))
 
     def behind(self, steps: Steps, taken: Array, easy: Array) -> Steps:
         """After an accepted step, before one of the same length, or twice that if it was easy."""
@@ -187,7 +188,7 @@ class _Slabs:
         thickness = steps.thickness + jnp.where(each == steps.sample, taken, 0)
         sample = steps.sample + (steps.far >= self.at(steps.sample + 1))
         begin, end = self.at(sample), self.at(sample + 1)
-        step = jnp.minimum(jnp.where(easy, 2, 1) * steps.step, end - begin)
+        step = lesser(jnp.where(easy, 2, 1) * steps.step, end - begin)
         return steps._replace(
             sample=sample,
             near=steps.far,

@@ -28,6 +28,7 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch, particle_at, quantities_of
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 Carry = TypeVar("Carry")
@@ -219,7 +220,7 @@ def ends_of(
         ]
         if not task.measured:
             return found
-        inner = jnp.maximum(jnp.minimum(end, lines.back[:, None]) - jnp.maximum(begin, lines.front[:, None]), 0)
+        inner = greater(0, lesser(end, lines.back[:, None]) - greater(begin, lines.front[:, None]))
         sides = end < apart, end >= apart
         return found + [old + jnp.where(mine, inner, 0).sum(1) for old, mine in zip(so_far[len(EXTREMES) :], sides, strict=True)]
 
@@ -252,7 +253,7 @@ def chords(parts: tuple[Array, ...], lines: Lines) -> tuple[Array, Array]:
     along = along_u + along_v
     foot = along * lines.inverse[:, None]
     inner = (rest - x_square) + along * foot
-    half = jnp.sqrt(jnp.maximum(inner, 0) * lines.inverse[:, None])
+    half = jnp.sqrt(greater(0, inner) * lines.inverse[:, None])
     begin, end = foot - half, foot + half
     valid = (inner > 0) & (end > lines.front[:, None]) & (begin < lines.back[:, None])
     far = jnp.finfo(foot.dtype).max

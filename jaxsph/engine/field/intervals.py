@@ -26,6 +26,7 @@ from jaxsph.engine.field.cover import Cover
 from jaxsph.engine.field.tasks import Part
 from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import slope_in_middle
+from jaxsph.numerics.extremes import clamped, greater, lesser
 
 LIGHT, EXTINCTION = range(4), 3  # channels: red, green, blue, extinction
 BESIDE = 1e-3  # of an interval that rounding may move a border out of it
@@ -45,12 +46,12 @@ class Intervals(NamedTuple):
         """What is in a part of each interval; `ahead` is the share before the inner part, in which the field is linear."""
         if part is None:
             return self
-        begin, end = jnp.maximum(ahead, part.begin), jnp.minimum(ahead + self.share, part.end)
+        begin, end = greater(ahead, part.begin), lesser(ahead + self.share, part.end)
         inverse = jnp.where(self.share > 0, 1 / jnp.where(self.share > 0, self.share, 1), 0)
-        near, far = (self.near + jnp.clip((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
+        near, far = (self.near + clamped((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
         hull = part.end - part.begin
         filled = jnp.where(hull > 0, part.share / jnp.where(hull > 0, hull, 1), 0)
-        return Intervals(near, far, jnp.maximum(end - begin, 0) * filled)
+        return Intervals(near, far, greater(0, end - begin) * filled)
 
 
 def intervals_of(
@@ -75,11 +76,11 @@ def intervals_of(
     begins = (front >= begin - slack) & (front <= end + slack)
     ends = (back >= begin - slack) & (back <= end + slack)
     inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 0)
-    ahead = jnp.where(begins, jnp.clip((front - begin) * inverse, 0, 1), jnp.where(first, 0, 0.5))
-    past = jnp.where(ends, jnp.clip((end - back) * inverse, 0, 1), jnp.where(second, 0, 0.5))
+    ahead = jnp.where(begins, clamped((front - begin) * inverse, 0, 1), jnp.where(first, 0, 0.5))
+    past = jnp.where(ends, clamped((end - back) * inverse, 0, 1), jnp.where(second, 0, 0.5))
     ahead, past = jnp.where(first, 0, ahead), jnp.where(second, 0, past)
     hidden = ~first & ~second & ~(begins & ends)
-    share = jnp.where(hidden, 0, jnp.maximum(1 - ahead - past, 0))
+    share = jnp.where(hidden, 0, greater(0, 1 - ahead - past))
     at_front = jnp.where(begins, of_front, jnp.where(second, quantity[:, 1:], 0))
     at_back = jnp.where(ends, of_back, jnp.where(first, quantity[:, :-1], 0))
     found = Intervals(jnp.where(first, quantity[:, :-1], at_front), jnp.where(second, quantity[:, 1:], at_back), share)
@@ -110,7 +111,7 @@ def extinction_over(tables: MeanTables, intervals: Intervals) -> tuple[Array, Ar
     near, far, _ = intervals
     (mean,) = mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))
     rise = slope_in_middle(tables.segments, near, far, EXTINCTION) * (far - near)
-    return mean, jnp.clip(rise, -2 * mean, 2 * mean)
+    return mean, clamped(rise, -2 * mean, 2 * mean)
 
 
 def means_by(
@@ -125,8 +126,8 @@ def means_by(
         mean = extinction
         if channel != EXTINCTION:
             (color,) = mean_light(tables[0], near, far, slice(channel, channel + 1))  # whose extinction is 1
-            most = 2 * jnp.clip(jnp.minimum(color, 1 - color), 0)
-            change = jnp.clip(slope_in_middle(tables[0].segments, near, far, channel) * (far - near), -most, most)
+            most = 2 * greater(0, lesser(color, 1 - color))
+            change = clamped(slope_in_middle(tables[0].segments, near, far, channel) * (far - near), -most, most)
             mean = color * extinction + change * rise / 12
         found.append(jnp.where(share > 0, share * mean, 0))
     return found

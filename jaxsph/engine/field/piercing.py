@@ -26,6 +26,7 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
+from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 Carry = TypeVar("Carry")
@@ -112,13 +113,13 @@ class Piercing:
 
         def of_one(block: Block, passed: Passed, k: int) -> tuple[Array, ...]:
             foot = passed.foot[:, k, None]
-            at = jnp.clip(foot, begin, end)
+            at = clamped(foot, begin, end)
             rest = (at - foot) ** 2 * passed.rate[:, k, None]
             weight = smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
             return weight, weight * at, jnp.where(weight >= level, at, far)
 
         def both(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
-            return a[0] + b[0], a[1] + b[1], jnp.minimum(a[2], b[2])
+            return a[0] + b[0], a[1] + b[1], lesser(a[2], b[2])
 
         def add(block: Block, passed: Passed, so_far: tuple[Array, ...]) -> tuple[Array, ...]:
             halves = [
@@ -132,7 +133,7 @@ class Piercing:
         start: tuple[Array, ...] = (nothing, nothing, nothing + far)
         upper, weighed, first = self._over(add, start)
         mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
-        return Bound(upper, jnp.clip(jnp.where(first < far, first, mean), begin, end))
+        return Bound(upper, clamped(jnp.where(first < far, first, mean), begin, end))
 
     def weights(self, place: Float[Array, "tasks some rays"]) -> Float[Array, "tasks some rays"]:
         """The field at depths relative to the middle."""
@@ -230,6 +231,6 @@ class Piercing:
         z, scale = block.z[..., None] - lines.middle[..., None], block.scale[..., None]
         along = x * lines.slope_u[:, None] + y * lines.slope_v[:, None] + z
         foot = along / lines.square[:, None]
-        away = jnp.maximum((x * x + y * y + z * z) - along * foot, 0)
+        away = greater(0, (x * x + y * y + z * z) - along * foot)
         nearest = kernels.by_name(self.kernel).prepare(away * scale**2, block.size[..., None])
         return Passed(foot, nearest, scale**2 * lines.square[:, None])

@@ -22,6 +22,7 @@ from jaxsph.engine.field.gather import BLOCK, PARTS
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
+from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 
@@ -49,7 +50,7 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
 
     def weighed(k: int) -> tuple[Array, tuple[Array, ...]]:
         one = jax.tree.map(lambda column: column[:, k, None, None], block)
-        across = jnp.minimum(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
+        across = lesser(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
         along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
         return smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp), one.quantities
 

@@ -39,14 +39,13 @@ from jaxsph.engine.lookups.tables import (
     MeanTables,
     beyond,
     ends,
-    greater,
     integral_between,
-    lesser,
     ordered,
     split,
     widened,
 )
 from jaxsph.model.transfer.function import SELECT_ALL, at, locate
+from jaxsph.numerics.extremes import clamped, greater, lesser
 
 __all__ = ["MeanTables", "mean_light"]
 
@@ -190,8 +189,8 @@ class _Part:
 
 def _smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     """Means for their derivatives' sake; the values are right but for what rounding does to jumps."""
-    near, far = (jnp.clip(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))  # where equal, each moves both by half
-    lo, hi = jnp.minimum(near, far), widened(jnp.maximum(near, far), 1)
+    near, far = (clamped(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))  # where equal, each moves both by half
+    lo, hi = lesser(near, far), widened(greater(near, far), 1)
     below, above, start, stop = split(lo, hi, tables.points[0], tables.points[-1])
     few = tables.points.shape[0] <= SELECT_ALL
     parts = (_all_parts if few else _outer_parts)(tables, lo, hi, start, stop)
@@ -221,8 +220,8 @@ def _all_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: Arr
     """All pieces of few control points."""
     points, last = tables.points, tables.points.shape[0] - 1
     jump = jnp.pad(tables.inverse[:-1] == 0, 1)
-    shares = [jnp.clip(_share(points[k], lo, hi, jump[k] | jump[k + 1]), 0, 1) for k in range(last + 1)]
-    places = [jnp.clip(point, start, stop) for point in points]
+    shares = [clamped(_share(points[k], lo, hi, jump[k] | jump[k + 1]), 0, 1) for k in range(last + 1)]
+    places = [clamped(point, start, stop) for point in points]
     pairs = [(k, min(k + 1, last)) for k in range(max(last, 1))]
     return [
         _Part(points[k], list(tables.base[:, k]), list(tables.slope[:, k]), (places[k], places[n]), (shares[k], shares[n]))
@@ -243,7 +242,7 @@ def _outer_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: A
     same, apart = i == j, j > after
     begin, end = jnp.where(same, stop, at(points, j)), jnp.where(same, stop, at(points, after))
     limits = ((points[0], tables.inverse[0]), (points[-1], tables.inverse[-2]))
-    first, last = (jnp.clip(_share(point, lo, hi, inverse == 0), 0, 1) for point, inverse in limits)
+    first, last = (clamped(_share(point, lo, hi, inverse == 0), 0, 1) for point, inverse in limits)
     inner = [jnp.where(same, last, _share(at(points, k), lo, hi, apart)) for k in (after, j)]
     bases, slopes = ([[at(row, k) for row in table] for k in (i, j)] for table in (tables.base, tables.slope))
     return [

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
 from jaxsph.numerics import exponents
+from jaxsph.numerics.extremes import clamped, greater, lesser
 
 MAX_QUANTITY = (
     2.0**60
@@ -51,11 +52,11 @@ def rescaled(
     """
     largest = jnp.abs(values).max()
     unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
-    unit = lax.stop_gradient(jnp.where(largest > 0, jnp.maximum(unit, jnp.finfo(unit.dtype).tiny), 1))
-    scaled, values = jnp.clip(quantity * unit, -MAX_QUANTITY, MAX_QUANTITY), values * unit
+    unit = lax.stop_gradient(jnp.where(largest > 0, greater(unit, jnp.finfo(unit.dtype).tiny), 1))
+    scaled, values = clamped(quantity * unit, -MAX_QUANTITY, MAX_QUANTITY), values * unit
     quantity = jnp.where(jnp.isfinite(quantity), scaled, quantity)  # what is no number is to be found as such
     first, last = values[0], values[-1]
-    narrow = (first * last > 0) & (last - first <= jnp.minimum(jnp.abs(first), jnp.abs(last)))
+    narrow = (first * last > 0) & (last - first <= lesser(jnp.abs(first), jnp.abs(last)))
     least = lax.stop_gradient(jnp.where(narrow, first, 0))
     return quantity - least, values - least
 

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.model.transfer.function import Segments, at
+from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.trees import tree
 
 WIDENED = 1  # eps of a range's upper end and of the control points' that it is widened by: at least its next number
@@ -131,21 +132,6 @@ def ordered(near: Array, far: Array, reach: float) -> tuple[Array, Array]:
     near, far = (clamped(end, -FARTHEST, FARTHEST) for end in (near, far))
     ascending = near < far
     return jnp.where(ascending, near, far), widened(jnp.where(ascending, far, near), reach)
-
-
-def lesser(a: Array | float, b: Array) -> Array:
-    """Minimum as one instruction: `b` if either is NaN, where `jnp.minimum` takes several to find NaN."""
-    return jnp.where(a < b, a, b)
-
-
-def greater(a: Array | float, b: Array) -> Array:
-    """Maximum, like `lesser`."""
-    return jnp.where(a > b, a, b)
-
-
-def clamped(value: Array, low: Array | float, high: Array | float) -> Array:
-    """`value` between two bounds; NaN stays."""
-    return lesser(high, greater(low, value))
 
 
 def widened(end: Array, reach: float) -> Array:

@@ -24,6 +24,7 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH
 from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import Segments, TransferFunction
+from jaxsph.numerics.extremes import greater, lesser
 
 GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives
 
@@ -66,14 +67,14 @@ def missed_length(gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks 
     lines = Lines.of(dataclasses.replace(task, part=None))
     first, last = ((lines.middle + end)[:, 0] for end in (lines.front, lines.back))
     taken = (intervals_between(gathered, task)[-1].share * (task.depth[:, 1:] - task.depth[:, :-1])[..., None]).sum(1)
-    hull = jnp.maximum(jnp.minimum(cover.back, last) - jnp.maximum(cover.front, first), 0)
-    covered = jnp.minimum(cover.length, hull).sum(0)
+    hull = greater(0, lesser(cover.back, last) - greater(cover.front, first))
+    covered = lesser(cover.length, hull).sum(0)
     known = covered > 0
-    over = jnp.where(known, jnp.maximum(taken - covered, 0), 0)
+    over = jnp.where(known, greater(0, taken - covered), 0)
     if task.part is not None:
         return over
     apart = (cover.length <= (1 + BESIDE) * hull).all(0)
-    return over + jnp.where(known & apart, jnp.maximum(covered - taken, 0), 0)
+    return over + jnp.where(known & apart, greater(0, covered - taken), 0)
 
 
 def missed_thickness(gathered: SumsBetween, task: SlabTask, tables: MeanTables) -> Float[Array, "tasks rays"]:

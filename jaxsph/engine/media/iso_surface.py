@@ -27,6 +27,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
@@ -209,12 +210,12 @@ def _newton(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordinate
 
     here, slope = jax.jvp(field, (share,), (jnp.ones_like(share),))
     slope = lax.stop_gradient(slope)
-    return jnp.clip(share - (here - level) / jnp.where(slope != 0, slope, 1), 0, 1)
+    return clamped(share - (here - level) / jnp.where(slope != 0, slope, 1), 0, 1)
 
 
 def _secant(low: Array, high: Array, at_low: Array, at_high: Array) -> Array:
     change = at_low - at_high
-    return low + jnp.clip(jnp.where(change != 0, at_low / jnp.where(change != 0, change, 1), 0.5), 0, 1) * (high - low)
+    return low + clamped(jnp.where(change != 0, at_low / jnp.where(change != 0, change, 1), 0.5), 0, 1) * (high - low)
 
 
 def _gradient(grid: VolumeGrid, place: Coordinates) -> Coordinates:

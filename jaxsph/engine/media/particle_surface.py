@@ -47,6 +47,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
@@ -89,7 +90,7 @@ class Bracket(NamedTuple):
         """Where a straight line crosses."""
         change = self.at_low - self.at_high
         share = jnp.where(change != 0, self.at_low / jnp.where(change != 0, change, 1), 0.5)
-        return self.low + jnp.clip(share, 0, 1) * (self.high - self.low)
+        return self.low + clamped(share, 0, 1) * (self.high - self.low)
 
 
 class _Search(NamedTuple):
@@ -365,7 +366,7 @@ def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Arra
     total = jnp.where(bent, rise + fall, 1)
     move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
     curve = jnp.where(bent, total / jnp.where(bent, before * behind * (end - begin), 1), 0)
-    return jnp.clip(middle + move, begin, end), value + curve * move**2
+    return clamped(middle + move, begin, end), value + curve * move**2
 
 
 def _interleaved(borders: Float[Array, "tasks borders rays"], between: Float[Array, "tasks intervals rays"]) -> Array:

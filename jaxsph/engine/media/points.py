@@ -31,6 +31,7 @@ from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Chord, Profile, Shaped
 from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -230,7 +231,7 @@ class PointsMedium(Medium):
         def chords() -> Array:
             scale = (rays.slant[:, None] * row.inverse)[:, :, None]
             at = (rays.border[:, None] - foot[:, :, None]) * scale
-            return self._along(some, rays, away, square, jnp.clip(at, -half, half))
+            return self._along(some, rays, away, square, clamped(at, -half, half))
 
         def whole() -> Array:
             middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)

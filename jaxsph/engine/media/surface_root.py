@@ -23,6 +23,7 @@ from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.media.headlight import headlight
 from jaxsph.model.medium import COLORS
 from jaxsph.model.transfer.function import Segments, find, read
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
 POLISHED = 2  # steps: the last has the derivatives, and they are as good as the root before it
@@ -100,7 +101,7 @@ def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[
         here = rays.found(place)
         slope = lax.stop_gradient(slope_along(here, rays.ray()))
         place = place + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
-        place = place + lax.stop_gradient(jnp.clip(place, low, high) - place)
+        place = place + lax.stop_gradient(clamped(place, low, high) - place)
     return Root(place, rays.found(place))
 
 

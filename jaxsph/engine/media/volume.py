@@ -26,6 +26,7 @@ from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import clamped, greater
 from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
@@ -136,11 +137,11 @@ class VolumeMedium(Medium):
         begin, end = task.depth[:, :-1, None], task.depth[:, 1:, None]
         first, slab = task.depth[:, :1, None], (task.depth[:, -1:] - task.depth[:, :1])[:, :, None]
         inverse = jnp.where(end > begin, 1 / jnp.where(end > begin, end - begin, 1), 0)
-        ahead = jnp.clip((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
-        within = jnp.clip((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
+        ahead = clamped((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
+        within = clamped((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
         near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])
         far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
-        return Intervals(near, far, jnp.maximum(within - ahead, 0)).narrowed(ahead, task.part)
+        return Intervals(near, far, greater(0, within - ahead)).narrowed(ahead, task.part)
 
     def means(self, intervals: Intervals, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """See `Medium.means`: of the transfer function, over the range of the quantity in each interval."""

@@ -15,6 +15,7 @@ from jaxsph.engine.access.extents import SlabExtents
 from jaxsph.engine.access.macrocells import Occupancy
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.trees import tree
 
 ROUNDING = 32  # eps of view coordinates that a computed grid coordinate may be off by: six products, their sums, and the box's
@@ -62,7 +63,7 @@ class VolumeGrid:
 
     def moved_inside(self, coordinates: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
         """The nearest points of the box."""
-        return [jnp.clip(at, 0, points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
+        return [clamped(at, 0, points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
 
     def clipped(
         self, begin: list[Float[Array, "..."]], end: list[Float[Array, "..."]]
@@ -75,9 +76,9 @@ class VolumeGrid:
             inverse = 1 / jnp.where(moves, change, 1)
             faces = -first * inverse, (points - 1 - first) * inverse
             inside = (first >= 0) & (first <= points - 1)
-            enter = jnp.maximum(enter, jnp.where(moves, jnp.minimum(*faces), jnp.where(inside, 0, 1)))
-            leave = jnp.minimum(leave, jnp.where(moves, jnp.maximum(*faces), jnp.where(inside, 1, 0)))
-        return jnp.minimum(enter, 1), jnp.maximum(leave, 0)
+            enter = greater(enter, jnp.where(moves, lesser(*faces), jnp.where(inside, 0, 1)))
+            leave = lesser(leave, jnp.where(moves, greater(*faces), jnp.where(inside, 1, 0)))
+        return lesser(1, enter), greater(0, leave)
 
     def interpolate(self, coordinates: list[Float[Array, "a b c"]]) -> Float[Array, "a b c"]:
         """The trilinear field at grid coordinates; those outside are moved to the nearest cell's own trilinear field."""

@@ -24,6 +24,7 @@ from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.medium import LIGHT, Medium, OfPlaces, Stops
+from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.trees import tree
 
 
@@ -190,10 +191,10 @@ def parts_of(task: SlabTask, clip: Clip, depth: Float[Array, "tasks samples"], f
     high: Any = 0
     for span_begin, span_end in zip(spans.begin, spans.end, strict=True):
         enters, leaves = (
-            jnp.clip((share[:, None] * slab[..., None] - (begin - first)[..., None]) / length[..., None], 0, 1)
+            clamped((share[:, None] * slab[..., None] - (begin - first)[..., None]) / length[..., None], 0, 1)
             for share in (span_begin, span_end)
         )
         filled = leaves > enters
         total = total + jnp.where(filled, leaves - enters, 0)
-        low, high = jnp.minimum(low, jnp.where(filled, enters, 1)), jnp.maximum(high, jnp.where(filled, leaves, 0))
-    return Part(low, jnp.maximum(high, low), total)
+        low, high = lesser(low, jnp.where(filled, enters, 1)), greater(high, jnp.where(filled, leaves, 0))
+    return Part(low, greater(high, low), total)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.trees import tree
 
 Place = tuple[Float[Array, "..."], ...]
@@ -125,8 +126,8 @@ def both(first: Clip | None, second: Clip | None) -> Clip | None:
 
 def common(first: Spans, second: Spans) -> Spans:
     """What is in both: spans of one are apart, so pairs of them are."""
-    begin = jnp.maximum(first.begin[:, None], second.begin[None])
-    end = jnp.minimum(first.end[:, None], second.end[None])
+    begin = greater(first.begin[:, None], second.begin[None])
+    end = lesser(first.end[:, None], second.end[None])
     shape = -1, *begin.shape[2:]
     return ascending(begin.reshape(shape), end.reshape(shape))
 

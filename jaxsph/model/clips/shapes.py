@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.trees import fill, tree, unchecked_of
 
@@ -309,10 +310,10 @@ def _halves(first: Array, last: Array) -> Spans:
     above, after = first >= 0, last >= 0
     crosses = above != after
     change = jnp.where(crosses, last - first, 1)
-    place = jnp.clip(-first / change, 0, 1)
+    place = clamped(-first / change, 0, 1)
     begin = jnp.where(above, 0, jnp.where(after, place, 1))
     return _span(begin, jnp.where(after, 1, jnp.where(above, place, 1)))
 
 
 def _span(begin: Array, end: Array) -> Spans:
-    return ascending(jnp.clip(begin, 0, 1)[None], jnp.clip(end, 0, 1)[None])
+    return ascending(clamped(begin, 0, 1)[None], clamped(end, 0, 1)[None])

@@ -54,42 +54,42 @@ class Kernel:
 
 
 def _poly6(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
-    t = xp.maximum(margin - rest, 0)
+    t = _positive(margin - rest, xp)
     return t * t * t
 
 
 def _poly6_slope(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
-    t = xp.maximum(margin - rest, 0)
+    t = _positive(margin - rest, xp)
     return -3 * (t * t)
 
 
 def _cubic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
+    outer, inner = _positive(size - r, xp), _positive(0.5 * size - r, xp)
     return 2 * outer * outer * outer - 8 * inner * inner * inner
 
 
 def _cubic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, inner = xp.maximum(size - r, 0), xp.maximum(0.5 * size - r, 0)
+    outer, inner = _positive(size - r, xp), _positive(0.5 * size - r, xp)
     return (12 * inner * inner - 3 * outer * outer) / r
 
 
 def _wendland(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer = xp.maximum(size - r, 0)
+    outer = _positive(size - r, xp)
     square = outer * outer
     return square * square * (size + 4 * r)
 
 
 def _wendland_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
-    outer = xp.maximum(size - xp.sqrt(part + rest), 0)
+    outer = _positive(size - xp.sqrt(part + rest), xp)
     return -10 * (outer * outer * outer)
 
 
 def _quartic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, middle, inner = (_power(xp.maximum(end * size - r, 0), 4) for end in (1.0, 0.6, 0.2))
+    outer, middle, inner = (_power(_positive(end * size - r, xp), 4) for end in (1.0, 0.6, 0.2))
     return outer - 5 * middle + 10 * inner
 
 
@@ -97,13 +97,13 @@ def _quartic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     """Of the innermost piece as a polynomial of the square: its parts cancel at the centre."""
     square = part + rest
     r = xp.sqrt(square)
-    outer, middle = (_power(xp.maximum(end * size - r, 0), 3) for end in (1.0, 0.6))
-    return xp.where(r < 0.2 * size, 12 * square - 2.4 * (size * size), xp.minimum(10 * middle - 2 * outer, 0) / r)
+    outer, middle = (_power(_positive(end * size - r, xp), 3) for end in (1.0, 0.6))
+    return xp.where(r < 0.2 * size, 12 * square - 2.4 * (size * size), -_positive(2 * outer - 10 * middle, xp) / r)
 
 
 def _quintic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, middle, inner = (_power(xp.maximum(end * size - r, 0), 5) for end in (1.0, 2 / 3, 1 / 3))
+    outer, middle, inner = (_power(_positive(end * size - r, xp), 5) for end in (1.0, 2 / 3, 1 / 3))
     return outer - 6 * middle + 15 * inner
 
 
@@ -111,33 +111,38 @@ def _quintic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     """As `_quartic_slope`."""
     square = part + rest
     r = xp.sqrt(square)
-    outer, middle = (_power(xp.maximum(end * size - r, 0), 4) for end in (1.0, 2 / 3))
+    outer, middle = (_power(_positive(end * size - r, xp), 4) for end in (1.0, 2 / 3))
     inside = 20 * size * square - 25 * square * r - 20 / 9 * _power(size, 3)
-    return xp.where(r < 1 / 3 * size, inside, xp.minimum(15 * middle - 2.5 * outer, 0) / r)
+    return xp.where(r < 1 / 3 * size, inside, -_positive(2.5 * outer - 15 * middle, xp) / r)
 
 
 def _wendland_c4(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    return _power(xp.maximum(size - r, 0), 6) * (size * size + 6 * size * r + 35 / 3 * square)
+    return _power(_positive(size - r, xp), 6) * (size * size + 6 * size * r + 35 / 3 * square)
 
 
 def _wendland_c4_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    return -28 / 3 * _power(xp.maximum(size - r, 0), 5) * (size + 5 * r)
+    return -28 / 3 * _power(_positive(size - r, xp), 5) * (size + 5 * r)
 
 
 def _wendland_c6(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    outer = _power(xp.maximum(size - r, 0), 4)  # half of the power first, half last: all of it could underflow
+    outer = _power(_positive(size - r, xp), 4)  # half of the power first, half last: all of it could underflow
     return outer * (size * size * (size + 8 * r) + square * (25 * size + 32 * r)) * outer
 
 
 def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    return -11 * _power(xp.maximum(size - r, 0), 7) * (size * size + 7 * size * r + 16 * square)
+    return -11 * _power(_positive(size - r, xp), 7) * (size * size + 7 * size * r + 16 * square)
+
+
+def _positive(value: Any, xp: Any) -> Any:
+    """What is above 0; as `numerics.extremes`, its derivative follows the comparison."""
+    return xp.where(value < 0, xp.zeros_like(value), value)
 
 
 def _power(value: Any, exponent: int) -> Any:

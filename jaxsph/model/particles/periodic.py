@@ -31,6 +31,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import clamped, greater, lesser
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
 """Periods around the box, in which ghosts can lie."""
@@ -179,7 +180,7 @@ def between_faces(camera: Camera, box: Box, pixel: str) -> tuple[Camera, Float[A
         pixel: `"mean"`, or `"ray"`, of which the middle counts.
     """
     low, high = _faces(camera, box)
-    near, far = jnp.maximum(camera.near, low[2]), jnp.minimum(camera.far, high[2])
+    near, far = greater(camera.near, low[2]), lesser(camera.far, high[2])
     meets = near < far
     inside = dataclasses.replace(camera, near=jnp.where(meets, near, camera.near), far=jnp.where(meets, far, camera.far))
     across = _shares(camera.column, camera.width, low[0], high[0], pixel)
@@ -193,5 +194,5 @@ def _shares(place: Any, number: int, low: Array, high: Array, pixel: str) -> Flo
         middle = place(jnp.arange(number) + 0.5)
         return ((middle >= low) & (middle <= high)).astype(low.dtype)
     edges = place(jnp.arange(number + 1))
-    lower, upper = jnp.minimum(edges[:-1], edges[1:]), jnp.maximum(edges[:-1], edges[1:])
-    return jnp.clip(jnp.minimum(upper, high) - jnp.maximum(lower, low), 0, upper - lower) / (upper - lower)
+    lower, upper = lesser(edges[:-1], edges[1:]), greater(edges[:-1], edges[1:])
+    return clamped(lesser(upper, high) - greater(lower, low), 0, upper - lower) / (upper - lower)

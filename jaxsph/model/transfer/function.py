@@ -19,6 +19,7 @@ from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.extremes import clamped, lesser
 from jaxsph.numerics.trees import tree
 
 
@@ -228,10 +229,10 @@ class TransferFunction:
         change = jnp.append(table[:, 1:] - table[:, :-1], jnp.zeros((4, 1), table.dtype), 1)
         width = jnp.append(self.values[1:] - self.values[:-1], 0)
         largest = jnp.finfo(width.dtype).max
-        inverse = jnp.where(width > 0, jnp.minimum(1 / jnp.where(width > 0, width, 1), largest), 0)
+        inverse = jnp.where(width > 0, lesser(1 / jnp.where(width > 0, width, 1), largest), 0)
         buckets = BUCKETS_PER_POINT * self.values.shape[0]
         extent = self.values[-1] - self.values[0]
-        rate = jnp.where(extent > 0, jnp.minimum(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
+        rate = jnp.where(extent > 0, lesser(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
         inside = _bucket(self.values, self.values[0], rate, buckets)
         below = jnp.searchsorted(inside, jnp.arange(buckets + 1, dtype=jnp.int32)).astype(jnp.int32)
         fullest = (below[1:] - below[:-1]).max()
@@ -334,7 +335,7 @@ def read(segments: Segments, place: tuple[Array, ...], channels: slice = slice(N
         return [at(base, i) + part * at(change, i) for base, change in zip(bases, changes, strict=True)]
     rows = [segments.start, segments.inverse, *bases, *changes]
     start, inverse, *found = _selected(rows, segments.start, place[0])
-    part = jnp.clip((place[0] - start) * inverse, 0, 1)
+    part = clamped((place[0] - start) * inverse, 0, 1)
     return [base + part * change for base, change in zip(found[: len(bases)], found[len(bases) :], strict=True)]
 
 
@@ -344,7 +345,7 @@ def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Arra
         return lax.cond(segments.even, _evenly, _scattered, segments, quantity)
     each = jnp.arange(segments.start.shape[0], dtype=jnp.int32)
     segment, start, inverse = _selected([each, segments.start, segments.inverse], segments.start, quantity)
-    return segment, jnp.clip((quantity - start) * inverse, 0, 1)
+    return segment, clamped((quantity - start) * inverse, 0, 1)
 
 
 def slope_in_middle(
@@ -352,7 +353,7 @@ def slope_in_middle(
 ) -> Float[Array, "*any"]:
     """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
     middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
-    slopes, place = jnp.clip(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
+    slopes, place = clamped(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
     slope = at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
     return jnp.where(middle >= segments.start[0], slope, 0)
 
@@ -395,14 +396,14 @@ def _segment(segments: Segments, quantity: Array) -> Array:
 def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     """Segment and place within it, for any control points."""
     i = _segment(segments, quantity)
-    return i, jnp.clip((quantity - at(segments.start, i)) * at(segments.inverse, i), 0, 1)
+    return i, clamped((quantity - at(segments.start, i)) * at(segments.inverse, i), 0, 1)
 
 
 @jax.custom_jvp
 def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
     """The same for control points that are evenly spaced but for rounding: no tables, no search."""
     last = segments.start.shape[0] - 1
-    place = jnp.clip((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
+    place = clamped((quantity - segments.start[0]) * (last / (segments.start[-1] - segments.start[0])), 0, last)
     i = jnp.clip(place.astype(jnp.int32), 0, last)
     return i, place - i.astype(place.dtype)
 
