@@ -6,8 +6,10 @@ Flow: path -> [formats] -> reader -> ParticleTable.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import importlib.metadata
+import sys
 import warnings
 import zlib
 from collections.abc import Callable
@@ -74,13 +76,19 @@ FORMATS = (
 )  # fmt: skip
 
 
+@functools.cache
+def installed_readers(path: tuple[str, ...]) -> tuple[importlib.metadata.EntryPoint, ...]:
+    """What packages on `sys.path` bring; found once, as it takes longer than to read a small file."""
+    return tuple(importlib.metadata.entry_points(group=READERS))
+
+
 def added_formats() -> tuple[Format, ...]:
     """Formats that installed packages bring, as entry points `jaxsph.readers`; asked before those of this package.
 
     One that cannot be loaded is left out with a `UserWarning` that names it.
     """
     found = []
-    for point in importlib.metadata.entry_points(group=READERS):
+    for point in installed_readers(tuple(sys.path)):
         try:
             form = point.load()
         except Exception as error:

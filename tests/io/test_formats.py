@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 import jaxsph.io as io
 from jaxsph.io.damage import UNENDED_NOTE
-from jaxsph.io.formats import FORMATS, READERS, find_format
+from jaxsph.io.formats import FORMATS, READERS, find_format, installed_readers
 
 of_phantom = {"phantom.h5", "disc_00010", "sphere_00020"}  # whose densities follow from h
 from_text = {"a.csv", "a.xyz", "extended.xyz"}
@@ -154,7 +154,7 @@ def bring(monkeypatch, tmp_path, loaded):
                 raise loaded
             return loaded
 
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [Point()] if group == READERS else [])
+    monkeypatch.setattr("jaxsph.io.formats.installed_readers", lambda path: [Point()])
 
 
 def test_a_format_of_another_package_is_read_by_its_reader(monkeypatch, tmp_path):
@@ -171,6 +171,14 @@ def test_a_format_of_another_package_is_read_by_its_reader(monkeypatch, tmp_path
     path = tmp_path / "a.mine"
     path.write_text("MINE\n1 2 3\n4 5 6\n")
     np.testing.assert_array_equal(js.io.read_table(path).position, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_packages_bring_their_readers_by_entry_points(monkeypatch, tmp_path):
+    (tmp_path / "one_package-1.dist-info").mkdir()
+    (tmp_path / "one_package-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: one-package\nVersion: 1\n")
+    (tmp_path / "one_package-1.dist-info" / "entry_points.txt").write_text(f"[{READERS}]\n{POINT} = package:FORMAT\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert [point.value for point in installed_readers(tuple(sys.path)) if point.name == POINT] == ["package:FORMAT"]
 
 
 @pytest.mark.parametrize("loaded", [ImportError("no such module"), "not a format"])
