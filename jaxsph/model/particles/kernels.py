@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.nearest import did_you_mean
@@ -141,8 +142,8 @@ def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
 
 
 def _positive(value: Any, xp: Any) -> Any:
-    """What is above 0; as `numerics.extremes`, its derivative follows the comparison."""
-    return xp.where(value < 0, xp.zeros_like(value), value)
+    """What is above 0; under JAX its derivative follows the comparison, as in `numerics.extremes`."""
+    return xp.maximum(value, 0) if xp is np else xp.where(value < 0, xp.zeros_like(value), value)
 
 
 def _power(value: Any, exponent: int) -> Any:
