@@ -12,13 +12,28 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.viewer import cut
 from jaxsph.viewer.pose import Pose
 
 LOOK_FILE = "look.json"
-REPLACED = ("--eye", "--target", "--up", "--fov", "--view", "--center", "--width", "--size", "--port", "--range", "--preset")
+REPLACED = (
+    "--eye",
+    "--target",
+    "--up",
+    "--fov",
+    "--view",
+    "--center",
+    "--width",
+    "--clip",
+    "--size",
+    "--port",
+    "--range",
+    "--preset",
+)
 LOOKS = ("--colormap", "--norm", "--range", "--preset", "--transfer", "--exposure", "--optical-depth")
 FLAGS = ("--no-browser", "--picture-all", "--quiet", "--verbose", "-q", "-v")
 
@@ -38,9 +53,18 @@ class Source:
     words: tuple[str, ...] = ()
 
 
-def python_of(source: Source, camera: Camera, pose: Pose | None, edited: TransferFunction | None, settings: Settings) -> str:
-    """Python that makes the picture again; `pose` is None where the camera is as it was given."""
+def python_of(
+    source: Source,
+    camera: Camera,
+    pose: Pose | None,
+    edited: TransferFunction | None,
+    settings: Settings,
+    within: Clip | None = None,
+) -> str:
+    """Python that makes the picture again; `pose` is None where the camera is as it was given, `within` is what is shown."""
     lines = ["import dataclasses", "import jaxsph as js", "", source.python]
+    if within is not None:
+        lines.append(f"scene = dataclasses.replace(scene, within={cut.python_of(within)})")
     if pose is not None:
         lines.append(_camera(camera, pose))
     if edited is not None:
@@ -53,18 +77,25 @@ def python_of(source: Source, camera: Camera, pose: Pose | None, edited: Transfe
 
 
 def command_of(
-    source: Source, camera: Camera, pose: Pose | None, edited: bool, settings: Settings, surface: Surface | None = None
+    source: Source,
+    camera: Camera,
+    pose: Pose | None,
+    edited: bool,
+    settings: Settings,
+    surface: Surface | None = None,
+    within: Clip | None = None,
 ) -> str:
-    """The command that makes the picture again, from a perspective; else why there is none."""
+    """The command that makes the picture again, from a perspective, with a pose by the clips of `within`; else why there is none."""
     if not source.file:
         return "# a scene of Python's has no command"
     if pose is not None and not pose.perspective:
-        return "# a moved parallel view has no command: its rays are parallel; use the Python"
+        return "# a parallel view that has moved or is cut has no command; use the Python"
     words = _kept(source.words, drop_look=edited, drop_view=pose is not None)
     if pose is not None:
         for name, place in (("--eye", pose.eye), ("--target", pose.target), ("--up", pose.axes[1])):
             words.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
         words.append(f"--fov={2 * np.degrees(np.arctan(pose.tangent)):.9g}")
+        words += [f"--clip={clip}" for clip in cut.words_of(within)]
     words.append(f"--size={camera.width}x{camera.height}")
     if edited:
         words.append(f"--transfer={LOOK_FILE}")

@@ -19,7 +19,7 @@ from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
 
-MODULES = ("made", "moves", "editor", "view", "notebook")
+MODULES = ("made", "moves", "editor", "cut", "view", "notebook")
 """Of the page, each after those that it imports."""
 IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const) (\w+))", re.MULTILINE)

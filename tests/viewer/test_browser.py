@@ -183,6 +183,28 @@ def test_keys_alone_suffice(page):
     assert not near(before, np.zeros_like(before))
 
 
+def test_a_cut_is_chosen_moved_and_turned_and_the_address_holds_it(page):
+    page.ask("document.querySelector('.picture').focus()")
+    whole = shown(page)
+    changed(page, lambda: page.key("x"))
+    plane = shown(page)
+    assert not near(whole, plane) and near(plane, rendered(page))
+    page.ask("document.querySelector('.picture').focus()")
+    for key in ("m", "N", "o", "k", "ArrowLeft"):
+        changed(page, lambda key=key: page.key(key))
+    assert not near(shown(page), plane) and near(shown(page), rendered(page))
+    page.until("decodeURIComponent(location.hash).includes('plane')")
+    changed(page, lambda: page.ask("[...document.querySelectorAll('button')].find((b) => b.innerText === 'Sphere').click()"))
+    across, down = page.middle("input[type=range]")
+    changed(page, lambda: page.drag([(across - 40, down), (across - 80, down), (across - 110, down)]))
+    assert near(shown(page), rendered(page))
+    for key in ("o", "x"):
+        page.ask("document.querySelector('.picture').focus()")
+        changed(page, lambda key=key: page.key(key))
+    changed(page, lambda: page.key("h"))
+    assert near(shown(page), whole) and page.ask("document.querySelector('input[type=range]').offsetParent === null")
+
+
 def test_a_picture_is_saved_and_the_address_holds_the_view(page, browser):
     x, y = page.middle(".picture")
     changed(page, lambda: page.drag([(x, y), (x - 60, y)]))
