@@ -46,11 +46,13 @@ class Source:
         python: lines that make `scene`; where they are not known, a line that says so.
         file: on the command line, FILE or scene:NAME; empty where there is none.
         words: options that it was opened with.
+        whole: whether look and camera are to be said, too, as they are those of a sequence.
     """
 
     python: str = "# scene: as it was given to js.view"
     file: str = ""
     words: tuple[str, ...] = ()
+    whole: bool = False
 
 
 def python_of(
@@ -85,7 +87,7 @@ def command_of(
     surface: Surface | None = None,
     within: Clip | None = None,
 ) -> str:
-    """The command that makes the picture again, from a perspective, with a pose by the clips of `within`; else why there is none."""
+    """The command that makes the picture again, with a pose by clips of `within`; else why there is none, as of parallel rays."""
     if not source.file:
         return "# a scene of Python's has no command"
     if pose is not None and not pose.perspective:
@@ -126,6 +128,8 @@ def _kept(words: tuple[str, ...], *, drop_look: bool, drop_view: bool) -> list[s
 def _camera(camera: Camera, pose: Pose) -> str:
     eye, target, up = (_listed(vector) for vector in (pose.eye, pose.target, pose.axes[1]))
     size = f"width={camera.width}, height={camera.height}"
+    if camera.near is not None and camera.far is not None:
+        size += f", near={float(camera.near)!r}, far={float(camera.far)!r}"
     if pose.perspective:
         fov = f"fov_degrees={2 * np.degrees(np.arctan(pose.tangent)).item()!r}"
         return f"camera = js.Camera.look_at({eye}, {target}, {up}, {fov}, {size})"

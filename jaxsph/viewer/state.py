@@ -99,12 +99,13 @@ class State:
 
     def code(self, source: Source, settings: Settings) -> dict[str, str]:
         """The Python and the command that make it again."""
-        pose, camera = self.pose if self.moved else None, self.camera
-        look = self.transfer if self.edited else None
+        moved, edited = self.moved or source.whole, self.edited or source.whole
+        pose, camera = self.pose if moved else None, self.camera
+        look = self.transfer if edited else None
         placed = self.pose if self.cut is not None else pose  # as clips have a say in where a command looks from
         return {
             "python": python_of(source, camera, pose, look, settings, self.scene.within),
-            "command": command_of(source, camera, placed, self.edited, settings, self._base.surface, self.scene.within),
+            "command": command_of(source, camera, placed, edited, settings, self._base.surface, self.scene.within),
         }
 
     def do(self, message: dict[str, Any], seen: Seen) -> None:
@@ -147,6 +148,11 @@ class State:
         else:
             known = ", ".join((*MOTIONS, *KNOWN_EDITS, *OTHERS, "pick"))
             raise InputError(f"there is no {name[:40]!r}; there are {known}")
+
+    def frame(self, scene: Scene) -> None:
+        """Show another frame of a sequence, with the look, the camera and the cut that there are."""
+        self._base = scene
+        self.scene = self._looked()
 
     def _move(self, pose: Pose) -> None:
         pose.camera(1, 1)  # refuses what is none

@@ -4,10 +4,9 @@ import dataclasses
 import shlex
 import threading
 
-import jax
 import numpy as np
 import pytest
-from views import HEIGHT, SETTINGS, WIDTH, camera, scene
+from views import HEIGHT, SETTINGS, WIDTH, camera, compiles, scene
 
 import jaxsph as js
 from jaxsph.cli.options import values
@@ -27,15 +26,6 @@ SECONDS = 240
 def same(image, other):
     names = ("color", "transmittance", "depth")
     return all(np.array_equal(np.asarray(getattr(image, name)), np.asarray(getattr(other, name))) for name in names)
-
-
-def compiles():
-    """A list that grows with everything that is compiled from now on."""
-    compiled, event = [], "/jax/core/compile/backend_compile_duration"
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **more: compiled.append(more) if name == event else None
-    )
-    return compiled
 
 
 @pytest.fixture(scope="module")

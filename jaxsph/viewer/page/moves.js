@@ -19,6 +19,7 @@ export const KEYS = [
   ["x", "cut: by a plane, a box, a sphere, not at all"],
   ["n, m", "move or size the cut, with shift by more"],
   ["o, k", "the other side of the cut; whether its plane follows the view"],
+  [", and .", "the frame before, and after, of a sequence; with shift the first, and the last"],
   ["u, y", "undo, redo a change of colours and opacity"],
   ["s", "save the picture"],
   ["?", "this help"],
