@@ -1,4 +1,4 @@
-"""Claim: a view of 44 thousand particles answers a drag within 150 ms once compiled, and neither compiles nor grows while it is used.
+"""Claim: a view of 44 thousand particles answers a drag within 150 ms once compiled, and neither compiles nor grows in its use.
 
 Of each source at 1024 x 768, without a browser: `first`, from the beginning of a view to its first draft, and `first_full` to its
 first picture of all pixels, where another view has compiled before; `drag`, from an input to its draft, the median of 50, and
