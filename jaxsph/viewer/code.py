@@ -12,13 +12,28 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.viewer import cut
 from jaxsph.viewer.pose import Pose
 
 LOOK_FILE = "look.json"
-REPLACED = ("--eye", "--target", "--up", "--fov", "--view", "--center", "--width", "--size", "--port", "--range", "--preset")
+REPLACED = (
+    "--eye",
+    "--target",
+    "--up",
+    "--fov",
+    "--view",
+    "--center",
+    "--width",
+    "--clip",
+    "--size",
+    "--port",
+    "--range",
+    "--preset",
+)
 LOOKS = ("--colormap", "--norm", "--range", "--preset", "--transfer", "--exposure", "--optical-depth")
 FLAGS = ("--no-browser", "--picture-all", "--quiet", "--verbose", "-q", "-v")
 
@@ -31,16 +46,27 @@ class Source:
         python: lines that make `scene`; where they are not known, a line that says so.
         file: on the command line, FILE or scene:NAME; empty where there is none.
         words: options that it was opened with.
+        whole: whether look and camera are to be said, too, as they are those of a sequence.
     """
 
     python: str = "# scene: as it was given to js.view"
     file: str = ""
     words: tuple[str, ...] = ()
+    whole: bool = False
 
 
-def python_of(source: Source, camera: Camera, pose: Pose | None, edited: TransferFunction | None, settings: Settings) -> str:
-    """Python that makes the picture again; `pose` is None where the camera is as it was given."""
+def python_of(
+    source: Source,
+    camera: Camera,
+    pose: Pose | None,
+    edited: TransferFunction | None,
+    settings: Settings,
+    within: Clip | None = None,
+) -> str:
+    """Python that makes the picture again; `pose` is None where the camera is as it was given, `within` is what is shown."""
     lines = ["import dataclasses", "import jaxsph as js", "", source.python]
+    if within is not None:
+        lines.append(f"scene = dataclasses.replace(scene, within={cut.python_of(within)})")
     if pose is not None:
         lines.append(_camera(camera, pose))
     if edited is not None:
@@ -53,18 +79,25 @@ def python_of(source: Source, camera: Camera, pose: Pose | None, edited: Transfe
 
 
 def command_of(
-    source: Source, camera: Camera, pose: Pose | None, edited: bool, settings: Settings, surface: Surface | None = None
+    source: Source,
+    camera: Camera,
+    pose: Pose | None,
+    edited: bool,
+    settings: Settings,
+    surface: Surface | None = None,
+    within: Clip | None = None,
 ) -> str:
-    """The command that makes the picture again, from a perspective; else why there is none."""
+    """The command that makes the picture again, with a pose by clips of `within`; else why there is none, as of parallel rays."""
     if not source.file:
         return "# a scene of Python's has no command"
     if pose is not None and not pose.perspective:
-        return "# a moved parallel view has no command: its rays are parallel; use the Python"
+        return "# a parallel view that has moved or is cut has no command; use the Python"
     words = _kept(source.words, drop_look=edited, drop_view=pose is not None)
     if pose is not None:
         for name, place in (("--eye", pose.eye), ("--target", pose.target), ("--up", pose.axes[1])):
             words.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
         words.append(f"--fov={2 * np.degrees(np.arctan(pose.tangent)):.9g}")
+        words += [f"--clip={clip}" for clip in cut.words_of(within)]
     words.append(f"--size={camera.width}x{camera.height}")
     if edited:
         words.append(f"--transfer={LOOK_FILE}")
@@ -95,6 +128,8 @@ def _kept(words: tuple[str, ...], *, drop_look: bool, drop_view: bool) -> list[s
 def _camera(camera: Camera, pose: Pose) -> str:
     eye, target, up = (_listed(vector) for vector in (pose.eye, pose.target, pose.axes[1]))
     size = f"width={camera.width}, height={camera.height}"
+    if camera.near is not None and camera.far is not None:
+        size += f", near={float(camera.near)!r}, far={float(camera.far)!r}"
     if pose.perspective:
         fov = f"fov_degrees={2 * np.degrees(np.arctan(pose.tangent)).item()!r}"
         return f"camera = js.Camera.look_at({eye}, {target}, {up}, {fov}, {size})"

@@ -29,6 +29,7 @@ from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
 from jaxsph.viewer.state import State
+from jaxsph.viewer.timeline import Timeline
 
 REST_SECONDS = 0.2
 """How long nothing moves before more than drafts are made."""
@@ -55,13 +56,21 @@ class Session:
         told: a reason why there is no picture of the settings, for people; empty where there is.
     """
 
-    def __init__(self, scene: Scene, camera: Camera, settings: Settings | None = None, source: Source | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera,
+        settings: Settings | None = None,
+        source: Source | None = None,
+        timeline: Timeline | None = None,
+    ) -> None:
         """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
 
         Args:
             scene, camera: what is looked at, and from where.
             settings: of the last picture of a state; None is `stages.default_of(scene)`.
             source: where the scene comes from, for the code that makes it again.
+            timeline: the sequence that it is a frame of, if it is.
 
         Raises:
             ValueError: a scene with nothing in it, or a camera that is none; a tolerance of a surface of particles.
@@ -72,6 +81,7 @@ class Session:
         if scene.surface is not None:
             along_rays(scene, self.settings)
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
+        self._timeline = timeline
         self._state = State(scene, camera)
         self._version, self._failed, self._changed = 1, 0, 0.0
         self._lock = threading.Condition()
@@ -89,7 +99,7 @@ class Session:
 
     def start(self) -> Session:
         """Begin to render."""
-        for work in (self._draft, self._finish):
+        for work in (self._draft, self._finish, *([] if self._timeline is None else [self._read])):
             thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
@@ -104,6 +114,8 @@ class Session:
         with self._lock:
             self._closed = True
             self._lock.notify_all()
+        if self._timeline is not None:
+            self._timeline.close()
         for thread in self._threads:
             thread.join(seconds)
         self._threads = [thread for thread in self._threads if thread.is_alive()]
@@ -132,7 +144,8 @@ class Session:
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
         with self._lock:
-            return {"is": "state", "version": self._version, "told": self.told, **self._state.told()}
+            frames = None if self._timeline is None else self._timeline.told()
+            return {"is": "state", "version": self._version, "told": self.told, "frames": frames, **self._state.told()}
 
     @property
     def transfer(self) -> TransferFunction | None:
@@ -142,7 +155,8 @@ class Session:
     def code(self) -> dict[str, str]:
         """The Python and the command that make the newest state again."""
         with self._lock:
-            return self._state.code(self._source, self.settings)
+            line = self._timeline
+            return self._state.code(self._source if line is None else line.frames[line.number].source, self.settings)
 
     @property
     def histogram(self) -> dict[str, Any] | None:
@@ -194,7 +208,7 @@ class Session:
         """Do what a message asks for.
 
         Args:
-            message: `{"do": NAME, ...}`, see `State.do`; also `pick`.
+            message: `{"do": NAME, ...}`, see `State.do`; also `pick`, and `frame` with a `number` from 0 on, of a sequence.
 
         Returns:
             An answer for who asked, where there is one.
@@ -207,6 +221,11 @@ class Session:
         try:
             if message["do"] == "pick":
                 return self._picked(message)
+            if message["do"] == "frame":
+                if self._timeline is None:
+                    raise InputError("this view is of no sequence of snapshots")
+                self._timeline.ask(int(number(message, "number", 0, len(self._timeline.frames) - 1)))
+                return None
             with self._lock:
                 self._state.do(message, self._seen)
                 self._version += 1
@@ -267,6 +286,22 @@ class Session:
             if not moved():
                 self._describe(state)
                 done = state.version
+
+    def _read(self) -> None:
+        """Frames of a sequence that are asked for."""
+        assert self._timeline is not None
+        self._timeline.read(self._frame)
+
+    def _frame(self, number: int, scene: Scene | None) -> None:
+        """Show a frame, or that it cannot be."""
+        if scene is not None:
+            with self._lock:
+                self._timeline.number = number  # type: ignore[union-attr]
+                self._state.frame(scene)
+                self._version += 1
+                self._changed = time.monotonic()
+                self._lock.notify_all()
+        self._send(self.state())
 
     def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
         """The newest state as soon as there is one after `done`, and it rests if it has to; None at the end."""

@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source, command_of, python_of
 from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking
+from jaxsph.viewer.cut import Cut, asked, read
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
 from jaxsph.viewer.pose import Pose
 
-OTHERS = ("fit", "home", "center", "restore")
+OTHERS = ("fit", "home", "center", "cut", "restore")
 """What can be done besides motions and edits of the look."""
 Seen = Callable[[dict[str, Any]], np.ndarray]
 
@@ -30,7 +32,8 @@ class State:
     """A scene as it is looked at; for one thread at a time.
 
     Attributes:
-        scene: with the look that is shown.
+        scene: with the look that is shown, and cut.
+        cut: what of it is shown; None is all.
         pose: of the camera; `moved` since the view began, whose camera is that which was given.
     """
 
@@ -42,7 +45,7 @@ class State:
         """
         look = first_look(scene)
         self._given, self._first = camera, Pose.of(camera, scene)
-        self.pose, self.moved = self._first, False
+        self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
         self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
         self._base = scene
         self.scene = self._looked()
@@ -91,15 +94,18 @@ class State:
             "look": None if self._steps is None else self._steps.look.told(),
             "edited": self.edited,
             "moved": self.moved,
+            "cut": None if self.cut is None else self.cut.told(),
         }
 
     def code(self, source: Source, settings: Settings) -> dict[str, str]:
         """The Python and the command that make it again."""
-        pose, camera = self.pose if self.moved else None, self.camera
-        look = self.transfer if self.edited else None
+        moved, edited = self.moved or source.whole, self.edited or source.whole
+        pose, camera = self.pose if moved else None, self.camera
+        look = self.transfer if edited else None
+        placed = self.pose if self.cut is not None else pose  # as clips have a say in where a command looks from
         return {
-            "python": python_of(source, camera, pose, look, settings),
-            "command": command_of(source, camera, pose, self.edited, settings, self._base.surface),
+            "python": python_of(source, camera, pose, look, settings, self.scene.within),
+            "command": command_of(source, camera, placed, edited, settings, self._base.surface, self.scene.within),
         }
 
     def do(self, message: dict[str, Any], seen: Seen) -> None:
@@ -123,31 +129,51 @@ class State:
             lower, upper = self._bounds()
             self._move(self.pose.fitted(lower, upper, self._given.width / self._given.height))
         elif name == "home":
-            self.pose, self.moved = self._first, False
+            self._move(self._first)
+            self.moved = False
         elif name == "center":
             self._move(self.pose.centred(seen(message)))
+        elif name == "cut":
+            self._cut(asked(self.cut, message, self.pose))
         elif name == "restore":
             if not isinstance(message.get("pose"), dict):
                 raise InputError("`pose` of 'restore' must be an object")
             pose = self._first.read(message["pose"])
             pose.camera(1, 1)  # before the look changes
+            cut = read(message["cut"]) if "cut" in message else self.cut
             if message.get("points") is not None and self._steps is not None:
                 self._edit(self._steps, {"do": "points", "points": message["points"]})
             self._move(pose)
+            self._cut(None if cut is None else cut.seen_from(pose))
         else:
             known = ", ".join((*MOTIONS, *KNOWN_EDITS, *OTHERS, "pick"))
             raise InputError(f"there is no {name[:40]!r}; there are {known}")
 
+    def frame(self, scene: Scene) -> None:
+        """Show another frame of a sequence, with the look, the camera and the cut that there are."""
+        self._base = scene
+        self.scene = self._looked()
+
     def _move(self, pose: Pose) -> None:
         pose.camera(1, 1)  # refuses what is none
         self.pose, self.moved = pose, True
+        if self.cut is not None:
+            self._cut(self.cut.seen_from(pose))
+
+    def _cut(self, cut: Cut | None) -> None:
+        self.cut = cut
+        self.scene = dataclasses.replace(self.scene, within=self._within())
+
+    def _within(self) -> Clip | None:
+        return both(self._base.within, None if self.cut is None else self.cut.clip())
 
     def _edit(self, steps: Steps, message: dict[str, Any]) -> None:
         edit(steps, message)
         self.scene = self._looked()
 
     def _looked(self) -> Scene:
-        return self._base if self._steps is None else looking(self._base, self._steps.look.transfer())
+        look = None if self._steps is None else self._steps.look.transfer()
+        return looking(dataclasses.replace(self._base, within=self._within()), look)
 
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
         if not self._base.parts:

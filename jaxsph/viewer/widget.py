@@ -15,11 +15,13 @@ from jaxsph.io.libraries import require
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
+from jaxsph.viewer.timeline import timeline_of
 
-MODULES = ("made", "moves", "editor", "view", "notebook")
+MODULES = ("made", "moves", "editor", "cut", "time", "view", "notebook")
 """Of the page, each after those that it imports."""
 IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const) (\w+))", re.MULTILINE)
@@ -27,14 +29,14 @@ MAX_UNSEEN = 2
 """Frames that are on their way to a notebook: more would pile up where it is slow."""
 
 
-def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
+def view(scene: Scene | Snapshots, camera: Camera, settings: Settings | None = None) -> Any:
     """Look around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
 
     `jaxsph view FILE` shows the same in a browser. A draft comes while something moves; then every pixel gets its ray; then the
     tolerance is kept. The widget always says which of these is seen, and how far it may be off.
 
     Args:
-        scene, camera: as for `jaxsph.render`.
+        scene, camera: as for `jaxsph.render`; or a sequence (`jaxsph.sequence.Snapshots`), whose frames are chosen by a slider.
         settings: of the picture once nothing moves; by default segments with a tolerance of 0.01, of a surface all samples.
 
     Returns:
@@ -46,7 +48,8 @@ def view(scene: Scene, camera: Camera, settings: Settings | None = None) -> Any:
         ValueError: a scene with nothing in it, or a camera that is none.
     """
     require("anywidget", "an interactive view in a notebook", "view")
-    return _widget_class()(Session(scene, camera, settings).start())
+    shown, timeline = timeline_of(scene) if isinstance(scene, Snapshots) else (scene, None)
+    return _widget_class()(Session(shown, camera, settings, timeline=timeline).start())
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """A small scene to look around in, and its view."""
 
+import jax
 import numpy as np
 
 import jaxsph as js
@@ -20,3 +21,12 @@ def scene(seed=0):
 
 def camera(width=WIDTH, height=HEIGHT):
     return js.Camera.look_at((0.3, 0.5, 4.0), (0, 0, 0), width=width, height=height, fov_degrees=35.0, near=2.0, far=6.0)
+
+
+def compiles():
+    """A list that grows with everything that is compiled from now on."""
+    compiled, event = [], "/jax/core/compile/backend_compile_duration"
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **more: compiled.append(more) if name == event else None
+    )
+    return compiled

@@ -26,9 +26,9 @@ SECONDS = 120
 
 
 @contextlib.contextmanager
-def served(*more):
+def served(*more, of=(f"scene:radial:particles={PARTICLES}",)):
     """A view that is served, as the command line does it: its address."""
-    words = [f"scene:radial:particles={PARTICLES}", "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
+    words = [*of, "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
     more = ["--integrator", "samples", "--no-browser", "-q", *more]
     process = subprocess.Popen(
         [sys.executable, "-m", "jaxsph", "view", *words, *more], stdout=subprocess.PIPE, text=True, cwd=ROOT
@@ -157,6 +157,27 @@ def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
         assert near(shown(page), rendered(page))
 
 
+def test_frames_of_a_sequence_are_chosen_and_one_that_is_damaged_is_named(browser, tmp_path):
+    fluid = js.scenes.load("radial", PARTICLES)[0].particles.to_numpy()
+    files = [tmp_path / f"s_{number}.npz" for number in range(3)]
+    for number, file in enumerate(files):
+        position = fluid["position"] * (1 - 0.1 * number)
+        np.savez(file, position=position, heat=fluid["quantity"], support=fluid["support"], time=number)
+    files[2].write_bytes(files[2].read_bytes()[:999])
+    with served("--surface", "none", of=map(str, files)) as address, opened(browser, address) as page:
+        page.ask("document.querySelector('.picture').focus()")
+        first = shown(page)
+        changed(page, lambda: page.key("."))
+        assert not near(first, shown(page)) and near(shown(page), rendered(page))
+        page.ask("document.querySelector('.picture').focus()")
+        page.key(".")
+        page.until("document.querySelector('.told').innerText.includes('s_2.npz')")
+        slider = "document.querySelector('.panel input[type=range]')"
+        assert page.ask(f"{slider}.value") == "2"
+        changed(page, lambda: page.ask(f"{slider}.value = 0, {slider}.dispatchEvent(new Event('input')) && 0"))
+        assert near(shown(page), first) and page.ask("document.querySelector('.told').hidden")
+
+
 def test_keys_alone_suffice(page):
     page.ask("document.querySelector('.picture').focus()")
     before = shown(page)
@@ -181,6 +202,28 @@ def test_keys_alone_suffice(page):
     changed(page, lambda: page.key("ArrowUp"))
     changed(page, lambda: page.ask("document.querySelector('button[title^=\"as it was\"]').click()"))
     assert not near(before, np.zeros_like(before))
+
+
+def test_a_cut_is_chosen_moved_and_turned_and_the_address_holds_it(page):
+    page.ask("document.querySelector('.picture').focus()")
+    whole = shown(page)
+    changed(page, lambda: page.key("x"))
+    plane = shown(page)
+    assert not near(whole, plane) and near(plane, rendered(page))
+    page.ask("document.querySelector('.picture').focus()")
+    for key in ("m", "N", "o", "k", "ArrowLeft"):
+        changed(page, lambda key=key: page.key(key))
+    assert not near(shown(page), plane) and near(shown(page), rendered(page))
+    page.until("decodeURIComponent(location.hash).includes('plane')")
+    changed(page, lambda: page.ask("[...document.querySelectorAll('button')].find((b) => b.innerText === 'Sphere').click()"))
+    across, down = page.middle("input[aria-label^=place]")
+    changed(page, lambda: page.drag([(across - 40, down), (across - 80, down), (across - 110, down)]))
+    assert near(shown(page), rendered(page))
+    for key in ("o", "x"):
+        page.ask("document.querySelector('.picture').focus()")
+        changed(page, lambda key=key: page.key(key))
+    changed(page, lambda: page.key("h"))
+    assert near(shown(page), whole) and page.ask("document.querySelector('input[aria-label^=place]').offsetParent === null")
 
 
 def test_a_picture_is_saved_and_the_address_holds_the_view(page, browser):

@@ -1,16 +1,18 @@
 """A view without anybody who shows it: inputs coalesce, what is old is abandoned, and pictures are those of `jaxsph.render`."""
 
 import dataclasses
+import shlex
 import threading
 
-import jax
 import numpy as np
 import pytest
-from views import HEIGHT, SETTINGS, WIDTH, camera, scene
+from views import HEIGHT, SETTINGS, WIDTH, camera, compiles, scene
 
 import jaxsph as js
+from jaxsph.cli.options import values
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.viewer import session as views
+from jaxsph.viewer.code import Source
 from jaxsph.viewer.explained import histogram_of
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
@@ -37,6 +39,7 @@ def home(session):
     """The session, as it began."""
     yield session
     session.do({"do": "reset_look"})
+    session.do({"do": "cut", "kind": "off"})
     session.do({"do": "home"})
 
 
@@ -83,16 +86,47 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(home):
     rows[1][1] *= 2
     home.do({"do": "points", "points": rows})
     home.wait(seconds=SECONDS)
-    compiled = []
-    event = "/jax/core/compile/backend_compile_duration"
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **more: compiled.append(more) if name == event else None
-    )
+    compiled = compiles()
     for turn in range(4):
         home.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
         home.do({"do": "points", "points": [*rows, [0.3, turn, 0.1, 0.2, 0.3]][turn % 2 :]})
         home.wait(seconds=SECONDS)
     assert not compiled
+
+
+def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(home, tmp_path, monkeypatch):
+    home.do({"do": "cut", "kind": "plane"})
+    home.do({"do": "orbit", "right": 0.1, "down": 0})
+    whole, picture, state = js.render(scene(), home.snapshot().camera, SETTINGS), home.wait(seconds=SECONDS), home.snapshot()
+    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS)) and not same(picture.image, whole)
+    compiled = compiles()
+    for share in (-0.3, 0.2, -2.0, 2.0, 0.1):
+        home.do({"do": "cut", "share": share})
+        home.do({"do": "orbit", "right": 0.1, "down": 0})
+        picture = home.wait(seconds=SECONDS)
+        assert share < 2 or float(np.asarray(picture.image.transmittance).min()) == 1  # nothing is left
+    assert not compiled
+    monkeypatch.chdir(tmp_path)
+    space = {"scene": scene(), "camera": None}
+    exec(home.code()["python"], space)
+    assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6
+
+
+def test_the_command_of_a_cut_has_all_clips(tmp_path):
+    held = dataclasses.replace(scene(), within=js.Sphere((0, 0, 0), 0.75))
+    made = Session(held, camera(), SETTINGS, Source(file="a.npz", words=("--width", "2", "--clip", "none")))
+    made.do({"do": "cut", "kind": "plane", "outside": True})
+    words = shlex.split(made.code()["command"])
+    assert next(word for word in words if "clip" in word) == "--clip=sphere:0,0,0,0.75"
+    found = [values.clip(word.partition("=")[2]).clip for word in words if word.startswith("--clip=")]
+    places = tuple(np.random.default_rng(0).uniform(-1, 1, (3, 99)))
+    clip = made.snapshot().scene.within
+    assert np.array_equal((found[0] & found[1]).contains(places), clip.contains(places)) and len(found) == 2
+    line = next(line for line in made.code()["python"].splitlines() if "within" in line)
+    space = {"js": js, "dataclasses": dataclasses, "scene": scene()}
+    exec(line, space)
+    assert np.array_equal(space["scene"].within.contains(places), clip.contains(places))
+    assert "--width" not in words and "none" not in words and words[4].startswith("--target=")
 
 
 def test_a_look_is_edited_and_taken_back(home):

@@ -1,9 +1,13 @@
 """What a view shows: inputs change the pose and the look, or nothing at all; no picture is made."""
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.viewer.cut import words_of
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.state import State
 
@@ -48,3 +52,74 @@ def test_a_view_is_restored_whole_or_not_at_all(state, points):
 def test_the_middle_is_what_is_seen_there(state):
     state.do({"do": "center", "right": 0.1, "down": 0.1}, lambda message: np.array([0.25, 0.5, 0.125]))
     np.testing.assert_allclose(state.pose.target, (0.25, 0.5, 0.125))
+
+
+def shown(state):
+    """Which particles are shown."""
+    within = state.scene.within
+    places = np.asarray(state.scene.particles.position, np.float64)
+    return np.ones(len(places), bool) if within is None else np.asarray(within.contains(tuple(places.T)))
+
+
+def test_a_plane_follows_the_view_until_it_is_held_and_cuts_what_is_before_it(state):
+    state.do({"do": "cut", "kind": "plane"}, nowhere)
+    position = np.asarray(state.scene.particles.position, np.float64)
+    np.testing.assert_array_equal(shown(state), (position - state.pose.target) @ state.pose.axes[2] >= 0)
+    state.do({"do": "orbit", "right": 0.3, "down": 0.1}, nowhere)
+    np.testing.assert_array_equal(shown(state), (position - state.pose.target) @ state.pose.axes[2] >= 0)
+    state.do({"do": "cut", "follows": False, "share": 0.1}, nowhere)
+    held = shown(state)
+    state.do({"do": "orbit", "right": 0.3, "down": 0.1}, nowhere)
+    np.testing.assert_array_equal(shown(state), held)
+    state.do({"do": "cut", "outside": True}, nowhere)
+    np.testing.assert_array_equal(shown(state), ~held)
+    state.do({"do": "cut", "kind": "off"}, nowhere)
+    assert state.scene.within is None and state.told()["cut"] is None
+
+
+@pytest.mark.parametrize("kind", ["box", "sphere"])
+def test_a_box_and_a_sphere_are_sized_around_the_middle_of_the_view(state, kind):
+    state.do({"do": "cut", "kind": kind, "share": 0.2}, nowhere)
+    few = shown(state)
+    state.do({"do": "cut", "share": 0.4}, nowhere)
+    assert few.sum() < shown(state).sum() < len(few)
+    before = state.pose.target
+    state.do({"do": "pan", "right": 0.3, "down": 0.0}, nowhere)
+    np.testing.assert_allclose(state.cut.middle, before)
+    state.do({"do": "cut", "here": True}, nowhere)
+    np.testing.assert_allclose(state.cut.middle, state.pose.target)
+
+
+def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene():
+    scene, camera = js.scenes.load("radial", 60, width=12, height=8)
+    scene = dataclasses.replace(scene, within=js.Sphere((0, 0, 0), 0.9))
+    there, here = State(scene, camera), State(scene, camera)
+    there.do({"do": "cut", "kind": "box", "share": 0.3, "outside": True}, nowhere)
+    told = json.loads(json.dumps(there.told()))
+    here.do({"do": "restore", "pose": told["pose"], "points": None, "cut": told["cut"]}, nowhere)
+    assert words_of(here.scene.within) == words_of(there.scene.within)
+    assert [word.partition(":")[0] for word in words_of(here.scene.within)] == ["sphere", "~box"]
+    here.do({"do": "restore", "pose": told["pose"], "cut": None}, nowhere)
+    assert here.scene.within is scene.within
+
+
+@pytest.mark.parametrize(
+    "said",
+    [{}, {"share": 0.1}, {"kind": "cone"}, {"kind": "plane", "share": 3}, {"kind": "box", "share": 0}],
+    ids=str,
+)
+def test_a_cut_that_makes_no_sense_is_refused(state, said):
+    with pytest.raises(InputError):
+        state.do({"do": "cut", **said}, nowhere)
+    assert state.cut is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"kind": "cone"}, {"middle": [0, 0]}, {"axis": [0, 0, 0]}, {"reach": -1}, {"share": "a"}], ids=str
+)
+def test_an_address_with_a_cut_that_is_none_changes_nothing(state, change):
+    state.do({"do": "cut", "kind": "plane"}, nowhere)
+    told, before = state.told(), state.cut
+    with pytest.raises(InputError):
+        state.do({"do": "restore", "pose": told["pose"], "cut": {**told["cut"], **change}}, nowhere)
+    assert state.cut is before and not state.moved

@@ -18,7 +18,6 @@ from cyclopts import Parameter
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
@@ -28,26 +27,20 @@ from jaxsph.cli.console import (
     progress,
     refuse,
     require_writable,
-    say_notes,
-    say_report,
-    span,
     tell_if_unseen,
     wrong_usage,
 )
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
+from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
-from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.surfaces import surface_of, told_of_surface
-from jaxsph.io.settle.assemble import AUTO
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.survey import Survey, surveyed
 from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
 
 SECONDS = 10.0
@@ -123,7 +116,9 @@ def movie(
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown = _sequence(options) if len(options.source) > 1 else _still(options)
+        sources, camera, shown = (
+            snapshots_of(options, gaps=options.gaps, strict=options.strict) if len(options.source) > 1 else _still(options)
+        )
         path = _path(options, camera, shown, sized)
         number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = _number_of_frames(options, path, number)
@@ -226,49 +221,6 @@ def _still(options: Any) -> tuple[Still, Camera, Bounded]:
     wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
     center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
     return Still(scene), camera, cli_where.framed(BoundingBox(center - reach, center + reach), options)
-
-
-def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded]:
-    """The snapshots and their look, as said on the way; a camera, and what there ever is."""
-    for path in options.source:
-        if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
-            raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
-    refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
-    by = options.opacity_by or (None if options.transfer is not None else AUTO)
-    said = {field.name: getattr(options, field.name) for field in dataclasses.fields(opening.Source)}
-    source = opening.Source(**said | {"opacity_by": by})
-    with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
-        try:
-            survey = surveyed(options.source, source, gaps=options.gaps, strict=options.strict, progress=show)
-        except ValueError as error:
-            if "missing" in str(error) and not options.gaps:
-                raise ValueError(f"{error}; --gaps goes on without") from error
-            raise
-    _say_survey(survey)
-    looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
-    transfer = cli_look.look(survey.middle, looks, survey.quantity)
-    of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
-    say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
-    center = cli_where.middle_of(survey, options)
-    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
-    if surface is not None:
-        say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
-    snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)
-    placed = dataclasses.replace(options, center=None) if center is not None else options
-    return snapshots, cli_where.camera_of(snapshots, placed), cli_where.framed(snapshots, options)
-
-
-def _say_survey(survey: Survey) -> None:
-    files, times = survey.files, survey.order.times
-    counts = span([file.num_particles for file in files])
-    say("sequence", f"{len(files)} snapshots, {files[0].path} to {files[-1].path}, {counts} particles each")
-    say("times", f"{span(times)}, {survey.order.told}")
-    for unread in survey.unread:
-        say("unread", f"{unread.why}; frames that need it are left out")
-    for sentence in survey.told():
-        say("between", sentence)
-    say_report(survey.report)
-    say_notes(survey.report.notes)
 
 
 def _moments(sources: Still | Snapshots, frames: int) -> Still | Sequence[Source]:

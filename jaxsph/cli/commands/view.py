@@ -6,8 +6,10 @@ Flow: options -> Scene, Camera, Settings -> [view] -> Session -> server, browser
 from __future__ import annotations
 
 import dataclasses
+import functools
 import warnings
 import webbrowser
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
@@ -18,13 +20,16 @@ from jaxsph.cli.console import UsageError, camera_line
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
 from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
+from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
 from jaxsph.model import Scene, Settings
+from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.code import Source
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
+from jaxsph.viewer.timeline import Timeline, timeline_of
 
 MAX_PORT = 65535
 SECONDS = 1.0
@@ -49,24 +54,31 @@ VIEW = View()
 
 
 def view(
-    file: Annotated[str, Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")],
-    /,
-    *,
+    *files: Annotated[
+        str, Parameter(help="a file of particles or of a volume, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")
+    ],
     asked: View = VIEW,
 ) -> bool:
     """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
-    options = dataclasses.replace(asked, source=file)
+    if not files:
+        raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
+    options = dataclasses.replace(asked, source=files[0] if len(files) == 1 else list(files))
     if not 0 <= options.port <= MAX_PORT:
         raise UsageError(f"--port must lie from 0 to {MAX_PORT}, got {options.port}; 0 takes any that is free")
     if options.json:
         raise UsageError("--json is for commands that end by themselves; the one line of stdout is the address")
     require("websockets", "an interactive view", "view")
     options = as_medium(options, settings_of(options))
-    scene, camera, _ = cli_scene.scene_of(options)
+    timeline: Timeline | None = None
+    if len(files) == 1:
+        scene, camera, _ = cli_scene.scene_of(options)
+    else:
+        snapshots, camera, _ = snapshots_of(options, gaps=True, strict=False)
+        scene, timeline = timeline_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
     settings = _settings(options, scene)
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
-    session = Session(scene, camera, settings, _source(options))
+    session = Session(scene, camera, settings, _source(options) if timeline is None else None, timeline)
     server, opens = Server(session, options.port), not options.no_browser
 
     def ready() -> None:
@@ -124,3 +136,22 @@ def _source(options: Any) -> Source:
         said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
         python = f"scene, camera = js.io.read_scene({options.source!r}{said}, size=({width}, {height}))"
     return Source(python, options.source, tuple(word for word in options.words if word != options.source))
+
+
+def _source_of_frame(options: Any, snapshots: Snapshots, path: Path, time: float) -> Source:
+    """How a frame of a sequence is made in Python, and by the command where its box is not moved."""
+    survey = snapshots.survey
+    chosen = {"color_by": survey.quantity, "opacity_by": survey.report.opacity_by}
+    names = (*chosen, "support", "kernel", "part_type", "where", "share", "center")
+    given = {name: chosen.get(name) or getattr(options, name) for name in names}
+    said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
+    if snapshots.surface is not None:
+        said += f", surface=js.Surface({float(snapshots.surface.level)!r})"
+    files = [str(file.path) for file in survey.files]
+    python = f"snapshots = js.sequence.Snapshots.from_files({files}{said}, gaps=True)\nscene = snapshots.at({time!r})"
+    words = [word for word in options.words if word not in options.source]
+    told = {word.partition("=")[0] for word in words}
+    for name, value in chosen.items():
+        option = f"--{name.replace('_', '-')}"
+        words += [f"{option}={value}"] * (value is not None and option not in told)
+    return Source(python, "" if snapshots.center is not None else str(path), tuple(words), whole=True)

@@ -46,8 +46,9 @@ function kept(one) {
   let timer = 0;
   if (location.hash.length > 1) {
     try {
-      const { pose, points } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
-      one.send({ do: "restore", pose, points });
+      const { pose, points, cut, frame } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+      if (frame != null) one.send({ do: "frame", number: frame });
+      one.send({ do: "restore", pose, points, cut });
     } catch {
       history.replaceState(null, "", location.pathname + location.search);
     }
@@ -56,9 +57,9 @@ function kept(one) {
     if (message.is !== "state") return;
     clearTimeout(timer);
     timer = setTimeout(() => {
-      const view = { pose: message.pose };
+      const view = { pose: message.pose, cut: message.cut, frame: message.frames?.asked };
       if (message.edited) view.points = message.look.points.map((row) => row.slice(0, 5));
-      const hash = message.moved || message.edited ? `#${encodeURIComponent(JSON.stringify(view))}` : "";
+      const hash = message.moved || message.edited || message.cut || message.frames?.asked ? `#${encodeURIComponent(JSON.stringify(view))}` : "";
       history.replaceState(null, "", location.pathname + location.search + hash);
     }, KEEP);
   });

@@ -1,7 +1,9 @@
 // A view: the picture with what it is in words, and beside it all that changes it.
+import { cutter } from "./cut.js";
 import { editor } from "./editor.js";
 import { boxOf, drawn, made, short } from "./made.js";
 import { KEYS, moves } from "./moves.js";
+import { timer } from "./time.js";
 
 const MAPS = ["viridis", "heat", "ice", "coolwarm", "gray", "magma", "inferno", "plasma", "cividis", "turbo",
   "cmocean:thermal", "crameri:batlow"];
@@ -28,7 +30,10 @@ export function mount(root, link) {
   const camera = section("Camera",
     made("div", { class: "row" }, axis("x"), axis("y"), axis("z"), button("Oblique", "oblique (0)", () => send({ do: "axis", name: "iso" }))),
     made("div", { class: "row" }, button("Fit", "fit all (f)", () => send({ do: "fit" })), button("Home", "the first view (h)", () => send({ do: "home" })), rays));
-  const edit = editor(send);
+  const edit = editor(send), cut = cutter(send);
+  const cuts = section("Cut", cut.element);
+  const time = timer(send), times = section("Time", time.element);
+  times.hidden = true;
   const maps = made("select", { "aria-label": "colour map", onchange: () => { if (maps.value) send({ do: "colormap", name: maps.value }); maps.value = ""; } },
     made("option", { value: "" }, "Colour map…"), ...MAPS.map((name) => made("option", { value: name }, name)));
   const opaque = [button("Thinner", "half as opaque", () => send({ do: "exposure", stops: -1 })), button("Denser", "twice as opaque", () => send({ do: "exposure", stops: 1 }))];
@@ -44,7 +49,7 @@ export function mount(root, link) {
     made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots. A surface is opaque: its bars are where rays met it, and its points have colours alone."), closing());
   const files = link.files ? [made("a", { class: "button", href: "view.exr", download: "view.exr" }, "EXR"), made("a", { class: "button", href: "look.json", download: "look.json" }, "Look")] : [];
   const keep = section("Keep", made("div", { class: "row" }, button("PNG", "save the picture (s)", save), ...files, button("Code", "Python and command", () => send({ do: "code" })), button("Help", "help (?)", () => help.showModal())));
-  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, look, pixel, keep)), texts, help);
+  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, times, look, cuts, pixel, keep)), texts, help);
 
   function section(title, ...children) {
     return made("section", {}, made("h2", {}, title), ...children);
@@ -68,7 +73,7 @@ export function mount(root, link) {
       URL.revokeObjectURL(to.href);
     });
   }
-  moves(picture, send, { p: turnRays, s: save, "?": () => help.showModal() });
+  moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, "?": () => help.showModal() });
 
   async function show(header, blob) {
     const turn = ++drawing;
@@ -134,8 +139,11 @@ export function mount(root, link) {
     else if (message.is === "state") {
       if (numbers.children.length > 2 && state?.version !== message.version) numbers.classList.add("stale");
       state = message;
-      complain(message.told);
+      complain(message.told || message.frames?.why);
       edit.show(message.look);
+      cut.show(message.cut);
+      times.hidden = !message.frames;
+      time.show(message.frames);
       look.hidden = !message.look;
       look.firstChild.textContent = message.look?.flat ? "Colour" : "Colour and opacity"; // a surface is opaque
       opaque.forEach((one) => { one.hidden = Boolean(message.look?.flat); });

@@ -1,0 +1,67 @@
+"""A sequence of particle files on the command line: its snapshots with one look, said on the way.
+
+Flow: files, options -> survey -> [sequence] -> Snapshots, Camera -> the commands movie and view.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from jaxsph import io
+from jaxsph.cli import look as cli_look
+from jaxsph.cli import where as cli_where
+from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_report, span, wrong_usage
+from jaxsph.cli.options.settings import SCENE
+from jaxsph.cli.voice import say
+from jaxsph.io.opening import options as opening
+from jaxsph.io.opening.surfaces import surface_of, told_of_surface
+from jaxsph.io.settle.assemble import AUTO
+from jaxsph.model import Camera
+from jaxsph.model.camera.camera import Bounded
+from jaxsph.sequence.snapshots import Snapshots
+from jaxsph.sequence.survey import Survey, surveyed
+
+
+def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, Camera, Bounded]:
+    """The snapshots and their look, as said on the way; a camera, and what there ever is."""
+    for path in options.source:
+        if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
+            raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
+    refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
+    by = options.opacity_by or (None if options.transfer is not None else AUTO)
+    said = {field.name: getattr(options, field.name) for field in dataclasses.fields(opening.Source)}
+    source = opening.Source(**said | {"opacity_by": by})
+    with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
+        try:
+            survey = surveyed(options.source, source, gaps=gaps, strict=strict, progress=show)
+        except ValueError as error:
+            if "missing" in str(error) and not gaps:
+                raise ValueError(f"{error}; --gaps goes on without") from error
+            raise
+    _say_survey(survey)
+    looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
+    transfer = cli_look.look(survey.middle, looks, survey.quantity)
+    of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
+    say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
+    center = cli_where.middle_of(survey, options)
+    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
+    if surface is not None:
+        say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
+    snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)
+    placed = dataclasses.replace(options, center=None) if center is not None else options
+    return snapshots, cli_where.camera_of(snapshots, placed), cli_where.framed(snapshots, options)
+
+
+def _say_survey(survey: Survey) -> None:
+    files, times = survey.files, survey.order.times
+    counts = span([file.num_particles for file in files])
+    say("sequence", f"{len(files)} snapshots, {files[0].path} to {files[-1].path}, {counts} particles each")
+    say("times", f"{span(times)}, {survey.order.told}")
+    for unread in survey.unread:
+        say("unread", f"{unread.why}; frames that need it are left out")
+    for sentence in survey.told():
+        say("between", sentence)
+    say_report(survey.report)
+    say_notes(survey.report.notes)

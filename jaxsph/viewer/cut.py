@@ -1,0 +1,142 @@
+"""What of a scene is cut away while one looks around: a plane across the view, a box, or a sphere.
+
+Flow: message, Pose -> [cut] -> Clip of the scene; JSON of a page; words of Python and of the command line.
+
+A cut is measured from a middle, in shares of a reach: what the view turned about, and half of its visible height, when it was
+chosen. To move it moves arrays of a clip, and compiles nothing; its kind is static.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from jaxsph.model.clips.clips import Both, Clip, Outside
+from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.viewer.inputs import InputError, number, word
+from jaxsph.viewer.pose import Pose
+
+OFF = "off"
+SHARES = {"plane": (-2.0, 2.0, 0.0), "box": (0.01, 2.0, 0.5), "sphere": (0.01, 2.0, 0.5)}
+"""Of each kind: the least and the largest share of the reach, and the first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cut:
+    """A part of space that alone is shown.
+
+    Attributes:
+        kind: one of `SHARES`.
+        middle: (3,) length units.
+        reach: length units.
+        share: of the reach: how far behind the middle a plane is, half a side of a box, the radius of a sphere.
+        axis: (3,) of length 1, across which a plane is; what is before it is cut away.
+        follows: whether that is the direction of view, whichever it is.
+        outside: whether the other side is shown instead.
+    """
+
+    kind: str
+    middle: tuple[float, ...]
+    reach: float
+    share: float
+    axis: tuple[float, ...]
+    follows: bool = True
+    outside: bool = False
+
+    def seen_from(self, pose: Pose) -> Cut:
+        """The same once the view has moved."""
+        return dataclasses.replace(self, axis=tuple(pose.axes[2].tolist())) if self.follows else self
+
+    def clip(self) -> Clip:
+        """What is shown."""
+        shapes: dict[str, Any] = {"plane": Plane, "box": Box, "sphere": Sphere}
+        made: Clip = shapes[self.kind](*self._numbers())
+        return ~made if self.outside else made
+
+    def told(self) -> dict[str, Any]:
+        """For a page, as JSON has it; `least` and `most` are ends of the share."""
+        least, most, _ = SHARES[self.kind]
+        return {**dataclasses.asdict(self), "least": least, "most": most}
+
+    def _numbers(self) -> tuple[Any, Any]:
+        middle, size = np.array(self.middle), self.reach * self.share
+        if self.kind == "plane":
+            return (middle + size * np.array(self.axis)).tolist(), list(self.axis)
+        return ((middle - size).tolist(), (middle + size).tolist()) if self.kind == "box" else (list(self.middle), size)
+
+
+def asked(cut: Cut | None, said: dict[str, Any], pose: Pose) -> Cut | None:
+    """The cut that a message asks for: another `kind`, `"off"`, another `share`, `follows` or `outside`; or measured from `here`.
+
+    Raises:
+        InputError: there is none to change, or no such kind or number.
+    """
+    kind = cut.kind if cut is not None and "kind" not in said else word(said, "kind", (*SHARES, OFF))
+    if kind == OFF:
+        return None
+    least, most, first = SHARES[kind]
+    flags: dict[str, Any] = {name: said[name] is True for name in ("follows", "outside") if name in said}
+    if cut is None or said.get("here") is True:
+        middle, reach, axis = pose.target.tolist(), pose.height / 2, tuple(pose.axes[2].tolist())
+        old: dict[str, Any] = {} if cut is None else {"follows": cut.follows, "outside": cut.outside}
+        cut = Cut(kind, tuple(middle), reach, first, axis, **old)
+    elif kind != cut.kind:
+        cut = dataclasses.replace(cut, kind=kind, share=first)
+    share = number(said, "share", least, most, cut.share)
+    return dataclasses.replace(cut, share=share, **flags).seen_from(pose)
+
+
+def read(told: Any) -> Cut | None:
+    """What `Cut.told` said; None is none.
+
+    Raises:
+        InputError: that is no cut.
+    """
+    if told is None:
+        return None
+    if not isinstance(told, dict):
+        raise InputError("`cut` must be an object, or null")
+    said = {"do": "restore", **told}
+    kind = word(said, "kind", tuple(SHARES))
+    vectors = []
+    for name in ("middle", "axis"):
+        rows = told.get(name)
+        if not isinstance(rows, list) or len(rows) != 3:
+            raise InputError(f"`{name}` of a cut must be three numbers")
+        vectors.append(tuple(number({"do": "restore", name: one}, name, -1e30, 1e30) for one in rows))
+    if not any(vectors[1]):
+        raise InputError("`axis` of a cut must have a direction")
+    reach, share = number(said, "reach", 1e-30, 1e30), number(said, "share", *SHARES[kind][:2])
+    return Cut(kind, vectors[0], reach, share, vectors[1], told.get("follows") is True, told.get("outside") is True)
+
+
+def words_of(clip: Clip | None) -> list[str]:
+    """Values of `--clip` that together are a clip as the command line makes them."""
+    if clip is None:
+        return []
+    if isinstance(clip, Both):
+        return [*words_of(clip.first), *words_of(clip.second)]
+    if isinstance(clip, Outside):
+        return [f"~{one}" for one in words_of(clip.clip)]
+    numbers = ",".join(f"{value:.9g}" for given in _given(clip) for value in np.ravel(given))
+    return [f"{type(clip).__name__.lower()}:{numbers}"]
+
+
+def python_of(clip: Clip) -> str:
+    """Python that makes a clip."""
+    if isinstance(clip, Both):
+        return f"({python_of(clip.first)} & {python_of(clip.second)})"
+    if isinstance(clip, Outside):
+        return f"~{python_of(clip.clip)}"
+    return f"js.{type(clip).__name__}({', '.join(str(given.tolist()) for given in _given(clip))})"
+
+
+def _given(shape: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """What a shape is made of, float64."""
+    if isinstance(shape, Box):
+        return shape.corners()
+    assert isinstance(shape, Plane | Sphere)
+    place, other = (shape.point, shape.normal) if isinstance(shape, Plane) else (shape.center, shape.radius)
+    return np.asarray(place, np.float64) + np.asarray(shape.rest, np.float64), np.asarray(other, np.float64)

@@ -1,0 +1,152 @@
+"""A view of a sequence: frames are read when they are asked for, neighbours before; what cannot be is told."""
+
+import dataclasses
+import threading
+import time
+
+import numpy as np
+import pytest
+from views import SETTINGS, camera, compiles, scene
+
+import jaxsph as js
+from jaxsph.viewer.code import Source
+from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.session import Session
+from jaxsph.viewer.timeline import Frame, Timeline, timeline_of
+
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
+SECONDS = 240
+NUMBER = 5
+
+
+def sequence(folder, wrong=(3,)):
+    """Files of a ball that moves, some of which are none."""
+    for number in range(NUMBER):
+        path = folder / f"s_{number}.npz"
+        position = np.asarray(scene().particles.position) + np.float32(0.1 * number)
+        columns = {"support": np.full(80, 0.4, np.float32), "heat": position[:, 0], "id": np.arange(80)}
+        np.savez(path, position=position, time=0.5 * number, **columns)
+        if number in wrong:
+            path.write_bytes(path.read_bytes()[:99])
+    paths = sorted(folder.glob("s_*.npz"))
+    return js.sequence.Snapshots.from_files(paths, "heat", transfer=scene().transfer, strict=False)
+
+
+def until(happens):
+    end = time.monotonic() + SECONDS
+    while not happens():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def sequenced(tmp_path_factory):
+    """A view of a sequence, and its folder."""
+    folder = tmp_path_factory.mktemp("sequence")
+    first, timeline = timeline_of(sequence(folder))
+    with Session(first, camera(), SETTINGS, timeline=timeline) as session:
+        session.wait(seconds=SECONDS)
+        yield session, folder
+
+
+def asked(session, number):
+    session.do({"do": "frame", "number": number})
+    until(lambda: session.state()["frames"]["number"] == number)
+    return session.wait(seconds=SECONDS)
+
+
+def test_a_frame_is_shown_with_the_look_the_camera_and_the_cut_and_compiles_nothing(sequenced):
+    session, _ = sequenced
+    session.do({"do": "orbit", "right": 0.1, "down": 0})
+    session.do({"do": "exposure", "stops": 1})
+    session.do({"do": "cut", "kind": "plane"})
+    before, place = session.wait(seconds=SECONDS), session.snapshot()
+    compiled = compiles()
+    picture, state = asked(session, 1), session.snapshot()
+    assert not compiled
+    assert state.pose is place.pose and np.array_equal(state.scene.transfer.extinction, place.scene.transfer.extinction)
+    assert np.allclose(np.asarray(state.scene.particles.position)[:80], np.asarray(scene().particles.position) + 0.1, atol=1e-6)
+    assert not np.array_equal(picture.image.color, before.image.color)
+    expected = js.render(state.scene, state.camera, SETTINGS)
+    assert np.array_equal(np.asarray(picture.image.color), np.asarray(expected.color))
+    session.do({"do": "cut", "kind": "off"})
+    session.do({"do": "reset_look"})
+    session.do({"do": "home"})
+
+
+def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):
+    session, folder = sequenced
+    asked(session, 2)
+    told, version = [], session.version
+    undo = session.listen(lambda what: told.append(what) if isinstance(what, dict) else None)
+    session.do({"do": "frame", "number": 3})
+    until(lambda: session.state()["frames"]["why"])
+    frames = session.state()["frames"]
+    assert "s_3.npz" in frames["why"] and (frames["number"], frames["asked"], frames["of"]) == (2, 3, NUMBER)
+    until(lambda: any(one["is"] == "state" and one["frames"]["why"] for one in told))
+    undo()
+    assert session.version == version and session.told == ""
+    asked(session, 0)
+    until(lambda: set(session._timeline._ready) == {0, 1})
+    (folder / "s_4.npz").rename(folder / "away.npz")
+    session.do({"do": "frame", "number": 4})
+    until(lambda: "s_4.npz" in session.state()["frames"]["why"])
+    (folder / "away.npz").rename(folder / "s_4.npz")
+    assert asked(session, 4).version == session.version and not session.state()["frames"]["why"]
+
+
+@pytest.mark.parametrize("number", [-1, NUMBER, "1", None, True, float("nan")], ids=str)
+def test_a_frame_that_there_is_not_is_refused(sequenced, number):
+    session, _ = sequenced
+    with pytest.raises(InputError):
+        session.do({"do": "frame", "number": number})
+    with pytest.raises(InputError, match="no sequence"):
+        Session(scene(), camera(), SETTINGS).do({"do": "frame", "number": 0})
+
+
+def test_neighbours_are_read_before_they_are_asked_for_and_what_is_asked_last_comes_first():
+    begun, go, read, shown = threading.Semaphore(0), threading.Semaphore(0), [], []
+
+    def reads(number):
+        read.append(number)
+        begun.release()
+        assert go.acquire(timeout=60)
+        return scene()
+
+    line = Timeline(tuple(Frame(str(k), None, lambda k=k: reads(k), Source()) for k in range(9)))
+
+    def show(number, found):
+        line.number = number
+        shown.append(number)
+
+    thread = threading.Thread(target=line.read, args=(show,))
+    thread.start()
+    assert begun.acquire(timeout=60)  # of the first neighbour
+    for number in (3, 7, 5):
+        line.ask(number)
+    go.release(20)
+    until(lambda: set(line._ready) == {4, 5, 6})
+    assert read == [1, 5, 6, 4] and shown == [5]
+    line.ask(6)
+    until(lambda: set(line._ready) == {5, 6, 7})
+    assert read == [1, 5, 6, 4, 7] and shown == [5, 6]
+    line.close()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def test_the_code_of_a_frame_makes_it_again(tmp_path):
+    snapshots = sequence(tmp_path, wrong=())
+    files = [str(file.path) for file in snapshots.survey.files]
+    python = f"snapshots = js.sequence.Snapshots.from_files({files}, 'heat')\nscene = snapshots.at(0.5)"
+    first, timeline = timeline_of(snapshots, lambda path, time: Source(python, str(path), whole=True))
+    session = Session(dataclasses.replace(first), camera(), SETTINGS, timeline=timeline)
+    session._frame(1, timeline.frames[1].scene())
+    space = {}
+    exec(session.code()["python"].partition("image = ")[0], space)
+    state = session.snapshot()
+    assert np.array_equal(space["scene"].particles.position, state.scene.particles.position)
+    assert np.allclose(space["scene"].transfer.values, state.scene.transfer.values)
+    command = session.code()["command"]
+    assert "s_1.npz" in command and "--transfer=look.json" in command and "--eye=" in command
