@@ -23,6 +23,7 @@ from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import choose, fitted, fitting
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
+from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -30,7 +31,6 @@ from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.numerics.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
+from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
@@ -22,7 +23,6 @@ from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.particles.surface import Surface
 from jaxsph.numerics.checks import Progress, record_of
-from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
 
 ROUNDING = 1e-9

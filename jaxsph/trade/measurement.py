@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 from jaxsph.io.damage import regular_file
+from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.replace import written_whole
 from jaxsph.model import Camera, Scene, Settings
-from jaxsph.numerics.digest import digest_of, fingerprint
 from jaxsph.numerics.version import __version__
 
 JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
