@@ -96,7 +96,8 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     if settings.tolerance is None:
         error = "error not estimated" if scene.surface is None else OF_SURFACE
         words = f"{width} x {height}, {settings.samples} samples a ray; {error}"
-        return (f"draft: {words}; {left:,} rays left" if stage.name == DRAFT else f"full: {words}"), facts
+        draft = f"draft: {words}; {left:,} rays left{_particles_left(stage, scene)}"
+        return (draft if stage.name == DRAFT else f"full: {words}"), facts
     facts["error"] = largest = float(bound.max(initial=0))
     facts["over"] = over = int((bound > settings.tolerance).sum())
     how = "certified" if bool(image.certified) else "estimated"
@@ -104,3 +105,11 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     if over:
         return f"tolerance {settings.tolerance:g} not met in {over:,} pixels, error up to {largest:.2g} ({how})", facts
     return f"tolerance {settings.tolerance:g} met, error at most {largest:.2g} ({how}, against {against})", facts
+
+
+def _particles_left(stage: Stage, scene: Scene) -> str:
+    """Of a draft of many particles, how many it leaves out."""
+    if scene.particles is None:
+        return ""
+    left = scene.particles.num_particles - stage.shown(scene).particle_set.num_particles
+    return f", and {left:,} particles" if left else ""

@@ -4,7 +4,7 @@ Flow: Scene, Camera of the newest state -> [stages] -> Image, and what it is in 
 
 | stage | pixels | settings |
 |---|---|---|
-| draft | a fraction | a quarter of the samples, no tolerance |
+| draft | a fraction | a quarter of the samples, no tolerance; of fewer particles where there are many |
 | full | all | point samples, no tolerance: the bits of `jaxsph.render` |
 | tolerance | all | those that were asked for, where they hold a tolerance |
 
@@ -29,6 +29,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.viewer.control_points import everywhere
+from jaxsph.viewer.fewer import fewer
 
 DRAFT_PIXELS = 50_000
 """Most pixels of a draft: on two cores one of 40,000 particles takes a tenth of a second."""
@@ -64,6 +65,7 @@ class Stage:
     def __init__(self, name: str, settings: Settings, shrink: int = 1) -> None:
         self.name, self.settings, self.shrink, self.made = name, settings, shrink, 0
         self._plans: dict[Any, Plan] = {}
+        self._few: tuple[Any, Any] = None, None
         self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
 
     def camera(self, camera: Camera) -> Camera:
@@ -73,12 +75,21 @@ class Stage:
         width, height = (max(1, round(side / self.shrink)) for side in (camera.width, camera.height))
         return dataclasses.replace(camera, width=width, height=height)
 
+    def shown(self, scene: Scene) -> Scene:
+        """The scene with the particles of this stage."""
+        if not self._is_draft or scene.particles is None:
+            return scene
+        if self._few[0] is not scene.particles:
+            self._few = scene.particles, fewer(scene.particles)
+        return dataclasses.replace(scene, particles=self._few[1])
+
     def prepare(self, scene: Scene, cameras: Iterable[Camera]) -> None:
         """Make room for views.
 
         Raises:
             ValueError: settings that the scene does not suit.
         """
+        scene = self.shown(scene)
         for camera in cameras:
             self._planned(everywhere(scene), self.camera(camera))
 
@@ -89,7 +100,7 @@ class Stage:
             Abandoned: `stop()` has become true between two bands.
             ValueError: what `jaxsph.render` raises it for.
         """
-        camera = self.camera(camera)
+        scene, camera = self.shown(scene), self.camera(camera)
         made = self._plans[self._choice(None)] if self._is_draft and self._plans else self._planned(scene, camera)
 
         def leave(done: int, bands: int) -> None:

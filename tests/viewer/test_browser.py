@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import re
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from PIL import Image as Pillow
 
 pytest.importorskip("websockets", reason="the extra `view` is not installed")
 import browser as browsers
+from derivatives import QUICKLY
 
 import jaxsph as js
 
@@ -30,9 +32,10 @@ def served(*more, of=(f"scene:radial:particles={PARTICLES}",)):
     """A view that is served, as the command line does it: its address."""
     words = [*of, "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
     more = ["--integrator", "samples", "--no-browser", "-q", *more]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "jaxsph", "view", *words, *more], stdout=subprocess.PIPE, text=True, cwd=ROOT
-    )
+    quickly = " ".join(f"--{name}={str(value).lower()}" for name, value in QUICKLY.items())
+    environment = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {quickly}".strip()}
+    command = [sys.executable, "-m", "jaxsph", "view", *words, *more]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
     yield process.stdout.readline().strip()
     process.send_signal(signal.SIGINT)
     try:

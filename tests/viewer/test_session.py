@@ -224,6 +224,9 @@ class Slow:
     def camera(self, camera):
         return camera
 
+    def shown(self, scene):
+        return scene
+
     def image(self, shown, camera, stop):
         self.seen.append(float(camera.eye[0]))
         self.begun.release()

@@ -189,8 +189,10 @@ class _Part:
 
 def _smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     """Means for their derivatives' sake; the values are right but for what rounding does to jumps."""
-    near, far = (clamped(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))  # where equal, each moves both by half
-    lo, hi = lesser(near, far), widened(greater(near, far), 1)
+    near, far = (clamped(end * tables.unit, -FARTHEST, FARTHEST) for end in (near, far))
+    middle, equal = 0.5 * (near + far), near == far  # where equal, each moves both by half
+    lo, hi = (jnp.where(equal, middle, end(near, far)) for end in (lesser, greater))
+    hi = widened(hi, 1)
     below, above, start, stop = split(lo, hi, tables.points[0], tables.points[-1])
     few = tables.points.shape[0] <= SELECT_ALL
     parts = (_all_parts if few else _outer_parts)(tables, lo, hi, start, stop)
