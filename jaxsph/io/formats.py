@@ -78,7 +78,7 @@ FORMATS = (
 
 @functools.cache
 def installed_readers(path: tuple[str, ...]) -> tuple[importlib.metadata.EntryPoint, ...]:
-    """What packages on `sys.path` bring; found once, as it takes longer than to read a small file."""
+    """What packages on `sys.path` bring; found once a process, as it takes longer than to read a small file."""
     return tuple(importlib.metadata.entry_points(group=READERS))
 
 

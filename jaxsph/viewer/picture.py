@@ -96,8 +96,9 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     if settings.tolerance is None:
         error = "error not estimated" if scene.surface is None else OF_SURFACE
         words = f"{width} x {height}, {settings.samples} samples a ray; {error}"
-        draft = f"draft: {words}; {left:,} rays left{_particles_left(stage, scene)}"
-        return (draft if stage.name == DRAFT else f"full: {words}"), facts
+        if stage.name == DRAFT:
+            return f"draft: {words}; {left:,} rays left{_particles_left(stage, scene)}", facts
+        return f"full: {words}", facts
     facts["error"] = largest = float(bound.max(initial=0))
     facts["over"] = over = int((bound > settings.tolerance).sum())
     how = "certified" if bool(image.certified) else "estimated"

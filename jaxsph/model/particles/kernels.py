@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsph.numerics.extremes import greater
 from jaxsph.numerics.nearest import did_you_mean
 
 MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
@@ -142,8 +143,8 @@ def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
 
 
 def _positive(value: Any, xp: Any) -> Any:
-    """What is above 0; under JAX its derivative follows the comparison, as in `numerics.extremes`."""
-    return xp.maximum(value, 0) if xp is np else xp.where(value < 0, xp.zeros_like(value), value)
+    """What is above 0."""
+    return np.maximum(value, 0) if xp is np else greater(0, value)
 
 
 def _power(value: Any, exponent: int) -> Any:
