@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
+from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import clamped, greater, lesser
@@ -135,26 +136,39 @@ class Piercing:
         mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
         return Bound(upper, clamped(jnp.where(first < far, first, mean), begin, end))
 
-    def weights(self, place: Float[Array, "tasks some rays"]) -> Float[Array, "tasks some rays"]:
-        """The field at depths relative to the middle."""
-        smooth = kernels.by_name(self.kernel)
+    def upper(self, border: Float[Array, "tasks borders"]) -> Float[Array, "tasks intervals rays"]:
+        """The bound alone, `Bound.upper`."""
+        smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
 
         def add(block: Block, passed: Passed, total: Array) -> Array:
             for k in range(BLOCK):
-                rest = (place - passed.foot[:, k, None]) ** 2 * passed.rate[:, k, None]
+                foot = passed.foot[:, k, None]
+                rest = (clamped(foot, begin, end) - foot) ** 2 * passed.rate[:, k, None]
                 total = total + smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
             return total
 
-        return self._over(add, jnp.zeros_like(place))
+        shape = begin.shape[0], begin.shape[1], self.lines.u.shape[1]
+        return self._over(add, jnp.zeros(shape, border.dtype))
+
+    def weights(self, place: Float[Array, "tasks rays"]) -> Float[Array, "tasks rays"]:
+        """The field at one depth of each ray, relative to the middle."""
+
+        def put(nth: Array, total: Array) -> Array:
+            for one in _each(self._fetched(nth)[1]):
+                total = total + self._of_one(one, self.lines, place)[0]
+            return total
+
+        return lax.fori_loop(0, self._blocks(), put, jnp.zeros_like(place))
 
     def found(self, place: Float[Array, "tasks rays"]) -> Found:
         """Field, gradient and quantities at one depth of each ray."""
-        number = len(self.task.entry.references)
 
-        def add(block: Block, passed: Passed, total: Array) -> Array:
-            return total + self._rows(block, passed, self.lines, place)
+        def put(nth: Array, total: tuple[Array, ...]) -> tuple[Array, ...]:
+            of_block = in_halves([self._of_one(one, self.lines, place) for one in _each(self._fetched(nth)[1])])
+            return tuple(old + new for old, new in zip(total, of_block, strict=True))
 
-        weight, *rows = self._over(add, jnp.zeros((4 + number, *place.shape), place.dtype))
+        nothing = (jnp.zeros_like(place),) * (4 + len(self.task.entry.references))
+        weight, *rows = lax.fori_loop(0, self._blocks(), put, nothing)
         return Found(weight, tuple(rows[:3]), tuple(rows[3:]))
 
     def pull(
@@ -170,9 +184,12 @@ class Piercing:
 
         def rows(columns: tuple[Array, ...], factor: Array) -> Array:
             x, y, z, scale, size, *quantities = columns
-            block = Block(x, y, z, scale, size, tuple(quantities))
             lines = SlabRays.of(dataclasses.replace(task, u=task.u * factor, v=task.v * factor))
-            return self._rows(block, self._passed(block, lines), lines, place)
+
+            def of_one(one: Block) -> Array:
+                return jnp.stack(self._of_one(one, lines, place))
+
+            return jax.vmap(of_one, 1)(Block(x, y, z, scale, size, tuple(quantities))).sum(0)
 
         def pulled(block: Block) -> tuple[Array, Array]:
             columns = block.x, block.y, block.z, block.scale, block.size, *block.quantities
@@ -188,26 +205,22 @@ class Piercing:
 
         return lax.fori_loop(0, self._blocks(), put, (table, jnp.zeros((), place.dtype)))
 
-    def _rows(
-        self, block: Block, passed: Passed, lines: SlabRays, place: Float[Array, "tasks rays"]
-    ) -> Float[Array, "rows tasks rays"]:
-        """What a block adds to what is `found`."""
-        smooth, size, scale = kernels.by_name(self.kernel), block.size[..., None], block.scale[..., None]
-        rest = (place[:, None] - passed.foot) ** 2 * passed.rate
-        weight = smooth.weigh(passed.nearest, rest, size, jnp)
-        slope = 2 * scale**2 * smooth.slope(passed.nearest, rest, size, jnp)
-        here = lines.u + place * lines.slope_u, lines.v + place * lines.slope_v, place
-        there = block.x[..., None], block.y[..., None], block.z[..., None] - lines.middle[..., None]
-        rows = [weight, *(slope * (at[:, None] - of) for at, of in zip(here, there, strict=True))]
-        rows += [weight * quantity[..., None] for quantity in block.quantities]
-        return jnp.stack([row.sum(1) for row in rows])
+    def _of_one(self, one: Block, lines: SlabRays, place: Float[Array, "tasks rays"]) -> list[Float[Array, "tasks rays"]]:
+        """What one particle of each slab adds to what is `found`."""
+        x, y, z, scale, size, *quantities = (of[:, None] for of in jax.tree.leaves(one))
+        smooth = kernels.by_name(self.kernel)
+        away = (lines.u + place * lines.slope_u) - x, (lines.v + place * lines.slope_v) - y, place - (z - lines.middle)
+        across, along = (away[0] * scale) ** 2, smooth.prepare((away[1] * scale) ** 2 + (away[2] * scale) ** 2, size)
+        weight = smooth.weigh(along, across, size, jnp)
+        slope = 2 * scale**2 * smooth.slope(along, across, size, jnp)
+        return [weight, *(slope * of for of in away), *(weight * of for of in quantities)]
 
     def _over(self, add: Callable[[Block, Passed, Carry], Carry], start: Carry) -> Carry:
         """All particles of the windows, a block at a time."""
 
         def put(nth: Array, carry: Carry) -> Carry:
             block = self._fetched(nth)[1]
-            return add(block, fusion_barrier(nth >= 0, self._passed, block, self.lines), carry)
+            return add(block, fusion_barrier(nth >= 0, self._passed, block), carry)
 
         return lax.fori_loop(0, self._blocks(), put, start)
 
@@ -225,8 +238,9 @@ class Piercing:
 
         return fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
 
-    def _passed(self, block: Block, lines: SlabRays) -> Passed:
+    def _passed(self, block: Block) -> Passed:
         """How rays pass a block of particles."""
+        lines = self.lines
         x, y = block.x[..., None] - lines.u[:, None], block.y[..., None] - lines.v[:, None]
         z, scale = block.z[..., None] - lines.middle[..., None], block.scale[..., None]
         along = x * lines.slope_u[:, None] + y * lines.slope_v[:, None] + z
@@ -234,3 +248,8 @@ class Piercing:
         away = greater(0, (x * x + y * y + z * z) - along * foot)
         nearest = kernels.by_name(self.kernel).prepare(away * scale**2, block.size[..., None])
         return Passed(foot, nearest, scale**2 * lines.square[:, None])
+
+
+def _each(block: Block) -> list[Block]:
+    """Its particles one by one."""
+    return [jax.tree.map(lambda of, k=k: of[:, k], block) for k in range(BLOCK)]  # type: ignore[misc]

@@ -32,6 +32,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups
+from jaxsph.engine.field.crossing import Cut, first_crossings, narrowed
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
 from jaxsph.engine.field.scattered import gather_scattered
@@ -47,12 +48,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
-
-NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
-STEPS = 10  # of false position, at most
-ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step of Newton's squares that
 
 
 class Hit(NamedTuple):
@@ -76,30 +72,6 @@ class SurfaceCotangents(NamedTuple):
 
     table: Float[Array, "particles 8"]
     own: ParticleSurface
-
-
-class Bracket(NamedTuple):
-    """Depths before and behind a crossing, relative to the middle of a slab, and the field less the level there."""
-
-    low: Float[Array, "tasks rays"]
-    high: Float[Array, "tasks rays"]
-    at_low: Float[Array, "tasks rays"]
-    at_high: Float[Array, "tasks rays"]
-
-    def secant(self) -> Float[Array, "tasks rays"]:
-        """Where a straight line crosses."""
-        change = self.at_low - self.at_high
-        share = jnp.where(change != 0, self.at_low / jnp.where(change != 0, change, 1), 0.5)
-        return self.low + clamped(share, 0, 1) * (self.high - self.low)
-
-
-class _Search(NamedTuple):
-    """Brackets of all rays, which end of each moved last, rays whose brackets still shrink, and how often they have."""
-
-    ends: Bracket
-    side: Int[Array, "tasks rays"]
-    active: Bool[Array, "tasks rays"]
-    number: Int[Array, ""]
 
 
 @tree(static=("kernel",))
@@ -160,15 +132,27 @@ class ParticleSurface(Medium):
         on_borders, still = _on_borders(task), lax.stop_gradient(self)
         sums = gather_scattered if task.scattered else gather
         weight = by_rays(sums(*still._lists(), lax.stop_gradient(on_borders), self.kernel))[0]
+        there = lax.stop_gradient(on_borders)
+        bracket = first_crossings(still._rays, there, weight, still.level, still._cut())
+        bracket = narrowed(still._rays, there, bracket, still.level)
         tasks, _, rays = weight.shape
-        nothing = jnp.asarray([jnp.inf, -1, *[0] * 6], weight.dtype)[None, :, None]
 
-        def search(items: Array, some: SlabTask, found: Array) -> Array:
-            rows = self._searched(some, weight[jnp.minimum(items, tasks - 1)])
-            return found.at[items].set(rows, mode="drop")
+        def look(items: Array, some: SlabTask, found: Array) -> Array:
+            here, moving = bracket.of(items), self._rays(some)
+            root = root_near(moving, here.secant(), (here.low, here.high), self.level)
+            colors, normal = self.look.shade(root.found, moving.ray(), some.entry.references[0][:, None])
+            rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal], 1)
+            return found.at[items].set(jnp.where(here.met[:, None], rows, 0), mode="drop")
 
-        found = over_groups(search, jnp.broadcast_to(nothing, (tasks, 8, rays)), on_borders, weight >= still.level)
-        return Hit(found[:, 0], found[:, 1].astype(jnp.int32), found[:, 2:5], found[:, 5:])
+        found = over_groups(look, jnp.zeros((tasks, 7, rays), weight.dtype), on_borders, ~bracket.met[:, None])
+        depth = jnp.where(bracket.met, found[:, 0], jnp.inf)
+        return Hit(depth, bracket.interval.astype(jnp.int32), found[:, 1:4], found[:, 4:])
+
+    def _cut(self) -> Cut | None:
+        clip = self.clip
+        if clip is None:
+            return None
+        return Cut(clip, lambda task: parts_of(task, clip, task.depth, jnp.ones((), task.depth.dtype)))
 
     def _lists(self) -> tuple[Ordered, Int[Array, " pairs"]]:
         if self.ordered is None or self.rank is None:
@@ -177,89 +161,6 @@ class ParticleSurface(Medium):
 
     def _rays(self, task: SlabTask) -> Piercing:
         return Piercing(*self._lists(), task, SlabRays.of(task), self.kernel)
-
-    def _searched(self, task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> Float[Array, "tasks 8 rays"]:
-        """Rows of `Hit`, of some slabs, given the field on their borders."""
-        still, there = lax.stop_gradient((self, task))
-        rays = still._rays(there)
-        at = jnp.broadcast_to((there.border - rays.lines.middle)[..., None], weight.shape)
-        places, values = still._places(rays, at, weight)
-        inside = values >= still.level
-        crossed = inside[:, 1:] != inside[:, :-1]
-        if still.clip is not None:
-            crossed &= still.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
-        bracket = Bracket(
-            *_first(crossed, places[:, :-1], places[:, 1:], values[:, :-1] - still.level, values[:, 1:] - still.level)
-        )
-        number = crossed.shape[1]
-        first = jnp.where(crossed, jnp.arange(number, dtype=jnp.int32)[:, None], number).min(1)
-        met = first < number
-
-        def lit() -> Array:
-            ends, moving = still._narrowed(rays, bracket, met), self._rays(task)
-            root = root_near(moving, ends.secant(), (ends.low, ends.high), self.level)
-            colors, normal = self.look.shade(root.found, moving.ray(), task.entry.references[0][:, None])
-            depth = root.place + moving.lines.middle
-            return jnp.where(met[:, None], jnp.stack([depth, *colors, *normal], 1), 0)
-
-        none = jnp.zeros((met.shape[0], 7, met.shape[1]), weight.dtype)
-        rows = lax.cond(met.any(), lit, lambda: none)
-        depth = jnp.where(met, rows[:, 0], jnp.inf)
-        interval = jnp.where(met, first // 2, -1).astype(weight.dtype)
-        return jnp.concatenate([depth[:, None], interval[:, None], rows[:, 1:]], 1)
-
-    def _places(
-        self, rays: Piercing, at: Float[Array, "tasks borders rays"], weight: Float[Array, "tasks borders rays"]
-    ) -> tuple[Float[Array, "tasks places rays"], Float[Array, "tasks places rays"]]:
-        """Ascending depths, relative to the middle: borders, and a place between each two; and the field there."""
-        bound = rays.bound(at[:, :, 0], self.level)
-        below = (weight[:, 1:] < self.level) & (weight[:, :-1] < self.level)
-        wanted, place = below & (bound.upper >= self.level), bound.place
-        if self.clip is not None:
-            part = parts_of(rays.task, self.clip, rays.task.depth, jnp.ones((), at.dtype))
-            begin, length = at[:, :-1], at[:, 1:] - at[:, :-1]
-            enters, leaves = (part.begin > 0) & (part.share > 0), (part.end < 1) & (part.share > 0)
-            place = jnp.where(enters, begin + part.begin * length, jnp.where(leaves, begin + part.end * length, place))
-            wanted |= enters | leaves
-        between, known = self._asked(rays, wanted, (jnp.where(wanted, place, at[:, :-1]), weight[:, :-1]))
-        vertex, peak = _vertex((at[:, :-1], between, at[:, 1:]), (weight[:, :-1], known, weight[:, 1:]))
-        near = below & wanted & (known < self.level) & (peak >= NEAR * self.level)
-        if self.clip is not None:
-            near &= ~(enters | leaves)
-        between, known = self._asked(rays, near, (jnp.where(near, vertex, between), known))
-        return _interleaved(at, between), _interleaved(weight, known)
-
-    def _asked(self, rays: Piercing, wanted: Array, places: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Places, and the field there: known, or asked for where it is wanted."""
-        place, known = places
-        asked = lax.cond(wanted.any(), lambda: rays.weights(place), lambda: known)
-        return place, jnp.where(wanted, asked, known)
-
-    def _narrowed(self, rays: Piercing, bracket: Bracket, met: Bool[Array, "tasks rays"]) -> Bracket:
-        """Brackets by false position, of the rays that cross: Newton's step from their secant is to some roundings of a root."""
-
-        def goes_on(carry: _Search) -> Array:
-            return (carry.number < STEPS) & carry.active.any()
-
-        def step(carry: _Search) -> _Search:
-            ends, active = carry.ends, carry.active
-            place = ends.secant()
-            here = rays.weights(place[:, None])[:, 0] - self.level
-            behind = (here >= 0) == (ends.at_low >= 0)  # the crossing lies behind
-            side = jnp.where(behind, 1, -1).astype(carry.side.dtype)
-            kept = jnp.where(side == carry.side, 0.5, 1).astype(here.dtype)  # an end that stays twice weighs half
-            moving = Bracket(
-                jnp.where(behind, place, ends.low),
-                jnp.where(behind, ends.high, place),
-                jnp.where(behind, here, kept * ends.at_low),
-                jnp.where(behind, kept * ends.at_high, here),
-            )
-            ends = jax.tree.map(lambda old, new: jnp.where(active, new, old), ends, moving)  # whatever other rays take
-            return _Search(ends, side, active & (jnp.abs(here) > enough), carry.number + 1)
-
-        enough = self.level * float(jnp.finfo(self.level.dtype).eps) ** ENOUGH
-        found: _Search = lax.while_loop(goes_on, step, _Search(bracket, jnp.zeros(met.shape, jnp.int32), met, jnp.int32(0)))
-        return found.ends
 
     def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
         """Opaque where the surface is."""
@@ -347,30 +248,3 @@ class ParticleSurface(Medium):
 def _on_borders(task: SlabTask) -> SlabTask:
     """With samples on the borders of what samples stand for."""
     return dataclasses.replace(task, depth=task.border, between=False, part=None, measured=False)
-
-
-def _first(crossed: Bool[Array, "tasks places rays"], *of_places: Array) -> list[Float[Array, "tasks rays"]]:
-    """Of the first crossing of each ray; of the last place, where there is none."""
-    found = [one[:, -1] for one in of_places]
-    for k in range(crossed.shape[1] - 2, -1, -1):
-        found = [jnp.where(crossed[:, k], one[:, k], so_far) for one, so_far in zip(of_places, found, strict=True)]
-    return found
-
-
-def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Where the parabola through three points is highest, between the outer two, and how high; the middle one where it is not."""
-    (begin, middle, end), (first, value, last) = places, values
-    before, behind = middle - begin, end - middle
-    rise, fall = (value - first) * behind, (value - last) * before
-    bent = (before > 0) & (behind > 0) & (rise + fall > 0)
-    total = jnp.where(bent, rise + fall, 1)
-    move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
-    curve = jnp.where(bent, total / jnp.where(bent, before * behind * (end - begin), 1), 0)
-    return clamped(middle + move, begin, end), value + curve * move**2
-
-
-def _interleaved(borders: Float[Array, "tasks borders rays"], between: Float[Array, "tasks intervals rays"]) -> Array:
-    """A border, what is between it and the next, and so on."""
-    tasks, intervals, rays = between.shape
-    pairs = jnp.stack([borders[:, :-1], between], 2).reshape(tasks, 2 * intervals, rays)
-    return jnp.concatenate([pairs, borders[:, -1:]], 1)

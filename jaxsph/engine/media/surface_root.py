@@ -26,7 +26,6 @@ from jaxsph.model.transfer.function import Segments, find, read
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
-POLISHED = 2  # steps: the last has the derivatives, and they are as good as the root before it
 Vectors = list[Float[Array, "tasks rays"]]
 
 
@@ -87,7 +86,7 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
 
 
 def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""]) -> Root:
-    """The root that a place is near to, by steps of Newton's, and what is found there.
+    """The root that a place is near to, by a step of Newton's, which has the derivatives; and what is found there.
 
     Args:
         between: where it lies, relative to the middle of the slab as places are.
@@ -96,12 +95,10 @@ def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[
         By the particles, the rays and the level, as of an implicit function; `place` and `between` have none.
     """
     low, high = lax.stop_gradient(between)
-    for _ in range(POLISHED):
-        place = lax.stop_gradient(place)
-        here = rays.found(place)
-        slope = lax.stop_gradient(slope_along(here, rays.ray()))
-        place = place + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
-        place = place + lax.stop_gradient(clamped(place, low, high) - place)
+    here = rays.found(lax.stop_gradient(place))
+    slope = lax.stop_gradient(slope_along(here, rays.ray()))
+    place = lax.stop_gradient(place) + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
+    place = place + lax.stop_gradient(clamped(place, low, high) - place)
     return Root(place, rays.found(place))
 
 

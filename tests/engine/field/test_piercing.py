@@ -32,7 +32,8 @@ def bounded(ordered, rank, task, level, kernel):
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def weighed(ordered, rank, task, depth, kernel):
     rays = Piercing(ordered, rank, task, SlabRays.of(task), kernel)
-    return rays.weights(depth - rays.lines.middle[..., None])
+    place = jnp.moveaxis(depth - rays.lines.middle[..., None], 1, 0)
+    return jnp.moveaxis(jax.lax.map(rays.weights, place), 0, 1)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
