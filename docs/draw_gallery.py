@@ -1,6 +1,6 @@
 """Draws the pictures of docs/gallery.md and of the README: what commands show, and every particle file of a folder by default.
 
-python docs/draw_gallery.py FOLDER [files|front|NAME_OF_A_CARD ...]
+python docs/draw_gallery.py FOLDER [files|front|posters|NAME_OF_A_CARD ...]
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import tempfile
 
 from PIL import Image, ImageDraw
 
+import jaxsph as js
 from jaxsph.cli import main as cli
 
 HERE = pathlib.Path(__file__).parent.resolve() / "gallery"
@@ -38,6 +39,15 @@ CARDS = {
     "explain": ("scene:checker_board", "explain", "--pixel", "180", "240", "--integrator", "segments", "--tolerance", "0.01"),
 }
 """File or scene, command and options of every card."""
+WIDE, KEPT = (1600, 900), ("--tolerance", "0.004", "--integrator", "segments")
+POSTERS = {
+    "cosmic_web": (BOX, "render", "--center", "densest", "--width", "48000", "--exposure", "0.5", *KEPT),
+    "splash": ("splashsurf_double_dam_break_f26.vtk", "render"),
+    "stirred_tank": ("mixer_002.npz", "render"),
+    "column_density": (BOX, "project", "--width", "50000", "--norm", "log", "--colormap", "magma"),
+}
+"""The same of pictures to be printed; and a galaxy of points in gas, which is of Python."""
+STARS, CELLS = 60_000, 128
 
 
 def drawn(command: list[str], output: pathlib.Path) -> Image.Image:
@@ -70,6 +80,22 @@ def draw_front(folder: pathlib.Path) -> None:
     for place, picture in enumerate(pictures):
         made.paste(picture, (place * SQUARE[0], 0))
     made.save(HERE / "front.jpg", quality=88, optimize=True)
+
+
+def draw_posters(folder: pathlib.Path) -> None:
+    """Pictures to be printed, each to a tolerance of 0.004 where it has one."""
+    for name, (source, command, *options) in POSTERS.items():
+        size = "--size", f"{WIDE[0]}x{WIDE[1]}"
+        _save_poster(drawn([command, source, *options, *size], folder / f"{name}.png"), name)
+    scene, camera = js.scenes.cosmos.galaxy(STARS, CELLS, width=WIDE[0], height=WIDE[1])
+    image = js.render(scene, camera, js.Settings(integrator="segments", tolerance=0.004))
+    _save_poster(Image.fromarray(image.to_uint8()), "galaxy")
+
+
+def _save_poster(picture: Image.Image, name: str) -> None:
+    folder = HERE / "posters"
+    folder.mkdir(exist_ok=True)
+    picture.save(folder / f"{name}.jpg", quality=85, optimize=True)
 
 
 def sheet(pictures: list[tuple[str, Image.Image]], path: pathlib.Path) -> None:
@@ -106,9 +132,10 @@ def main() -> None:
     """Draw all, or what is named."""
     os.chdir(sys.argv[1])  # figures name the files that they show
     with tempfile.TemporaryDirectory() as folder:
-        for name in sys.argv[2:] or ["files", "front", *CARDS]:
+        groups = {"files": draw_files, "front": draw_front, "posters": draw_posters}
+        for name in sys.argv[2:] or [*groups, *CARDS]:
             place = pathlib.Path(folder)
-            {"files": draw_files, "front": draw_front}.get(name, lambda place, name=name: draw_card(name, place))(place)
+            groups[name](place) if name in groups else draw_card(name, place)
 
 
 if __name__ == "__main__":

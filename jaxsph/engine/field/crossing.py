@@ -30,7 +30,7 @@ from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
-STEPS, FIRST = 10, 2  # of false position, at most, and those after which most rays are done
+STEPS, FIRST = 64, 2  # of false position, at most, and those after which most rays are done
 ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step of Newton's squares that
 NOWHERE = -1.0  # number of no interval
 

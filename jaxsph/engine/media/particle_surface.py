@@ -1,13 +1,9 @@
 r"""The surface of particles as a medium: opaque where a ray first crosses a level of their coverage, shaded by its gradient.
 
-Flow: grid, schedule -> [particle_surface: borders -> bounds -> crossing -> root -> light] -> integrator.
+Flow: grid, schedule -> [particle_surface: borders -> crossing -> root -> light] -> integrator.
 
-**Where a ray crosses.** Slab by slab, the field is summed up at the borders of what samples stand for. Where it is below the
-level at both ends of an interval, particles' largest weights bound it in between (`field.piercing`): where even their sum is
-below the level there is no surface, a theorem but for the rounding of sums that are within some eps of the level. Else the field
-is asked for at one place more, where it may be largest, and then, if it is not reached there, at the vertex of the parabola
-through the three. The first change of sign between neighbouring places is a crossing. It is followed by false position (the
-Illinois form: Dahlquist & Bjoerck 1974, section 6.2) and steps of Newton's (`surface_root`), to some roundings of a support.
+**Where a ray crosses** is found by `field.crossing`, slab by slab, and followed by a step of Newton's (`surface_root`) to some
+roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
