@@ -41,8 +41,9 @@ napoleon_custom_sections = ["Differentiation"]
 napoleon_use_ivar, napoleon_attr_annotations = True, False
 
 CONTENTS = {
-    "Tutorials": "/notebooks/000_first_image /notebooks/100_tolerance /notebooks/200_inverse /notebooks/300_the_trade "
-    "/notebooks/400_progressive /notebooks/500_points_and_grids /notebooks/600_surfaces",
+    "Tutorials": "/notebooks/000_first_image /notebooks/010_your_snapshot /notebooks/100_tolerance /notebooks/200_inverse "
+    "/notebooks/210_jax_ways /notebooks/300_the_trade /notebooks/400_progressive /notebooks/500_points_and_grids "
+    "/notebooks/600_surfaces",
     "How to": "rendering colours selecting projections surfaces volumes points movies viewing error_control python gradients "
     "many_machines",
     "Reference": "api command_line files glossary packaging /CHANGELOG",

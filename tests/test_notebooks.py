@@ -28,7 +28,7 @@ def code_cells(notebook):
 
 
 def test_there_are_notebooks():
-    assert [path.stem[:3] for path in NOTEBOOKS] == ["000", "100", "200", "300", "400", "500", "600"]
+    assert [path.stem[:3] for path in NOTEBOOKS] == ["000", "010", "100", "200", "210", "300", "400", "500", "600"]
 
 
 @each_notebook
