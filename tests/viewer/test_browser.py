@@ -144,6 +144,18 @@ def test_drag_zoom_edit_and_click(page):
     changed(page, lambda: page.click(x, y, clicks=2))
 
 
+def test_opacity_takes_a_shape_whose_colours_stay(page):
+    before = shown(page)
+    choose = "(() => { const of = document.querySelector('select[aria-label=\"shape of opacity\"]');"
+    choose += " of.value = 'hill'; of.dispatchEvent(new Event('change')); })()"
+    changed(page, lambda: page.ask(choose))
+    assert page.ask("document.querySelectorAll('.editor .point').length") == 5
+    after = shown(page)
+    assert not near(before, after) and near(after, rendered(page))
+    changed(page, lambda: page.ask("document.querySelector('button[title=\"undo (u)\"]').click()"))
+    assert near(shown(page), before)
+
+
 def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
     with served("--surface", "0.2") as address, opened(browser, address) as page:
         assert shown(page).max() > 100

@@ -4,6 +4,13 @@ import { drawn, made, short } from "./made.js";
 const WIDTH = 320, HEIGHT = 150, STRIP = 14, PAD = 9;
 const STEP = 0.01;
 let strips = 0; // of all editors of a page
+const SHAPES = { // of opacity: places, and shares of the height that there is
+  rising: [[0, 0], [1, 1]],
+  falling: [[0, 1], [1, 0]],
+  hill: [[0, 0], [0.25, 0], [0.5, 1], [0.75, 0], [1, 0]],
+  shells: [[0.15, 0], [0.25, 1], [0.35, 0], [0.65, 0], [0.75, 1], [0.85, 0]],
+  even: [[0, 0.5], [1, 0.5]],
+};
 const FINE = 16; // pieces of a line: extinction is linear, its height here is a root
 
 export function editor(send) {
@@ -19,7 +26,9 @@ export function editor(send) {
   const value = made("output", { class: "value" });
   const remove = made("button", { type: "button", title: "remove the chosen point (Delete)" }, "Remove");
   const add = made("button", { type: "button", title: "add a point beside the chosen one (Enter)" }, "Add");
-  const element = made("div", {}, svg, made("div", { class: "row" }, color, value, add, remove));
+  const shapes = made("select", { "aria-label": "shape of opacity", onchange: () => { if (shapes.value) shape(SHAPES[shapes.value]); shapes.value = ""; } },
+    made("option", { value: "" }, "Shape…"), ...Object.keys(SHAPES).map((name) => made("option", { value: name }, name)));
+  const element = made("div", {}, svg, made("div", { class: "row" }, color, value, add, remove), made("div", { class: "row" }, shapes));
 
   const x = (place) => PAD + Math.max(0, Math.min(1, place)) * (WIDTH - 2 * PAD);
   const y = (extinction) => look.flat ? HEIGHT / 2 : HEIGHT - PAD - Math.min(1, Math.sqrt(Math.max(0, extinction) / look.top)) * (HEIGHT - 2 * PAD);
@@ -42,6 +51,11 @@ export function editor(send) {
     const [low, high] = [points[after - 1], points[after]];
     const part = (place - low[0]) / (high[0] - low[0]);
     return low.map((one, i) => one + part * (high[i] - one));
+  }
+  function shape(corners) { // colours stay where they are
+    points = corners.map(([place, tall]) => [place, look.top * tall * tall, ...between(place).slice(2, 5)]);
+    chosen = 0;
+    tell(true);
   }
   function insert(place, extinction, done = true) {
     const row = between(place);
@@ -80,6 +94,7 @@ export function editor(send) {
       }
     }
     line.toggleAttribute("hidden", look.flat);
+    shapes.toggleAttribute("hidden", look.flat);
     svg.setAttribute("aria-label", look.flat ? "control points of colour" : "control points of colour and opacity");
     const corners = [[0, points[0][1]], ...points, [1, points[points.length - 1][1]]];
     const path = [];
