@@ -165,7 +165,7 @@ def test_errors_and_times_of_the_readme_were_measured():
     assert [f"{ours['total']:.2f} s", f"{theirs['total']:.0f} s"] == re.findall(r"[\d.]+ s\b", row("VTK by a grid"))
     assert round(theirs["mean_error"] / ours["mean_error"]) == 5
     gradient = next(one for one in results("gradients")["frames"] if one["size"] == 512)
-    assert f"takes {gradient['backward_to_frame']:.1f} pictures more" in README
+    assert f"takes {gradient['backward_to_frame']:.1f} times as long as a picture" in README
 
 
 def test_the_page_of_results_is_what_the_results_make_of_it():

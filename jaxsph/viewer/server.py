@@ -154,16 +154,18 @@ class Server:
             return _answer(connection, http.HTTPStatus.OK, page, "index.html")
         if name in self._files:
             return _answer(connection, http.HTTPStatus.OK, self._files[name], name)
-        if name in ("view.png", "view.exr", "look.json"):
+        if name in ("view.png", "view.exr", "look.json", "keys.json"):
             content = await asyncio.to_thread(self._kept, name)
             if content is not None:
                 return _answer(connection, http.HTTPStatus.OK, content, name, attached=True)
         return _answer(connection, http.HTTPStatus.NOT_FOUND, b"404: there is no such page\n")
 
     def _kept(self, name: str) -> bytes | None:
-        """A file to keep: a picture of all pixels of the view as it is, or its look; None where there is none."""
+        """A file to keep: a picture of all pixels of the view as it is, its look or its key frames; None where there is none."""
         try:
-            what: Any = self.session.transfer if name.endswith(".json") else self.session.whole(SAVE_SECONDS).image
+            what: Any = self.session.path if name == "keys.json" else self.session.transfer
+            if not name.endswith(".json"):
+                what = self.session.whole(SAVE_SECONDS).image
         except (TimeoutError, RuntimeError):
             return None
         if what is None:

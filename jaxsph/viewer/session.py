@@ -19,6 +19,7 @@ import numpy as np
 from jaxsph.engine.asked import require_asked
 from jaxsph.engine.request import along_rays
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
@@ -28,7 +29,7 @@ from jaxsph.viewer.inputs import InputError, number
 from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
-from jaxsph.viewer.state import State
+from jaxsph.viewer.state import QUIET, State
 from jaxsph.viewer.timeline import Timeline
 
 REST_SECONDS = 0.2
@@ -152,6 +153,11 @@ class Session:
         """The look that is shown, where there is one."""
         return self._state.transfer
 
+    @property
+    def path(self) -> CameraPath | None:
+        """Through the key frames that were kept; None where there are fewer than two."""
+        return self._state.path
+
     def code(self) -> dict[str, str]:
         """The Python and the command that make the newest state again."""
         with self._lock:
@@ -228,6 +234,8 @@ class Session:
                 return None
             with self._lock:
                 self._state.do(message, self._seen)
+                if message["do"] in QUIET:
+                    return None
                 self._version += 1
                 self._changed = time.monotonic()
                 self._lock.notify_all()

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.path import CameraPath
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -23,8 +25,12 @@ from jaxsph.viewer.cut import Cut, asked, read
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
 from jaxsph.viewer.pose import Pose
 
-OTHERS = ("fit", "home", "center", "cut", "restore")
+OTHERS = ("fit", "home", "center", "cut", "restore", "key", "unkey")
 """What can be done besides motions and edits of the look."""
+QUIET = ("key", "unkey")
+"""What changes no picture."""
+SECONDS, MOST_KEYS = 2.0, 256
+"""Between key frames of a movie, and how many there may be."""
 Seen = Callable[[dict[str, Any]], np.ndarray]
 
 
@@ -47,7 +53,7 @@ class State:
         self._given, self._first = camera, Pose.of(camera, scene)
         self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
         self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
-        self._base = scene
+        self._base, self._keys = scene, []  # type: Scene, list[tuple[Camera, np.ndarray]]
         self.scene = self._looked()
 
     @property
@@ -79,6 +85,15 @@ class State:
         return None if self._steps is None else self._steps.look.scale
 
     @property
+    def path(self) -> CameraPath | None:
+        """Through all key frames, `SECONDS` apart, around the point that all of them turn about, if they do; None of one."""
+        if len(self._keys) < 2:
+            return None
+        middles = np.stack([middle for _, middle in self._keys])
+        around = middles[0] if (middles == middles[0]).all() else None
+        return CameraPath.from_keys([(SECONDS * k, camera) for k, (camera, _) in enumerate(self._keys)], around=around)
+
+    @property
     def edited(self) -> bool:
         """Whether the look is another than that which was given."""
         return self._steps is not None and self._steps.look.points is not None
@@ -95,6 +110,7 @@ class State:
             "edited": self.edited,
             "moved": self.moved,
             "cut": None if self.cut is None else self.cut.told(),
+            "keys": len(self._keys),
         }
 
     def code(self, source: Source, settings: Settings) -> dict[str, str]:
@@ -135,6 +151,10 @@ class State:
             self._move(self.pose.centred(seen(message)))
         elif name == "cut":
             self._cut(asked(self.cut, message, self.pose))
+        elif name == "key":
+            self._keep()
+        elif name == "unkey":
+            self._keys = self._keys[:-1]
         elif name == "restore":
             if not isinstance(message.get("pose"), dict):
                 raise InputError("`pose` of 'restore' must be an object")
@@ -159,6 +179,14 @@ class State:
         self.pose, self.moved = pose, True
         if self.cut is not None:
             self._cut(self.cut.seen_from(pose))
+
+    def _keep(self) -> None:
+        camera = with_depths(self.camera, self.scene)
+        if len(self._keys) >= MOST_KEYS:
+            raise InputError(f"a path has {MOST_KEYS} key frames at most; forget some")
+        if self._keys and self._keys[0][0].is_perspective != camera.is_perspective:
+            raise InputError("key frames of a path are all of perspective or all of parallel rays; forget those that are not")
+        self._keys = [*self._keys, (camera, np.asarray(self.pose.target, np.float64))]
 
     def _cut(self, cut: Cut | None) -> None:
         self.cut = cut

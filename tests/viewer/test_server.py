@@ -216,6 +216,13 @@ def test_pictures_and_looks_can_be_kept(server, tmp_path):
     assert np.allclose(np.asarray(image.color), np.asarray(server.session.picture.image.color), atol=1e-5)
     (tmp_path / "look.json").write_bytes(got(server, f"/{server.token}/look.json")[2])
     assert np.array_equal(js.TransferFunction.load(tmp_path / "look.json").values, server.session.transfer.values)
+    assert got(server, f"/{server.token}/keys.json")[0] == 404
+    version = server.session.version
+    for _ in range(2):
+        server.session.do({"do": "key"})
+    (tmp_path / "keys.json").write_bytes(got(server, f"/{server.token}/keys.json")[2])
+    assert js.CameraPath.load(tmp_path / "keys.json").legs[0].times == (0, 2)
+    assert server.session.version == version  # no picture is made again
 
 
 def test_words_of_a_command_that_make_no_sense(capsys, tmp_path, monkeypatch):

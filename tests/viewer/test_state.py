@@ -123,3 +123,21 @@ def test_an_address_with_a_cut_that_is_none_changes_nothing(state, change):
     with pytest.raises(InputError):
         state.do({"do": "restore", "pose": told["pose"], "cut": {**told["cut"], **change}}, nowhere)
     assert state.cut is before and not state.moved
+
+
+def test_key_frames_are_a_path_around_what_the_view_turns_about_and_become_a_file(state, tmp_path):
+    state.do({"do": "key"}, nowhere)
+    assert state.path is None and state.told()["keys"] == 1
+    state.do({"do": "orbit", "right": 0.3, "down": 0.1}, nowhere)
+    state.do({"do": "key"}, nowhere)
+    path = state.path
+    assert path.legs[0].times == (0, 2) and np.allclose(path.legs[0].around, state.pose.target)
+    path.save(tmp_path / "keys.json")
+    again = js.CameraPath.load(tmp_path / "keys.json")
+    np.testing.assert_allclose(again.at(2.0).exact_eye(), state.camera.exact_eye(), atol=1e-6)
+    state.do({"do": "projection", "name": "parallel"}, nowhere)
+    with pytest.raises(InputError, match="all of perspective or all of parallel"):
+        state.do({"do": "key"}, nowhere)
+    for _ in range(3):
+        state.do({"do": "unkey"}, nowhere)
+    assert state.path is None and state.told()["keys"] == 0

@@ -58,7 +58,16 @@ def _ascii_points(content: bytes, count: int, record: np.dtype, others: int) -> 
     width, num_properties = len(rows[0].split()), len(record.names or ())
     if width != num_properties:
         raise DataError(f"has {width} numbers a vertex, but {num_properties} properties are announced; write it again")
-    return np.loadtxt([row.decode("ascii") for row in rows], dtype=record, ndmin=1, comments=None)
+    wide = np.dtype(
+        [(name, record[name] if record[name].kind == "f" else f"{record[name].kind}8") for name in record.names or ()]
+    )
+    points = np.loadtxt([row.decode("ascii") for row in rows], dtype=wide, ndmin=1, comments=None)
+    for name in record.names or ():  # NumPy before 2.3 wraps what a narrow type cannot hold
+        kept = points[name].astype(record[name])
+        if record[name].kind != "f" and (kept != points[name]).any():
+            value = points[name][kept != points[name]][0]
+            raise DataError(f"has {value} as {name!r}, which its type {record[name]} cannot hold; write it as a wider one")
+    return points.astype(record)
 
 
 def _header(content: bytes) -> tuple[str, int, np.dtype, int, int]:

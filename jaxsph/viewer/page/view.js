@@ -49,7 +49,11 @@ export function mount(root, link) {
     made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots. A surface is opaque: its bars are where rays met it, and its points have colours alone."), closing());
   const files = link.files ? [made("a", { class: "button", href: "view.exr", download: "view.exr" }, "EXR"), made("a", { class: "button", href: "look.json", download: "look.json" }, "Look")] : [];
   const keep = section("Keep", made("div", { class: "row" }, button("PNG", "save the picture (s)", save), ...files, button("Code", "Python and command", () => send({ do: "code" })), button("Help", "help (?)", () => help.showModal())));
-  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, times, look, cuts, pixel, keep)), texts, help);
+  const path = made("a", { class: "button", href: "keys.json", download: "keys.json", title: "for jaxsph movie --camera", hidden: true }, "Keys");
+  const kept = made("output", { class: "value" }), paths = section("Movie", made("div", { class: "row" },
+    button("Keep view", "keep this view as a key frame (g)", () => send({ do: "key" })), button("Forget", "forget the last key frame (b)", () => send({ do: "unkey" })), path), kept);
+  paths.hidden = !link.files;
+  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, times, look, cuts, pixel, paths, keep)), texts, help);
 
   function section(title, ...children) {
     return made("section", {}, made("h2", {}, title), ...children);
@@ -73,7 +77,7 @@ export function mount(root, link) {
       URL.revokeObjectURL(to.href);
     });
   }
-  moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, "?": () => help.showModal() });
+  moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, g: () => send({ do: "key" }), b: () => send({ do: "unkey" }), "?": () => help.showModal() });
 
   async function show(header, blob) {
     const turn = ++drawing;
@@ -142,6 +146,8 @@ export function mount(root, link) {
       complain(message.told || message.frames?.why);
       edit.show(message.look);
       cut.show(message.cut);
+      kept.textContent = `${message.keys} key frames, 2 s apart`;
+      path.hidden = message.keys < 2;
       times.hidden = !message.frames;
       time.show(message.frames);
       look.hidden = !message.look;
