@@ -198,8 +198,7 @@ def narrowed(rays_of: Callable[[SlabTask], Piercing], task: SlabTask, bracket: B
     """Brackets of the rays that cross by false position: Newton's step from their secant is to some roundings of a root.
 
     It is the Illinois form (Dahlquist & Bjoerck 1974, section 6.2): an end that stays twice weighs half. Most rays take two
-    steps;
-    slabs with one that takes more are looked at again.
+    steps; slabs with one that takes more are looked at again.
     """
     enough = level * float(jnp.finfo(level.dtype).eps) ** ENOUGH
 

@@ -21,7 +21,7 @@ export const KEYS = [
   ["o, k", "the other side of the cut; whether its plane follows the view"],
   [", and .", "the frame before, and after, of a sequence; with shift the first, and the last"],
   ["u, y", "undo, redo a change of colours and opacity"],
-  ["g b", "keep this view as a key frame of a movie, forget the last one"],
+  ["g, b", "keep this view as a key frame of a movie, forget the last one"],
   ["s", "save the picture"],
   ["?", "this help"],
   ["Tab", "to control points: arrows move one, Delete removes it, Enter adds one beside it"],

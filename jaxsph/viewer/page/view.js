@@ -146,7 +146,7 @@ export function mount(root, link) {
       complain(message.told || message.frames?.why);
       edit.show(message.look);
       cut.show(message.cut);
-      kept.textContent = `${message.keys} key frames, 2 s apart`;
+      kept.textContent = `${message.keys} key frame${message.keys === 1 ? "" : "s"}, 2 s apart`;
       path.hidden = message.keys < 2;
       times.hidden = !message.frames;
       time.show(message.frames);
