@@ -25,7 +25,6 @@ from jaxsph.engine.media.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged
-from jaxsph.io.opening.options import View
 from jaxsph.io.opening.views import camera_and_clip
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -39,11 +38,11 @@ OF_SCENES = ("particles", "frame")
 OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface")
 
 
-def require_something(options: Any, also: str = "") -> None:
+def require_something(options: Any) -> None:
     """Raise `UsageError` where there is nothing to show."""
     cli_parts.check(options)
     if options.source is None and not options.points and not options.volume:
-        raise UsageError(f"a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE{also}")
+        raise UsageError("a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE")
 
 
 def scene_of(options: Any) -> tuple[Scene, Camera, Labels]:
@@ -197,9 +196,3 @@ def _surface(opened: Opened, loaded: Loaded, options: Any, beside: Scene) -> Ope
     say("surface", f"where the values are {options.iso:g}")
     surface = IsoSurface.from_volume(loaded.shown, options.iso, color)
     return dataclasses.replace(opened, scene=dataclasses.replace(beside, media=(surface,), within=opened.scene.within))
-
-
-def opened_view(options: Any) -> View:
-    """The group of the camera, of a command that does not offer all of it."""
-    names = (field.name for field in dataclasses.fields(View))
-    return View(**{name: getattr(options, name) for name in names if hasattr(options, name)})

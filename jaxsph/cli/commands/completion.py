@@ -5,7 +5,6 @@ Flow: commands -> cyclopts -> [completion] -> stdout.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -17,18 +16,10 @@ from jaxsph.cli.options.table import app
 from jaxsph.numerics.nearest import did_you_mean
 
 SHELLS = ("bash", "zsh", "fish")
+OPTIONS = groups.Options()
 
 
-@Parameter(name="*")
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Completion(groups.Options):
-    """Options of the command."""
-
-
-COMPLETION = Completion()
-
-
-def completion(shell: Annotated[str, Parameter(help=", ".join(SHELLS))], /, *, asked: Completion = COMPLETION) -> None:
+def completion(shell: Annotated[str, Parameter(help=", ".join(SHELLS))], /, *, asked: groups.Options = OPTIONS) -> None:
     """Print what completes commands in a shell."""
     if shell not in SHELLS:
         raise UsageError(f"there is no completion for {shell!r}, but for {', '.join(SHELLS)}{did_you_mean(shell, SHELLS)}")

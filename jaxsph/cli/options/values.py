@@ -132,10 +132,6 @@ def box(text: str) -> tuple[float, ...] | None:
     """Sides of a periodic box; None of `none`."""
     if text == NONE:
         return None
-    return _sides(text)
-
-
-def _sides(text: str) -> tuple[float, ...]:
     try:
         found = tuple(float(part) for part in text.split(","))
     except ValueError:
