@@ -16,7 +16,7 @@ from jaxsph.cli.voice import say
 from jaxsph.io import Labels, ParticleTable, labels_of
 from jaxsph.io.libraries import require
 from jaxsph.io.opening.looks import look_of
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.labels import NEEDS, can_name
 from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.settle.unit_names import unit_of
@@ -25,6 +25,7 @@ from jaxsph.model.transfer.domains import Scale
 from jaxsph.plot.image_figure import image_figure
 
 UNITS = "unit", "length_unit"
+FIGURES = (".png", ".pdf", ".svg")
 
 
 def is_looked(options: Any) -> bool:
@@ -66,7 +67,7 @@ def has_key(options: Any) -> bool:
     return bool(getattr(options, "annotate", False)) or any(getattr(options, name, None) is not None for name in UNITS)
 
 
-def require_figure(output: Path, suffixes: tuple[str, ...]) -> None:
+def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
     """Know before the work that a figure can be drawn and written."""
     require_writable(output, "a figure is written as", suffixes)
     require("matplotlib", "figures", "color")
@@ -119,9 +120,3 @@ def save_with_key(image: Image, scene: Scene, camera: Camera, labels: Labels, op
     """Write the picture with its key; what an image's file says of how it was made, this says too."""
     figure = image_figure(image, scene, camera, labels=labels, target=options.target)
     write_figure(figure, output, metadata={str(name): str(value) for name, value in image.metadata})
-
-
-def write_figure(figure: Any, output: Path, **more: Any) -> None:
-    """Write a figure of matplotlib's, whole or not at all."""
-    with written_whole(output) as temporary:
-        figure.savefig(temporary, **more)

@@ -17,6 +17,7 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 STALE_SECONDS = 24 * 3600.0
 """Since the last write to a temporary file; a process of another machine, which cannot be asked for, writes more often."""
@@ -58,6 +59,12 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: {reason}; choose another place") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_figure(figure: Any, path: str | Path, **options: Any) -> None:
+    """Write a figure of matplotlib's, by the suffix of the name; `options` are those of its `savefig`."""
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, **options)
 
 
 def _before(path: Path) -> str:

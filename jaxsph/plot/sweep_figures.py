@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.libraries import require
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
 from jaxsph.trade.contenders import ESTIMATORS, FULL_RATE
 from jaxsph.trade.measurement import Measurement
@@ -82,14 +82,15 @@ def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
     if len({row.scene for row in rows}) != 1:
         found = ", ".join(sorted({row.scene for row in rows})) or "nothing"
         raise ValueError(f"`measurements` must be of one scene, got {found}; draw each on its own")
-    points = summary(rows)
-    figures = {"error.png": _error, "pareto.png": _pareto}
-    written = [_saved(draw_one(points, _title(rows)), Path(folder) / name) for name, draw_one in figures.items()]
+    points, title = summary(rows), _title(rows)
+    figures = {"error.png": _error(points, title), "pareto.png": _pareto(points, title)}
     if any(point.integral is not None for point in points):
-        written.append(_saved(_integral(points, _title(rows)), Path(folder) / "integral.png"))
+        figures["integral.png"] = _integral(points, title)
     if len({row.frame for row in rows}) > 1:
-        written.append(_saved(_frames(rows, _title(rows, summed=False)), Path(folder) / "frames.png"))
-    return written
+        figures["frames.png"] = _frames(rows, _title(rows, summed=False))
+    for name, figure in figures.items():
+        write_figure(figure, Path(folder) / name)
+    return [Path(folder) / name for name in figures]
 
 
 def summary(rows: Sequence[Measurement]) -> list[Point]:
@@ -140,12 +141,6 @@ def _canvas(title: str, panels: int, **shared: Any) -> tuple[Any, Any]:
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
     return figure, axes
-
-
-def _saved(figure: Any, path: Path) -> Path:
-    with written_whole(path) as temporary:
-        figure.savefig(temporary)
-    return path
 
 
 def _legend(figure: Any, axis: Any, **options: Any) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import operator
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from jaxsph.analysis.explanation.surface import SurfaceExplanation, explain_surf
 from jaxsph.analysis.explanation.words import note_of, table_of
 from jaxsph.engine.frame.budget import budget_of
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import write_figure
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -110,9 +109,7 @@ class Explanation:
 
     def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
         """Write the figure: `.png`, `.pdf` or `.svg`."""
-        made = self.figure(quantity, title)
-        with written_whole(Path(path)) as temporary:
-            made.savefig(temporary)
+        write_figure(self.figure(quantity, title), os.fspath(path))
 
 
 def explain(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from jaxsph.analysis.at_places import ParticleField
 from jaxsph.analysis.explanation.figure import surface_figure
 from jaxsph.analysis.explanation.words import surface_table
 from jaxsph.engine.render import render
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import write_figure
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene, widened
@@ -93,9 +92,7 @@ class SurfaceExplanation:
 
     def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
         """Write the figure: `.png`, `.pdf` or `.svg`."""
-        made = self.figure(quantity, title)
-        with written_whole(Path(path)) as temporary:
-            made.savefig(temporary)
+        write_figure(self.figure(quantity, title), os.fspath(path))
 
 
 class _Ray:

@@ -23,8 +23,6 @@ from jaxsph.cli.options.groups import OWN, option, output
 from jaxsph.cli.options.settings import as_medium, settings_of
 from jaxsph.cli.voice import say
 
-SUFFIXES = (".png", ".pdf", ".svg")
-
 
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,7 +52,7 @@ def explain(
     with wrong_usage():
         pixel_of(options.pixel, *options.size)
     if options.output is not None:
-        cli_look.require_figure(options.output, SUFFIXES)
+        cli_look.require_figure(options.output)
     scene, camera, labels = cli_scene.scene_of(options)
     say("camera", camera_line(camera, options))
     made = explained(scene, camera, settings, pixel=options.pixel)

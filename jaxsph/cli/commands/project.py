@@ -27,7 +27,7 @@ from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, velocity_name
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
@@ -112,8 +112,7 @@ def _save(image: Projection, arrows: _Arrows | None, options: Any, output: Path)
         figure = image.figure(**_look(options))
         if arrows is not None:
             draw_arrows(figure.axes[0], *arrows)
-        with written_whole(output) as temporary:
-            figure.savefig(temporary)
+        write_figure(figure, output)
     else:
         image.save(output, **_look(options))
 

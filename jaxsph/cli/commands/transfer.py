@@ -19,9 +19,9 @@ from jaxsph.cli.console import UsageError, refuse, span
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OUTPUT, OWN, option, output
 from jaxsph.cli.voice import say
+from jaxsph.io.replace import write_figure
 from jaxsph.plot.transfer_figure import transfer_figure
 
-SUFFIXES = (".png", ".pdf", ".svg")
 OF_SOURCES = ("color_by", "save", "colormap", "range", "norm", "preset", "optical_depth", "transfer")
 
 
@@ -54,7 +54,7 @@ def transfer(
         return
     scene, camera, labels = cli_scene.scene_of(options)
     look = scene.looks[0]
-    cli_look.write_figure(transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays), output)
+    write_figure(transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays), output)
     say("figure", f"{output}, over what {min(options.rays, camera.width * camera.height)} rays meet")
     voice.written(output, values=[float(look.values[0]), float(look.values[-1])])
     if options.save is not None:
@@ -67,7 +67,7 @@ def _checked(options: Any) -> Path:
     """Where the figure goes; know before the work that it, and the function, can be written there."""
     stem = Path(str(options.source).split(":")[1] if str(options.source).startswith("scene:") else options.source).stem
     output: Path = options.output or Path(f"{stem}_transfer.png")
-    cli_look.require_figure(output, SUFFIXES)
+    cli_look.require_figure(output)
     if options.save is not None and options.save.suffix.lower() != ".json":
         raise UsageError(f"--save {options.save}: a transfer function is written as .json")
     if options.rays < 1:
@@ -79,6 +79,6 @@ def _draw_file(file: str, output: Path) -> None:
     """The figure of a saved function alone."""
     look = io.read_transfer(file)
     say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
-    cli_look.write_figure(transfer_figure(look, title=Path(file).name), output)
+    write_figure(transfer_figure(look, title=Path(file).name), output)
     say("figure", str(output))
     voice.written(output)
