@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.footprint import side_distances, touches
 from jaxsph.engine.access.ordering import Ordered
@@ -79,6 +79,10 @@ class ListPlan:
         value = value.reshape(self.tile_rows, self.tile_columns, 2, 2, *value.shape[1:])
         value = jnp.moveaxis(value, (0, 2, 4, 1, 3, 5), (0, 1, 2, 3, 4, 5))
         return value.reshape(self.tile_rows * 2 * down, self.tile_columns * 2 * across, *value.shape[6:])
+
+    def over_pixels(self, value: Shaped[Array, " bundles"]) -> Shaped[Array, "rows columns"]:
+        """What each bundle holds, at each of its pixels, as they lie in the band."""
+        return self.as_image(jnp.broadcast_to(value[:, None, None], (self.num_bundles, BUNDLE, BUNDLE)))
 
 
 @tree()

@@ -8,7 +8,7 @@ those of the whole image, bit for bit. With a quadtree the whole image is drawn,
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -100,10 +100,10 @@ def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int,
         shares |= {LEVELS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
         if plan.control.super_pixels:
             painted = [shard.painted for shard in band.of_shards.verdicts if shard.painted is not None]
-            shares[SUPER_PIXELS] = float(_at(plan, unshard(tuple(painted)), row, column)) if painted else 0.0
+            shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
     if ends(settings):
         shards = [shard.cut for shard in band.of_shards.cast if shard.cut is not None]
-        ended = bool(_at(plan, unshard(tuple(shards)), row, column)) if shards else False
+        ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
         shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
     return shares
 
@@ -115,17 +115,12 @@ def _of_leaves(work: Work, clock: Clock, image: Image, row: int, column: int) ->
         first = row // plan.band_height * plan.band_height
         frame = work.begun(plan.shards, clock)
         decided, _ = frame.decide(frame.grid(jnp.int32(first), clock).of(frame.ordered), clock)
-        shares[INTERPOLATION] = float(_at(plan, unshard(tuple(one.verdict.bound for one in decided)), row - first, column))
+        bound = plan.lists.over_pixels(unshard(tuple(one.verdict.bound for one in decided)))
+        shares[INTERPOLATION] = float(bound[row - first, column])
     if ends(work.settings):
         let_through = float(image.transmittance[row, column])
         shares[ENDED] = let_through if let_through < float(least_transmittance(work.settings)) else 0.0
     return shares
-
-
-def _at(plan: Plan, of_bundles: Any, row: int, column: int) -> Any:
-    """Of bundles of a band, that of one of its pixels."""
-    pixels = jnp.broadcast_to(of_bundles[:, None, None], (plan.lists.num_bundles, BUNDLE, BUNDLE))
-    return plan.lists.as_image(pixels)[row, column]
 
 
 def _apart(total: float, shares: dict[str, float | None]) -> dict[str, float]:

@@ -101,16 +101,12 @@ def develop(bands: tuple[OfShards, ...], *, plan: Plan) -> Layers:
 
 def of_band(band: OfShards, *, plan: Plan) -> Layers:
     """The layers of a band."""
-    lists, verdict = plan.lists, unshard(band.verdicts)
+    lists, over_pixels, verdict = plan.lists, plan.lists.over_pixels, unshard(band.verdicts)
     spent = unshard(tuple(shard.evaluations for shard in band.cast))
     color = unshard(tuple(shard.rays.color for shard in band.cast), 1)
     transmittance = unshard(tuple(shard.rays.transmittance for shard in band.cast), 0)
     depth = unshard(tuple(shard.rays.depth for shard in band.cast), 0)
     pixels = registry.screen(plan.screen).resolve(RayResult(color, transmittance, depth), lists)
-
-    def over_pixels(value: Float[Array, " bundles"]) -> Float[Array, "rows columns"]:
-        return lists.as_image(jnp.broadcast_to(value[:, None, None], (lists.num_bundles, BUNDLE, BUNDLE)))
-
     levels = None if verdict.levels is None else lists.as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
     bound = over_pixels(verdict.bound)
     if band.cast[0].rays.error is not None:

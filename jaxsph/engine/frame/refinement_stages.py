@@ -49,12 +49,8 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
     spent, cast = unshard(tuple(one.evaluations for one in rays)), unshard(filled).any(0)
     value = lists.as_image(canvases.channels_of(color, transmittance, depth))
     rows, columns = camera.nodes
-    value, spent, cast = (one[:rows, :columns] for one in (value, _at_pixels(lists, spent), _at_pixels(lists, cast)))
+    value, spent, cast = (one[:rows, :columns] for one in (value, lists.over_pixels(spent), lists.over_pixels(cast)))
     return canvases.of_lattice((camera.height, camera.width), value, spent, cast, camera.stride)
-
-
-def _at_pixels(lists: ListPlan, of_bundles: Array) -> Array:
-    return lists.as_image(jnp.broadcast_to(of_bundles[:, None, None], (of_bundles.shape[0], BUNDLE, BUNDLE)))
 
 
 @stage(quickly=True)
@@ -77,7 +73,7 @@ def tell(
     height, width = canvas.shape
 
     def over_image(of_bundles: Array) -> Array:
-        pixels = _at_pixels(lists, of_bundles)[:, :width]
+        pixels = lists.over_pixels(of_bundles)[:, :width]
         image = jnp.zeros((height + pixels.shape[0], width), pixels.dtype)
         return lax.dynamic_update_slice_in_dim(image, pixels, first_row, 0)[:height]
 
