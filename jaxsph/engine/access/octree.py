@@ -24,7 +24,6 @@ roundings of positions along rays.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +35,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.macrocells import MACROCELL, Occupancy
 from jaxsph.engine.runtime.tuning import MEMORY
 from jaxsph.model.particles.particles import capacity_class
+from jaxsph.numerics.trees import tree
 
 INNER = -1  # the length of a node that is split
 ROUNDING = 32  # eps of the cube's side that radii are widened by, and the box on either side
@@ -54,7 +54,7 @@ class Leaf(NamedTuple):
     length: Int[Array, "*any"]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("top", "levels"))
 class Octree:
     """Spheres by where they are; `build_octree` makes it.
 
@@ -101,11 +101,6 @@ class Octree:
         leaf = lax.fori_loop(0, below, descend, top)
         x_inside, y_inside, z_inside = ((at >= 0) & (at < 1) for at in coordinates)
         return leaf._replace(length=jnp.where(x_inside & y_inside & z_inside, leaf.length, 0))
-
-
-jax.tree_util.register_dataclass(
-    Octree, data_fields=["lower", "side", "node", "entry", "occupancy"], meta_fields=["top", "levels"]
-)
 
 
 class Spheres(NamedTuple):

@@ -32,14 +32,14 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.control.ranges import RangeTables, ranges_of_parts
 from jaxsph.engine.field.fetch import particle_at
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
 COVERERS = 96  # particles in the middle of a window, that is nearest in depth, among which coverage is sought
 SOLID = 0.01  # least `size`, as a share of the largest, for which weights just inside the support are far above underflow
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class SampleBounds:
     """Bounds over each sample slab, for all rays of a bundle.
 
@@ -55,8 +55,7 @@ class SampleBounds:
     hi: list[Float[Array, "samples bundles"]]
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Spheres:
     """Particles in rank order: centres, reciprocals of outer and inner radii (infinite where they do not count), quantities.
 

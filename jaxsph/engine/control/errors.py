@@ -21,16 +21,15 @@ two middle slabs, so its optics lie in the ranges of both.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
 from jaxsph.engine.control.bounds import SampleBounds
+from jaxsph.numerics.trees import tree
 
 LEVELS = MAX_LEVEL + 1
 SUPER_PIXEL = LEVELS  # the candidate after the last level
@@ -45,8 +44,7 @@ def fits(slab_samples: int) -> int:
     return (CELL_SAMPLES // slab_samples).bit_length() - 1
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class CellErrors:
     """Of single cells: as seen from right in front of them, or by the bundle's pixels.
 
@@ -64,8 +62,7 @@ class CellErrors:
     tau_lo: Float[Array, "*cells"]
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class _Optics:
     """Ranges of what the fine samples of a layer of cells are, and of the light that they take away."""
 

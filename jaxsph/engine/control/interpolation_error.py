@@ -23,7 +23,6 @@ weighted.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -40,6 +39,7 @@ from jaxsph.engine.field.lattice import GAP, REACH, Lattice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
 MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
@@ -52,8 +52,7 @@ Combine = Callable[[Array, Array], Array]
 Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; first layer
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class InterpolationError:
     """Of the slabs of a band.
 

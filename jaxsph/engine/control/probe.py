@@ -10,11 +10,9 @@ it says, what is analysed is bounded with care.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -25,13 +23,13 @@ from jaxsph.engine.access.slab_windows import CELL_SAMPLES
 from jaxsph.engine.control.ranges import RangeTables, ranges_of_parts
 from jaxsph.engine.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 PROBES = 8  # particles of each slab, from the middle half of its window
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Probe:
     """What a look at the bundles of a band, or of a shard of it, has found.
 

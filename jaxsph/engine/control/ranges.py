@@ -8,23 +8,21 @@ every run of $2^k$ control points) gives the latter from two overlapping runs: O
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, look_up
+from jaxsph.numerics.trees import tree
 
 EXTINCTION = 3  # channel, after those of colours
 ROUNDING = 8  # eps: a looked up value is a sum and a product away from its control points
 ROUNDING_OF_PLACE = 16  # eps of the largest value: where evenly spaced points are taken to lie
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class RangeTables:
     """Transfer function with extremes of runs of control points.
 

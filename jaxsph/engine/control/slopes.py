@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.model.transfer.function import TransferFunction, look_up
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 BUCKETS = 1024  # of the transfer function's domain: a slope is averaged over one at least
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@tree()
 class SquaredSlopes:
     """Squared slopes of a transfer function, such that they are read without a search.
 

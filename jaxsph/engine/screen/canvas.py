@@ -8,19 +8,19 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.screen.estimators import leaf_errors
 from jaxsph.engine.screen.pyramid import at_nodes, lattices, of_corners, over_pixels, places
+from jaxsph.numerics.trees import tree
 
 LIGHT = 4  # red, green, blue and transmittance: what errors are told from
 CHANNELS = 6  # and depth where it is finite, and whether it is
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Canvas:
     """An image of which some pixels are known.
 
@@ -93,6 +93,3 @@ def finished(canvas: Canvas, coarsest: int) -> tuple[Array, Array, Array, Array]
         error = jnp.where(made, over_pixels(largest, canvas.shape, side), error)
         side //= 2
     return jnp.stack([red, green, blue], -1), transmittance, depth, jnp.where(canvas.known, 0, error)
-
-
-jax.tree_util.register_dataclass(Canvas, data_fields=[field.name for field in dataclasses.fields(Canvas)], meta_fields=[])

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
@@ -18,12 +17,13 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.trees import tree
 
 SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
 PIXELS = BUNDLE * BUNDLE  # of a bundle, and rays of one that is cast whole
 
 
-@dataclasses.dataclass(frozen=True)
+@tree()
 class Chosen:
     """Some bundles, of which some rays are cast.
 
@@ -45,7 +45,7 @@ class Chosen:
         return jnp.where(inside, row * shape[1] + column, shape[0] * shape[1]).T
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("rays", "packets"))
 class Queue:
     """Bundles of which rays are wanted, one after the other; `packets` of them are cast together, from the `first` on.
 
@@ -111,9 +111,3 @@ def packets_of(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
     u = camera.column((grid.column[chosen.bundle] + chosen.place % BUNDLE).astype(dtype) + 0.5)
     v = camera.row((grid.row[chosen.bundle] + chosen.place // BUNDLE).astype(dtype) + 0.5)
     return RayPackets(u, v, chosen.bundle, real, scattered=True)
-
-
-_STATIC = {Chosen: [], Queue: ["rays", "packets"]}
-for _kind, _static in _STATIC.items():
-    _names = [field.name for field in dataclasses.fields(_kind) if field.name not in _static]
-    jax.tree_util.register_dataclass(_kind, data_fields=_names, meta_fields=_static)
