@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, slab_windows_with_borders
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, find_slab_windows
 from jaxsph.engine.control.bounds import SampleBounds, sample_bounds, spheres
 from jaxsph.engine.control.errors import DEPTH_ROUNDING, EXPONENTIAL
 from jaxsph.engine.control.ranges import tables_of_parts
@@ -64,7 +64,7 @@ def bundle_bounds(
     tables, balls = tables_of_parts(transfer), spheres(ordered)
     missing = ((0, num_cells * per_cell - slabs), (0, 0))
     borders = grid.borders(num_cells * CELL_SAMPLES)
-    beside = slab_windows_with_borders(ordered, lists)
+    beside = find_slab_windows(ordered, lists, beside=True)
     begin, length = (jnp.pad(window, ((0, 0), *missing)) for window in (beside.begin, beside.length))
     extremes = [
         (jnp.where(ordered.live, quantity, jnp.inf).min(), jnp.where(ordered.live, quantity, -jnp.inf).max())

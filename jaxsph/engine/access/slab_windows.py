@@ -33,14 +33,15 @@ class SlabWindows:
     count: Int[Array, "slabs bundles"]
 
 
-def find_slab_windows(ordered: Ordered, lists: BundleLists) -> SlabWindows:
-    """Bisect every bundle's list for the first and last rank of every slab and class."""
-    return _windows(lists, ordered.first_rank, ordered.last_rank)
+def find_slab_windows(ordered: Ordered, lists: BundleLists, beside: bool = False) -> SlabWindows:
+    """Bisect every bundle's list for the first and last rank of every slab and class.
 
-
-def slab_windows_with_borders(ordered: Ordered, lists: BundleLists) -> SlabWindows:
-    """The same for slabs with all that lies between their samples and those of the next: for samples of any spacing."""
-    return _windows(lists, ordered.first_beside, ordered.last_beside)
+    `beside`: of slabs with all that lies between their samples and those of the next, for samples of any spacing.
+    """
+    first, last = (ordered.first_beside, ordered.last_beside) if beside else (ordered.first_rank, ordered.last_rank)
+    begin, end = _bisect(lists.rank, jnp.stack([first, last]), lists.start, lists.end)
+    length = jnp.maximum(end - begin, 0)
+    return SlabWindows(begin, length, length.sum(0, dtype=jnp.int32))
 
 
 @tree()
@@ -76,12 +77,6 @@ def whole_cells(slabs: Bool[Array, "slabs bundles"], slab_samples: int) -> Bool[
     per_cell = CELL_SAMPLES // slab_samples
     padded = jnp.pad(slabs, ((0, -slabs.shape[0] % per_cell), (0, 0)), constant_values=True)
     return padded.reshape(-1, per_cell, slabs.shape[1]).all(1)
-
-
-def _windows(lists: BundleLists, first: Array, last: Array) -> SlabWindows:
-    begin, end = _bisect(lists.rank, jnp.stack([first, last]), lists.start, lists.end)
-    length = jnp.maximum(end - begin, 0)
-    return SlabWindows(begin, length, length.sum(0, dtype=jnp.int32))
 
 
 def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:

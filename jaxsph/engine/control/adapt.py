@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, slab_windows_with_borders
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, find_slab_windows
 from jaxsph.engine.control.analysis import analyse
 from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.control.levels import bound, choose
@@ -81,7 +81,7 @@ def adapt(
         saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
         on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
         rounding = rounding_of((~empty).sum(0), dtype)
-        beside = slab_windows_with_borders(grid.ordered, grid.lists)
+        beside = find_slab_windows(grid.ordered, grid.lists, beside=True)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)

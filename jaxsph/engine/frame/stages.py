@@ -21,7 +21,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.engine.access.shards import shard, shard_of_grid
-from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, slab_windows_with_borders, whole_cells
+from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
 from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
@@ -171,7 +171,7 @@ def grid_of_lists(
 ) -> BandGrid:
     """The same, given the lists of its bundles."""
     depths = half_steps(camera, ordered.x.dtype, samples)
-    windows = (slab_windows_with_borders if beside else find_slab_windows)(jax.tree.map(lax.stop_gradient, ordered), made)
+    windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), made, beside)
     pairs = (made.end - made.start).sum(dtype=jnp.int32)
     return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
 

@@ -15,7 +15,7 @@ from hypothesis import currently_in_test_context, given, target
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows, slab_windows_with_borders
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows, find_slab_windows
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.control.analysis import analyse
 from jaxsph.engine.control.errors import SUPER_PIXEL
@@ -48,7 +48,7 @@ jax.tree_util.register_dataclass(Looked, data_fields=[field.name for field in da
 def look(scene, camera, frame, wished, *, plan, kernel, form):
     grid, reference = frame
     slab_samples, number = plan.cast.slab_samples, wished.shape[0]
-    windows, beside = coarser_windows(grid.windows, slab_samples), slab_windows_with_borders(grid.ordered, grid.lists)
+    windows, beside = coarser_windows(grid.windows, slab_samples), find_slab_windows(grid.ordered, grid.lists, beside=True)
     filled, free = (filled_cells(slabs, slab_samples, number) for slabs in (grid.windows, beside))
     whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
     levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)
