@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.footprint import pixel_ranges
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.resolution import ROUNDING, unresolved
+from jaxsph.engine.planning.viewing import camera_usable
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import faults
@@ -79,7 +80,7 @@ def place(particles: Particles, camera: Camera, doubt: int = 0) -> Placed:
     word = faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any()) | faults.raised(
         faults.UNRESOLVED, blurred.any()
     )
-    return Placed(view, distance, support, live, small, large, word | _camera_fault(camera))
+    return Placed(view, distance, support, live, small, large, word | faults.raised(faults.BAD_CAMERA, ~camera_usable(camera)))
 
 
 def _small(z: Array, support: Array, camera: Camera, off: Array) -> Bool[Array, " particles"]:
@@ -120,11 +121,3 @@ def footprints(placed: Placed, camera: Camera, wanted: Bool[Array, " particles"]
     columns = {"x": x, "y": y, "z": z, "reach": reach, "live": live}
     columns |= dict.fromkeys(("scale", "size", "quantity"), nothing)
     return Ordered(**columns, **borders, **windows, index=index)
-
-
-def _camera_fault(camera: Camera) -> Int[Array, ""]:
-    numbers = jnp.concatenate([camera.eye, camera.axes.ravel(), jnp.stack([camera.half_height, camera.near, camera.far])])
-    usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
-    if camera.is_perspective:
-        usable &= camera.near > 0
-    return faults.raised(faults.BAD_CAMERA, ~usable)

@@ -19,7 +19,7 @@ from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.planning.measures import Measures, measure
-from jaxsph.engine.planning.plan import MAX_CAPACITY
+from jaxsph.engine.planning.plan import MAX_CAPACITY, fullest_band
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -219,15 +219,10 @@ def _larger(one: ListPlan | None, other: ListPlan | None) -> ListPlan | None:
 def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan | None:
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
-    pairs = [_fullest(counts, of_band) for counts in (counted.tile_pairs, counted.bundle_pairs)]
+    pairs = [fullest_band(counts, of_band) for counts in (counted.tile_pairs, counted.bundle_pairs)]
     if pairs[0] == 0:
         return None
     return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
-
-
-def _fullest(counts: np.ndarray, rows: int) -> int:
-    """Most pairs of any band of so many rows of tiles."""
-    return int(np.pad(counts, (0, -len(counts) % rows)).reshape(-1, rows).sum(1).max(initial=0))
 
 
 def _bytes(plan: ProjectionPlan) -> int:

@@ -304,7 +304,7 @@ def in_bands(
     tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
     rows = -(-tile_rows // bands)
     bands = -(-tile_rows // rows)
-    pairs = [_fullest_band(counts, rows, bands) for counts in (measures.tile_pairs, measures.bundle_pairs)]
+    pairs = [fullest_band(counts, rows) for counts in (measures.tile_pairs, measures.bundle_pairs)]
     tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
     lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
@@ -335,8 +335,9 @@ def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, li
     return QuadtreePlan(settings.leaf_pixels, coarse, packets)
 
 
-def _fullest_band(counts: np.ndarray, rows: int, bands: int) -> int:
-    return int(np.pad(counts, (0, rows * bands - len(counts))).reshape(bands, rows).sum(1).max(initial=0))
+def fullest_band(counts: np.ndarray, rows: int) -> int:
+    """Most pairs of any band of so many rows of tiles, of which there are counts."""
+    return int(np.pad(counts, (0, -len(counts) % rows)).reshape(-1, rows).sum(1).max(initial=0))
 
 
 def next_class(count: int) -> int:

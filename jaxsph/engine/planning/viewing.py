@@ -122,12 +122,16 @@ def sphere_depths(camera: Camera, dtype: Any, samples: int, between_samples: boo
     return depths.at[0].set(steps[0]).at[-1].set(steps[-1]) if samples > 1 else steps[::2]
 
 
-def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
+def camera_usable(camera: Camera) -> Bool[Array, ""]:
+    """Whether a camera's numbers are finite, and its depths and its size such as can be."""
     numbers = jnp.concatenate([camera.eye, camera.axes.ravel(), jnp.stack([camera.half_height, camera.near, camera.far])])
-    usable = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
-    if camera.is_perspective:
-        usable &= camera.near > 0
-    word = faults.raised(faults.UNRESOLVED, usable & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~usable)
+    found = jnp.isfinite(numbers).all() & (camera.half_height > 0) & (camera.near < camera.far)
+    return found & (camera.near > 0) if camera.is_perspective else found
+
+
+def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
+    good = camera_usable(camera)
+    word = faults.raised(faults.UNRESOLVED, good & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~good)
     for transfer in (scene.transfer, *(look for _, look in scene.volumes)):
         if transfer is not None:
             word |= faults.raised(faults.BAD_TRANSFER, ~_shows(transfer))
