@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxsph.engine.runtime.executors import Clock, Forecast, Traced
+from jaxsph.engine.runtime.executors import Clock, Forecast, Traced, side_by_side
 from jaxsph.engine.runtime.programs import PROGRAMS, Programs, shapes_of
 
 Devices = tuple[jax.Device, ...]
@@ -57,12 +56,7 @@ class OnDevices(Clock):
         begun = [self._programs.get(function, placed(arguments, device), static) for arguments, device in pairs]
         programs = [program.compiled.result() for program in begun]
         self.mark("compile")
-        given = self._given(pairs)
-        if len(inputs) == 1:
-            results = [jax.block_until_ready(programs[0](*given[0]))]
-        else:
-            with ThreadPoolExecutor(len(inputs)) as threads:
-                results = list(threads.map(lambda program, some: jax.block_until_ready(program(*some)), programs, given))
+        results = side_by_side(programs, self._given(pairs))
         self.mark(stage)
         return results
 

@@ -123,11 +123,7 @@ class Clock(AllShards):
         """The same for several arguments of the same shapes, each on a thread of its own."""
         program = self._programs.get(function, inputs[0], static).compiled.result()
         self.mark("compile")
-        if len(inputs) == 1:
-            results = [jax.block_until_ready(program(*inputs[0]))]
-        else:
-            with ThreadPoolExecutor(len(inputs)) as threads:
-                results = list(threads.map(lambda arguments: jax.block_until_ready(program(*arguments)), inputs))
+        results = side_by_side([program] * len(inputs), inputs)
         self.mark(stage)
         return results
 
@@ -156,6 +152,18 @@ class Clock(AllShards):
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """As many as there are things for."""
         return -(-int(number) // together), together
+
+
+def side_by_side(programs: Sequence[Callable[..., Any]], inputs: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """What programs return when they are done, several each on a thread of its own."""
+
+    def done(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        return jax.block_until_ready(program(*arguments))
+
+    if len(inputs) == 1:
+        return [done(programs[0], inputs[0])]
+    with ThreadPoolExecutor(len(inputs)) as threads:
+        return list(threads.map(done, programs, inputs))
 
 
 class Unforeseen(Exception):

@@ -10,7 +10,6 @@ import collections
 import dataclasses
 import functools
 import gc
-import os
 import threading
 import warnings
 from collections.abc import Callable, Hashable
@@ -21,6 +20,7 @@ import jax
 import numpy as np
 
 from jaxsph.engine.runtime import free_memory, memory_maps
+from jaxsph.engine.runtime.tuning import cores_at_hand
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
@@ -202,5 +202,4 @@ def _compile(lowered: jax.stages.Lowered, quickly: bool) -> Callable[..., Any]:
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
     """Threads that compile: XLA holds no lock of Python's meanwhile, and uses little more than one core for a program."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(min(max(cores, 2), 8), "jaxsph-compile")
+    return ThreadPoolExecutor(min(max(cores_at_hand(), 2), 8), "jaxsph-compile")
