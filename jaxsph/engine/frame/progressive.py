@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.layers import Band, Drawn
@@ -104,17 +105,15 @@ class Progressive:
         self._clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
         self._asked = asked
         plan, self._seen = PLANS.for_frame(asked, self._clock)
-
-        def frame_by(run: Executor) -> Frame:
-            return Frame.begun(self._seen, asked.camera, self._settings, plan, asked.scene.formulas, plan.shards, run)
+        work = Work(self._seen, asked.camera, self._settings, plan, asked.scene.formulas)
 
         def rehearse(known: list[bool]) -> None:
             run = Forecast(known)
-            frame = frame_by(run)
+            frame = work.begun(plan.shards, run)
             finished(self._refined(self._coarse(frame, run), frame, run).canvas, frame, run)
 
         self._clock.foresee(rehearse)
-        self._frame = frame_by(self._clock)
+        self._frame = work.begun(plan.shards, self._clock)
         return self._coarse(self._frame, self._clock)
 
     def _coarse(self, frame: Frame, run: Executor) -> _Stage:
