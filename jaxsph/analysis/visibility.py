@@ -24,8 +24,8 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.names import renamed
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
-from jaxsph.reference.media import AllOfVolume, AllParticles, Part, Whole, parts_of
-from jaxsph.reference.portions import Portions, cut
+from jaxsph.reference.media import AllOfVolume, AllParticles, Whole, at_nodes, met, parts_of
+from jaxsph.reference.portions import Portions
 
 BLOCK = 128  # rays that share arrays
 WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2
@@ -136,15 +136,8 @@ class Recording(Look):
 
 def _cast(rays: Rays, wholes: list[Whole], record: Recording) -> None:
     """One block of rays, in portions as the reference first cuts them."""
-    parts: list[Part] = [whole.seen_by(rays) for whole in wholes]
-    roots = cut(rays, [part.cuts() for part in parts])
-    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
-    for part in parts:
-        part.keep(held)
-    portions = roots.some(held)._replace(root=np.arange(held.sum()))
-    seen = AtNodes.nothing(len(portions.ray))
-    for part in parts:
-        part.add(seen, portions)
+    parts, portions = met(wholes, rays)
+    seen = at_nodes(parts, portions)
     half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
     thickness = light_of(seen, half_path).thickness
     front = np.exp(-_in_front(portions.ray, thickness[:, -1]))

@@ -20,7 +20,7 @@ from jaxsph.reference.chords import rays_of
 from jaxsph.reference.image import sample_borders, sample_depths
 from jaxsph.reference.light_integral import refined
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, Look, light_of
-from jaxsph.reference.media import AllOfVolume, AllParticles, Part, parts_of
+from jaxsph.reference.media import AllOfVolume, AllParticles, Part, at_nodes, parts_of
 from jaxsph.reference.points import thickness
 from jaxsph.reference.portions import Portions, cut
 from jaxsph.reference.where import inside, places_of, to_world
@@ -162,10 +162,7 @@ class _Record(Look):
         shape = NODES, len(portions.start)
         self._start, self.extinction = portions.start, np.zeros(shape)
         self.quantities = [np.full(shape, np.nan) for _ in range(self._number)]
-        seen = AtNodes.nothing(shape[1])
-        for part in parts:
-            part.add(seen, portions)
-        return seen
+        return at_nodes(parts, portions)
 
     def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
         """See `Look`."""

@@ -19,9 +19,9 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.reference.chords import Rays, blocks, rays_of
-from jaxsph.reference.looks import AtNodes, Light, light_of, where_thickness
-from jaxsph.reference.media import Part, Whole, parts_of
-from jaxsph.reference.portions import Portions, cut
+from jaxsph.reference.looks import Light, light_of, where_thickness
+from jaxsph.reference.media import Part, Whole, at_nodes, met, parts_of
+from jaxsph.reference.portions import Portions
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
@@ -131,12 +131,7 @@ def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple
 
 def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
-    parts = [whole.seen_by(rays) for whole in wholes]
-    roots = cut(rays, [part.cuts() for part in parts])
-    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
-    for part in parts:
-        part.keep(held)
-    portions = roots.some(held)._replace(root=np.arange(held.sum()))
+    parts, portions = met(wholes, rays)
     portions, light, evaluations = refined(rays, parts, portions, tolerance)
     chords = sum(len(part.chords.ray) for part in parts)
     return np.concatenate([_composite(rays, portions, light), evaluations[:, None]], 1), np.array([chords, len(portions.ray)])
@@ -148,9 +143,7 @@ def refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float)
     evaluations = np.zeros(count)
 
     def look(some: Portions) -> Light:
-        seen = AtNodes.nothing(len(some.ray))
-        for part in parts:
-            part.add(seen, some)
+        seen = at_nodes(parts, some)
         evaluations[:] += np.bincount(some.ray, seen.evaluations, count)
         return light_of(seen, (some.end - some.start) / 2 * rays.slant[some.ray])
 

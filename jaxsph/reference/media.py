@@ -21,7 +21,7 @@ from jaxsph.model.volume import Volume
 from jaxsph.reference.chords import NO_CHORDS, Chords, Rays, Spheres
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference.points import at_offset, kinks
-from jaxsph.reference.portions import Cuts, Lists, Portions, borders, lists
+from jaxsph.reference.portions import Cuts, Lists, Portions, borders, cut, lists
 from jaxsph.reference.where import columns_of, crossings, inside, to_view
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
@@ -79,6 +79,24 @@ def parts_of(scene: Scene, camera: Camera) -> list[Whole]:
     others: list[Whole] = [AllOfVolume(volume, look, camera) for volume, look in scene.volumes]
     others += [AllPoints(points, camera) for points in scene.point_sets]
     return parts + [one if scene.within is None else _AllWithin(one, scene.within, camera) for one in others]
+
+
+def met(wholes: list[Whole], rays: Rays) -> tuple[list[Part], Portions]:
+    """Parts as rays meet them, and the portions that rays are first cut into: those that any part has something in."""
+    parts = [whole.seen_by(rays) for whole in wholes]
+    roots = cut(rays, [part.cuts() for part in parts])
+    held: np.ndarray = np.logical_or.reduce([part.lies_over(roots) for part in parts])
+    for part in parts:
+        part.keep(held)
+    return parts, roots.some(held)._replace(root=np.arange(held.sum()))
+
+
+def at_nodes(parts: list[Part], portions: Portions) -> AtNodes:
+    """What all parts have at nodes of portions."""
+    seen = AtNodes.nothing(len(portions.ray))
+    for part in parts:
+        part.add(seen, portions)
+    return seen
 
 
 class AllParticles(Whole):
