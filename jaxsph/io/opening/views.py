@@ -22,6 +22,7 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import CodeUnit
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import VIEWS as ALONG
+from jaxsph.model.camera.path import middle
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Sphere
 from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
@@ -100,7 +101,7 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
     width, told = length_of(view.width, "width", unit)
     if center is None:
         found = fitted(_within(scene, clip), direction)
-        center = _middle(found)
+        center = np.array(middle(found))
     said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
     height = width * view.size[1] / view.size[0]
     reach = math.inf
@@ -231,12 +232,6 @@ def _all_of(scene: Scene, direction: Direction, center: np.ndarray | None) -> Ca
     width, height = direction.size
     half = math.radians(direction.fov_degrees or 0) / 2
     return direction.camera(middle, 2 * reach * max(1, height / width) / math.cos(half), scene)
-
-
-def _middle(camera: Camera) -> np.ndarray:
-    """The place in the middle of the picture, halfway between near and far."""
-    ahead: np.ndarray = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (float(camera.near) + float(camera.far)) / 2
-    return ahead
 
 
 def _within(scene: Scene, clip: Clip | None) -> Scene:
