@@ -9,7 +9,9 @@ meets it at $\sqrt{b^2 + t^2}$. A point ends where its radius does, whatever its
 from __future__ import annotations
 
 import abc
+import functools
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -196,12 +198,6 @@ def _quadrature(value: Callable[[Array], Array], start: Array, end: Array) -> Ar
         low, high = side(start, 0), side(end, 0)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         rule = zip(NODES, WEIGHTS, strict=True)
-        halves.append(half * _sum([float(weight) * value(middle + float(node) * half) for node, weight in rule]))
-    return _sum(halves)
-
-
-def _sum(values: list[Array]) -> Array:
-    total = values[0]
-    for value in values[1:]:
-        total = total + value
-    return total
+        terms = (float(weight) * value(middle + float(node) * half) for node, weight in rule)
+        halves.append(half * functools.reduce(operator.add, terms))
+    return functools.reduce(operator.add, halves)

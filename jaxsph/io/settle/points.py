@@ -144,13 +144,7 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
 
 
 def _positive(values: np.ndarray, name: str) -> np.ndarray:
-    wrong = ~(values > 0)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise DataError(
-            f"`{name}` is a radius and must be > 0, but {int(wrong.sum())} of {len(values)} are not, "
-            f"the first in row {row + 1}: {values[row]:g}; remove these points, or give `radius=NUMBER`"
-        )
+    _refuse(~(values > 0), values, f"`{name}` is a radius and must be > 0", "remove these points, or give `radius=NUMBER`")
     return values
 
 
@@ -226,14 +220,14 @@ def _values(table: ParticleTable, role: str, name: str) -> tuple[np.ndarray, str
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
     values = values.astype(np.float64)
-    wrong = ~np.isfinite(values)
-    if wrong.any():
-        row = int(np.argwhere(wrong)[0, 0])
-        raise DataError(
-            f"column `{name}` must be finite, but {int(wrong.sum())} of {values.size} values are not, "
-            f"the first in row {row + 1}: {values[wrong].flat[0]}; repair or remove these points"
-        )
+    _refuse(~np.isfinite(values), values, f"column `{name}` must be finite", "repair or remove these points", "values ")
     return values
+
+
+def _refuse(wrong: np.ndarray, values: np.ndarray, must: str, remedy: str, each: str = "") -> None:
+    if wrong.any():
+        row, count = int(np.argwhere(wrong)[0, 0]), f"{int(wrong.sum())} of {values.size} {each}are not"
+        raise DataError(f"{must}, but {count}, the first in row {row + 1}: {values[wrong].flat[0]:g}; {remedy}")
 
 
 def _unit(name: str, column: np.ndarray) -> np.ndarray:
