@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import jax.monitoring
 
-from jaxsph.cli.voice import notice
+from jaxsph.cli.voice import notice, say
 from jaxsph.engine.runtime.programs import PROGRAMS
 
 CHOSEN_BY_USER = "JAX_COMPILATION_CACHE_DIR"
@@ -53,14 +53,15 @@ def folder() -> Path:
     return Path(chosen) if chosen else Path(platformdirs.user_cache_path("jaxsph")) / "compiled"
 
 
-def described() -> list[tuple[str, str]]:
-    """Where the cache is, what it holds, and how large it may become, as lines with their subjects."""
+def say_kept() -> None:
+    """Say where the cache is, what it holds, and how large it may become."""
     place = folder()
     files = list(place.glob("*-cache")) if place.is_dir() else []
     size = sum(path.stat().st_size for path in files)
     chosen = CHOSEN_BY_USER in os.environ
     bound = f"as {CHOSEN_BY_USER} names it, JAX's variables bound it" if chosen else f"at most {MAX_BYTES / 1e6:.0f} MB"
-    return [("cache", str(place)), ("", f"{len(files)} compiled programs, {size / 1e6:.1f} MB; {bound}")]
+    say("cache", str(place))
+    say("", f"{len(files)} compiled programs, {size / 1e6:.1f} MB; {bound}")
 
 
 BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.-]+)'")

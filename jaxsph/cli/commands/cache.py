@@ -8,13 +8,11 @@ from __future__ import annotations
 from jaxsph.cli import cache as kept
 from jaxsph.cli import voice
 from jaxsph.cli.options import groups
-from jaxsph.cli.voice import say
 
 OPTIONS = groups.Options()
 
 
 def cache(*, asked: groups.Options = OPTIONS) -> None:
     """Say where compiled programs are kept, and how large they are."""
-    for what, text in kept.described():
-        say(what, text)
+    kept.say_kept()
     voice.report(folder=str(kept.folder()))

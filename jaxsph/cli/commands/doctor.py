@@ -48,8 +48,7 @@ def doctor(*, asked: groups.Options = OPTIONS) -> None:
             say("absent", f"{name}: {what}")
     say("devices", ", ".join(devices))
     say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
-    for what, text in kept.described():
-        say(what, text)
+    kept.say_kept()
     voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
     voice.report(cache=str(kept.folder()))
 

@@ -46,8 +46,7 @@ def info(
     """Say what a file holds, and what `render` would show of it."""
     options = dataclasses.replace(asked, source=file)
     if options.cache:
-        for what, text in cache.described():
-            say(what, text)
+        cache.say_kept()
         if options.source is None:
             return
     cli_scene.require_something(options)
