@@ -18,6 +18,7 @@ import numpy as np
 from jaxsph.cli.voice import OPTIONS, UsageError, report, result, say, tell
 from jaxsph.io import ParticleTable, Report
 from jaxsph.model import Camera, Image, Settings, registry
+from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
 
 IMAGES = (".exr", ".png")
@@ -156,11 +157,10 @@ def camera_line(camera: Camera, options: Any = None) -> str:
     """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
     if not camera.is_perspective:
         return _parallel(camera, options)
-    eye, axes = camera.exact_eye(), np.asarray(camera.axes, np.float64)
     fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
     near, far = float(camera.near), float(camera.far)
     given = [getattr(options, name, None) for name in ("eye", "target")]
-    computed = eye, eye + axes[2] * (near + far) / 2
+    computed = camera.exact_eye().tolist(), middle(camera)
     texts = [
         ",".join(f"{v:.5g}" for v in at) if said is None else ",".join(f"{v:.12g}" for v in said)
         for at, said in zip(computed, given, strict=True)
@@ -173,8 +173,7 @@ def _parallel(camera: Camera, options: Any) -> str:
     """The options that give a camera with parallel rays again, and its depths."""
     near, far, tall = float(camera.near), float(camera.far), 2 * float(camera.half_height)
     given = getattr(options, "center", None)
-    middle = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * (near + far) / 2
-    center = given if isinstance(given, tuple) else middle
+    center = given if isinstance(given, tuple) else middle(camera)
     place = ",".join(f"{value:.6g}" for value in center)
     view = getattr(options, "view", None) or "z"
     return f"--view {view} --center {place} --width {tall * camera.width / camera.height:.6g}, depths {near:.5g} to {far:.5g}"

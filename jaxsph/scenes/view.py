@@ -5,12 +5,10 @@ Flow: Particles -> [view] -> Camera.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from jaxsph.model import Camera, Particles
-from jaxsph.model.camera.snug import snug
+from jaxsph.model.camera.snug import corners_of, snug
 
 FOV_DEGREES = 35.0
 UP = (0.0, 1.0, 0.0)
@@ -34,7 +32,7 @@ def looking_at_box(
     forward = np.asarray(direction) / np.linalg.norm(direction)
     right = np.cross(forward, UP) / np.linalg.norm(np.cross(forward, UP))
     axes = np.stack([right, np.cross(right, forward), forward])
-    corners = np.array(list(itertools.product(*zip(lower, upper, strict=True)))) @ axes.T
+    corners = corners_of(lower, upper) @ axes.T
     tangent = np.tan(np.radians(FOV_DEGREES) / 2) * (1 - BORDER) * np.array([width / height, 1.0])
     ahead = corners[:, 2:] * tangent
     most, least = (corners[:, :2] - ahead).max(0), (corners[:, :2] + ahead).min(0)

@@ -78,8 +78,13 @@ def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
 
 
 def _span_of_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
-    depth = _depth(camera, np.array(list(itertools.product(*zip(lower, upper, strict=True)))))
+    depth = _depth(camera, corners_of(lower, upper))
     return float(depth.min()), float(depth.max())
+
+
+def corners_of(lower: Any, upper: Any) -> np.ndarray:
+    """Of a box, the last coordinate first."""
+    return np.array(list(itertools.product(*zip(lower, upper, strict=True))))
 
 
 def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:

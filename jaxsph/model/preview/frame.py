@@ -10,7 +10,6 @@ the light reaches the edge of the picture, it steps back first.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import corners_of
 from jaxsph.model.preview.exposure import typical_exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
@@ -150,7 +150,7 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
         if shown.any():
             ends.append((float(front[shown].min()), float(back[shown].max())))
     for volume, _ in scene.volumes:
-        depth = (_corners(volume.bounds()) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
+        depth = (corners_of(*volume.bounds()) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
         ends.append((float(depth.min()), float(depth.max())))
     if not ends:
         return camera
@@ -173,7 +173,7 @@ def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tup
     lower, upper = scene.bounds()
     if not (upper > lower).any():
         lower, upper = lower - 0.5, upper + 0.5
-    corners = _corners((lower, upper)) @ direction.axes.T
+    corners = corners_of(lower, upper) @ direction.axes.T
     low, high = corners.min(0), corners.max(0)
     if center is not None:
         reach = np.abs(corners - center @ direction.axes.T).max(0)
@@ -234,14 +234,10 @@ def _spheres(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
     found = []
     if scene.particles is not None and scene.particles.num_particles:
         if scene.particles.box is not None:
-            found.append((_corners(scene.particles.bounds()), np.zeros(8)))
+            found.append((corners_of(*scene.particles.bounds()), np.zeros(8)))
         valid = np.asarray(scene.particles.valid)
         found.append((scene.particles.exact_position()[valid], np.asarray(scene.particles.support, np.float64)[valid]))
     for points in scene.point_sets:
         valid = np.asarray(points.valid)
         found.append((points.exact_position()[valid], np.asarray(points.radius, np.float64)[valid]))
     return found
-
-
-def _corners(bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    return np.array(list(itertools.product(*zip(*bounds, strict=True))))
