@@ -88,7 +88,6 @@ def view(
         if opens:
             webbrowser.open(server.url)
 
-    ended = True
     try:
         run(server, ready)
     finally:
