@@ -20,6 +20,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -186,6 +187,16 @@ def over_groups(
 
     number = (has_outer.sum(dtype=jnp.int32) + group - 1) // group
     return lax.fori_loop(0, number, some, carry)
+
+
+def rows_of(rows: Carry, items: Int[Array, " some"]) -> Carry:
+    """What is known of some slabs: arrays whose first axis is slabs; of numbers past the last, anything."""
+    return jax.tree.map(lambda of: of[jnp.minimum(items, of.shape[0] - 1)], rows)  # type: ignore[no-any-return]
+
+
+def with_rows(rows: Carry, items: Int[Array, " some"], new: Carry) -> Carry:
+    """The same with what became known of some slabs."""
+    return jax.tree.map(lambda old, of: old.at[items].set(of, mode="drop"), rows, new)  # type: ignore[no-any-return]
 
 
 def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]) -> SlabTask:

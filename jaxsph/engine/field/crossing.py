@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.field.cover import over_groups
+from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
 from jaxsph.engine.field.piercing import Piercing
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.clips.clips import Clip
@@ -59,10 +59,6 @@ class Bracket:
         change = self.at_low - self.at_high
         share = jnp.where(change != 0, self.at_low / jnp.where(change != 0, change, 1), 0.5)
         return self.low + clamped(share, 0, 1) * (self.high - self.low)
-
-    def of(self, items: Int[Array, " some"]) -> Bracket:
-        """Those of some slabs."""
-        return jax.tree.map(lambda rows: rows[jnp.minimum(items, rows.shape[0] - 1)], self)  # type: ignore[no-any-return]
 
 
 class Cut(NamedTuple):
@@ -113,9 +109,8 @@ def first_crossings(
         looked_at = ~inside.all(1)
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
-        inner = weight[jnp.minimum(items, tasks - 1)]
-        within = _within(rays_of(some), inner, level, cut, so_far.of(items))
-        return jax.tree.map(lambda rows, new: rows.at[items].set(new, mode="drop"), so_far, within)
+        inner, crossing = rows_of((weight, so_far), items)
+        return with_rows(so_far, items, _within(rays_of(some), inner, level, cut, crossing))
 
     return over_groups(look, found, task, ~looked_at[:, None])
 
@@ -126,7 +121,7 @@ def _slab_bounds(rays_of: Callable[[SlabTask], Piercing]) -> Callable[[Array, Sl
     def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
         border = _relative(some)
         upper = rays_of(some).upper(jnp.stack([border[:, 0], border[:, -1]], 1))[:, 0]
-        return so_far.at[items].set(upper, mode="drop")
+        return with_rows(so_far, items, upper)
 
     return bound
 
@@ -210,9 +205,9 @@ def narrowed(rays_of: Callable[[SlabTask], Piercing], task: SlabTask, bracket: B
                 of, number = carry
                 return _stepped(rays, of, level, enough), number + 1
 
-            here = jax.tree.map(lambda rows: rows[jnp.minimum(items, rows.shape[0] - 1)], all_rays)
-            here = lax.while_loop(lambda carry: (carry[1] < most) & carry[0].active.any(), step, (here, jnp.int32(0)))[0]
-            return jax.tree.map(lambda rows, new: rows.at[items].set(new, mode="drop"), all_rays, here)  # type: ignore[no-any-return]
+            start = rows_of(all_rays, items), jnp.int32(0)
+            here = lax.while_loop(lambda carry: (carry[1] < most) & carry[0].active.any(), step, start)[0]
+            return with_rows(all_rays, items, here)
 
         return over_groups(of_some, search, task, ~search.active[:, None])
 

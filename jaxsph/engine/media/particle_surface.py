@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
-from jaxsph.engine.field.cover import over_groups
+from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
 from jaxsph.engine.field.crossing import Cut, first_crossings, narrowed
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
@@ -134,11 +134,11 @@ class ParticleSurface(Medium):
         tasks, _, rays = weight.shape
 
         def look(items: Array, some: SlabTask, found: Array) -> Array:
-            here, moving = bracket.of(items), self._rays(some)
+            here, moving = rows_of(bracket, items), self._rays(some)
             root = root_near(moving, here.secant(), (here.low, here.high), self.level)
             colors, normal = self.look.shade(root.found, moving.ray(), some.entry.references[0][:, None])
             rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal], 1)
-            return found.at[items].set(jnp.where(here.met[:, None], rows, 0), mode="drop")
+            return with_rows(found, items, jnp.where(here.met[:, None], rows, 0))
 
         found = over_groups(look, jnp.zeros((tasks, 7, rays), weight.dtype), on_borders, ~bracket.met[:, None])
         depth = jnp.where(bracket.met, found[:, 0], jnp.inf)
