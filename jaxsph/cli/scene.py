@@ -35,7 +35,7 @@ from jaxsph.numerics.nearest import did_you_mean
 ISO_COLOR = 0.85, 0.8, 0.7
 OF_SCENES = ("particles", "frame")
 """What stands behind the name of a built-in scene."""
-OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface")
+OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface", "surface_of")
 
 
 def require_something(options: Any) -> None:
@@ -85,7 +85,7 @@ def _no_source(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 
 def named_scene(options: Any) -> tuple[str, Scene, Camera]:
     """The built-in scene of `scene:NAME:particles=N,frame=K`, its name, and its camera."""
-    refuse(options, options.of_particles + ("iso", "color_by"), "is for particle files, not for built-in scenes")
+    refuse(options, options.of_particles + ("iso", "color_by", "surface_of"), "is for particle files, not for built-in scenes")
     source, behind = file_and_options(options.source)
     name = source.removeprefix(SCENE)
     for key in behind:
@@ -156,10 +156,12 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
     """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
     if io.is_volume(options.source):
-        refuse(options, (*options.of_particles, "surface"), "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface", "surface_of"), "is for particles, and this is a volume")
         volume, name = cli_parts.volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
+    if getattr(options, "surface_of", None) is not None:
+        refuse(options, ("opacity_by",), "and --surface-of exclude each other, as a surface is opaque")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, options)
     if not opacity:

@@ -16,7 +16,7 @@ from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_repo
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.surfaces import surface_of, told_of_surface
+from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded
@@ -30,7 +30,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
     refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
-    by = options.opacity_by or (None if options.transfer is not None else AUTO)
+    by = options.surface_of or options.opacity_by or (None if options.transfer is not None else AUTO)
     said = {field.name: getattr(options, field.name) for field in dataclasses.fields(opening.Source)}
     source = opening.Source(**said | {"opacity_by": by})
     with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
@@ -42,11 +42,12 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
             raise
     _say_survey(survey)
     looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
-    transfer = cli_look.look(survey.middle, looks, survey.quantity)
+    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
+    colored = survey.middle if surface is None else coloured_of(survey.middle)
+    transfer = cli_look.look(colored, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     center = cli_where.middle_of(survey, options)
-    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
     if surface is not None:
         say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
     snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)

@@ -28,6 +28,7 @@ from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import coverage_at_centers
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
@@ -94,20 +95,21 @@ def render(
     work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
     image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
     if asked.scene.surface is not None:
-        _tell_if_unreached(asked.scene, image)
+        _tell_if_unreached(scene, asked.scene.particle_set, image)
     return image
 
 
-def _tell_if_unreached(scene: Scene, image: Image) -> None:
-    """Warn where no ray meets the surface, with the range of what its level is a level of."""
-    surface, particles = scene.surface, scene.particles
-    if surface is None or particles is None or bool((image.transmittance < 1).any()):
+def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
+    """Warn where no ray meets the surface, with the range of what its level is a level of, which is the coverage by `makers`."""
+    surface = scene.surface
+    if surface is None or bool((image.transmittance < 1).any()):
         return
-    found = coverage_at_centers(particles)
+    of = "the coverage by particles" if surface.of == "coverage" else f"the particles' {surface.of}, smoothed by their kernels,"
+    found = coverage_at_centers(makers)
     told = f"{found.min():.3g} to {found.max():.3g} at particles' centres" if found.size else "0, as there are no particles"
     warnings.warn(
-        f"no ray meets the surface of level {float(surface.level):g}: the coverage by particles is {told}; give a level below "
-        "that, look where particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",
+        f"no ray meets the surface of level {float(surface.level):g}: {of} is {told}; give a level below that, look where "
+        "particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",
         UserWarning,
         stacklevel=3,
     )

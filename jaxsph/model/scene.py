@@ -97,6 +97,8 @@ class Scene:
             if (getattr(self, part) is None) != (getattr(self, look) is None):
                 missing, given = (look, part) if getattr(self, look) is None else (part, look)
                 raise ValueError(f"`{missing}` must be given with `{given}`, got None; give both to `jaxsph.Scene`, or neither")
+        if self.surface is not None and self.particles is not None:
+            self.surface.check(self.particles)
         volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")
@@ -189,17 +191,17 @@ def spheres_of(scene: Scene) -> Particles:
 
 
 def widened(scene: Scene) -> Scene:
-    """The scene with `smoothing` put into the supports of its particles, whose volumes stay: what all stages are given."""
+    """The scene as all stages are given it: its particles with supports that `smoothing` widens, and as the surface's field is
+    made of them, with the quantity it is of in their volumes.
+    """
     surface, particles = scene.surface, scene.particles
     if surface is None or particles is None:
         return scene
     given: dict[str, Any] = {
         name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")
     }
-    smoothing = given["smoothing"].astype(particles.support.dtype)
-    wide = dataclasses.replace(particles, support=particles.support * smoothing)
-    packed = dataclasses.replace(surface, **given | {"smoothing": jnp.ones_like(smoothing)})
-    return dataclasses.replace(scene, particles=wide, surface=packed)
+    packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": jnp.ones_like(given["smoothing"])})
+    return dataclasses.replace(scene, particles=surface.makers(particles, given["smoothing"]), surface=packed)
 
 
 def first_spheres(scene: Scene) -> tuple[int, ...]:

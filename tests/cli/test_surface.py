@@ -28,7 +28,8 @@ def asked(tmp_path, monkeypatch):
 
     def render(scene, camera, settings, **_):
         scenes.append((scene, camera))
-        image = js.reference.render(dataclasses.replace(scene, surface=None), camera, settings)
+        one = dataclasses.replace(scene.particles, extinction_quantity=None)
+        image = js.reference.render(dataclasses.replace(scene, surface=None, particles=one), camera, settings)
         return dataclasses.replace(
             image, stats=image.stats | {"seconds": {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}}
         )
@@ -63,9 +64,33 @@ def test_a_surface_of_read_scene_may_be_smoothed_and_that_of_a_built_in_scene_is
     assert asked[-1][0].surface == js.Surface(0.5) and asked[-1][0].transfer is not None
 
 
+def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_the_level(asked, capsys):
+    code, out, _ = run(capsys, "render", "drop.npz", "--surface-of", "temperature", "--color-by", "density", *TINY)
+    ((scene, camera),) = asked
+    assert code == 0 and scene.surface.of == "extinction_quantity" and scene.transfer.extinction_values is None
+    warm = np.asarray(scene.particles.extinction_quantity)[:60]
+    level = float(scene.surface.level)
+    assert (
+        level == pytest.approx(np.median(warm)) and f"where temperature, smoothed by kernels, is {level:.6g}, which half" in out
+    )
+    own, own_camera = io.read_scene("drop.npz", surface_of="temperature", color_by="density", size=(8, 8))
+    assert own.surface == scene.surface and own_camera.describe() == camera.describe()
+    same, _ = io.read_scene("drop.npz", surface_of="temperature", surface=1.2, color_by="temperature", size=(8, 8))
+    assert same.surface == js.Surface(1.2, "quantity") and same.particles.extinction_quantity is None
+    smooth = js.Surface(1e-3, smoothing=2)
+    given, all_of_it = io.read_scene("drop.npz", surface_of="temperature", color_by="density", surface=smooth, size=(8, 8))
+    assert given.surface == js.Surface(1e-3, "extinction_quantity", 2)
+    assert all_of_it.describe() != camera.describe()
+
+
 @pytest.mark.parametrize(
     ("words", "code", "match"),
     [
+        (["drop.npz", "--surface-of", "density", "--surface", "none"], 2, "says that there is none"),
+        (["drop.npz", "--surface-of", "density", "--opacity-by", "x"], 2, "--opacity-by and --surface-of exclude each other"),
+        (["drop.npz", "--surface-of", "x"], 2, "must be a level of x > 0, and the median of its values is -"),
+        (["drop.npy", "--surface-of", "density"], 2, "is for particles, and this is a volume"),
+        (["scene:letters", "--surface-of", "density"], 2, "is for particle files, not for built-in scenes"),
         (["drop.npz", "--surface", "-1"], 2, "must be > 0"),
         (["drop.npz", "--surface", "--from-disk", "1"], 2, "--surface is for particles that are in memory"),
         (["drop.npy", "--surface"], 2, "is for particles, and this is a volume"),

@@ -56,7 +56,8 @@ def crossing(scene: Any, camera: Any, within: Any = None, samples: int = SAMPLES
     real, level = np.asarray(p.valid), float(surface.level)
     view = (np.asarray(p.position, np.float64)[real] - np.asarray(camera.eye, np.float64)) @ np.asarray(camera.axes, np.float64).T
     reach = np.asarray(p.support, np.float64)[real] * float(surface.smoothing)
-    strength = np.asarray(p.volume, np.float64)[real] / reach**3
+    amount = 1.0 if surface.of == "coverage" else np.asarray(getattr(p, surface.of), np.float64)[real]
+    strength = amount * np.asarray(p.volume, np.float64)[real] / reach**3
     quantity, kernel = np.asarray(p.quantity, np.float64)[real], kernels.by_name(p.kernel)
 
     def weights(place: np.ndarray, some: np.ndarray) -> np.ndarray:

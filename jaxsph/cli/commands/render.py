@@ -145,7 +145,7 @@ def _render(options: Any) -> None:
     merge.check_tile(options, settings, output)
     _check_background(options, output)
     if options.from_disk is not None:
-        refuse(options, ("surface",), "is for particles that are in memory; leave out --from-disk")
+        refuse(options, ("surface", "surface_of"), "is for particles that are in memory; leave out --from-disk")
         image, camera = disk.render_options(options, settings)
         image = dataclasses.replace(image, metadata=(*image.metadata, words.header("render", options.words, part=False)))
         _save(image, options, output)

@@ -128,6 +128,7 @@ def _source(options: Any) -> Source:
             "range",
             "preset",
             "surface",
+            "surface_of",
             "eye",
             "target",
         )
@@ -145,12 +146,13 @@ def _source_of_frame(options: Any, snapshots: Snapshots, path: Path, time: float
     given = {name: chosen.get(name) or getattr(options, name) for name in names}
     said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if snapshots.surface is not None:
-        said += f", surface=js.Surface({float(snapshots.surface.level)!r})"
+        said += f", surface=js.Surface({float(snapshots.surface.level)!r}, {snapshots.surface.of!r})"
     files = [str(file.path) for file in survey.files]
     python = f"snapshots = js.sequence.Snapshots.from_files({files}{said}, gaps=True)\nscene = snapshots.at({time!r})"
     words = [word for word in options.words if word not in options.source]
     told = {word.partition("=")[0] for word in words}
     for name, value in chosen.items():
         option = f"--{name.replace('_', '-')}"
-        words += [f"{option}={value}"] * (value is not None and option not in told)
+        told_otherwise = option in told or (name == "opacity_by" and options.surface_of is not None)
+        words += [f"{option}={value}"] * (value is not None and not told_otherwise)
     return Source(python, "" if snapshots.center is not None else str(path), tuple(words), whole=True)

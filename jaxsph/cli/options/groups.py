@@ -274,6 +274,7 @@ class Look(opening.Look):
         option("--optical-depth", "DEPTH", values.number, LOOK, "of typical rays, instead of what is chosen", show=False),
     ] = None
     surface: Annotated[Any, NOT_HERE] = None
+    surface_of: Annotated[str | None, NOT_HERE] = None
 
     def __post_init__(self) -> None:
         """What Python checks, and a depth that numbers can hold."""
@@ -294,6 +295,12 @@ class SurfaceLook(Look):
             values.level,
             LOOK,
             f"of particles, where they cover so much (of liquids {Surface().level})",
+        ),
+    ] = None
+    surface_of: Annotated[
+        str | None,
+        option(
+            "--surface-of", "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
         ),
     ] = None
 

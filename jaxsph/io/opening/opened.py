@@ -18,7 +18,7 @@ import numpy as np
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, look_of
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.surfaces import surface_of, told_of_surface
+from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.views import Said, camera_and_clip, place_of
 from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
@@ -98,8 +98,13 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
         return Loaded(str(path), volume, name)
     table = read_with(find_format(file), file, source.part_type)
-    opacity_by = source.opacity_by or (None if look.transfer is not None else AUTO)
+    if look.surface_of is not None and source.opacity_by is not None:
+        raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface is opaque; leave one of them out")
+    opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
+    if look.surface_of is not None:
+        report = dataclasses.replace(report, opacity_by=None)
+        return Loaded(str(path), particles, report.quantity, None, table, report)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
     said: Said = []
@@ -132,15 +137,17 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
-    transfer, called = look_of(loaded.shown, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
+    colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
+    transfer, called = look_of(colored, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
         place: Any = place_of(scene, view.center, rows)
         scene = dataclasses.replace(scene, particles=loaded.shown.centered(place))
         view = dataclasses.replace(view, center=tuple(place))
-    camera, clip, said = camera_and_clip(scene, view, rows)
+    framed = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
+    camera, clip, said = camera_and_clip(framed, view, rows)
     scene = dataclasses.replace(scene, within=both(scene.within, clip))
     if surface is None:
         scene = exposed(scene, camera, look)

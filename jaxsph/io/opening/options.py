@@ -91,6 +91,8 @@ class Look:
             a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. False shows them as a medium. None is
             the surface of liquids (see `jaxsph.io.opening.surfaces`), unless their opacity or a clip was asked for, and a medium
             of all else.
+        surface_of: quantity whose level the surface is, in place of the coverage: an attribute or density, not negative. With it
+            a level is chosen where none is given.
 
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
@@ -104,8 +106,11 @@ class Look:
     exposure: float = 0.0
     optical_depth: float | None = None
     surface: Any = None
+    surface_of: str | None = None
 
     def __post_init__(self) -> None:
+        if self.surface_of is not None and self.surface is False:
+            raise ValueError("`surface_of` is of a surface, and `surface` says that there is none; leave out one of them")
         if self.surface not in (None, False) and not isinstance(self.surface, Surface):
             Surface(self.surface)  # which checks its level
         for name, known in (("norm", DOMAINS), ("preset", PRESETS)):

@@ -2,6 +2,8 @@
 
 Flow: Particles or Volume, Report, Look -> [surfaces] -> Surface or None, what was chosen.
 
+A surface of a quantity is asked for by name, and shown at its median where no level is given: by that a camera frames it.
+
 A liquid is told by its data: particles lie evenly, hardly two of them closer than half a spacing, as pressure keeps them apart,
 and all supports are one length, of about two spacings; spray lies farther apart. Particles at random lie evenly in the large, but
 30 of 100 have a neighbour that near. Files of gas, in formats of codes for it, are never taken for liquids.
@@ -9,6 +11,9 @@ and all supports are one length, of about two spacings; spray lies farther apart
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 
@@ -45,19 +50,57 @@ def surface_of(
     Raises:
         ValueError: a surface of a volume, which is another.
     """
+    if look.surface_of is not None:
+        return _of_quantity(shown, look)
     if look.surface is None:
         if clipped or _of_medium(look, source) or not isinstance(shown, Particles):
             return None
         return Surface() if _is_liquid(shown, report, source) else None
     if look.surface is False:
         return None
+    _require_particles(shown)
+    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
+
+
+def coloured_of(shown: Particles | Volume) -> Particles | Volume:
+    """What a surface is coloured by: without the quantity that it may be of."""
+    return dataclasses.replace(shown, extinction_quantity=None) if isinstance(shown, Particles) else shown
+
+
+def _of_quantity(shown: Particles | Volume, look: Look) -> Surface:
+    """The surface of what particles carry besides their colours, or of what they are coloured by if that is the same."""
+    particles = _require_particles(shown)
+    of = "quantity" if particles.extinction_quantity is None else "extinction_quantity"
+    if isinstance(look.surface, Surface):
+        return dataclasses.replace(look.surface, of=of)
+    if look.surface is not None:
+        return Surface(look.surface, of)
+    values = np.asarray(getattr(particles, of), np.float64)[np.asarray(particles.valid)]
+    level = float(np.median(values)) if values.size else 1.0
+    if not level > 0:
+        raise ValueError(f"`surface` must be a level of {look.surface_of} > 0, and the median of its values is {level:g}")
+    return Surface(level, of)
+
+
+def within_surface(shown: Particles, surface: Surface) -> Particles:
+    """What a camera is to frame: of a quantity's surface the particles that have the level, if any has."""
+    if surface.of == "coverage":
+        return shown
+    high = np.asarray(shown.valid) & (np.asarray(getattr(shown, surface.of)) >= float(surface.level))
+    return dataclasses.replace(shown, valid=jnp.asarray(high)) if high.any() else shown
+
+
+def _require_particles(shown: Particles | Volume) -> Particles:
     if isinstance(shown, Volume):
         raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
-    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
+    return shown
 
 
 def told_of_surface(surface: Surface, look: Look) -> str:
     """Where it is, and whether it was chosen, for people."""
+    if look.surface_of is not None:
+        chosen = "" if look.surface is not None else ", which half of the particles have; --surface LEVEL sets another"
+        return f"where {look.surface_of}, smoothed by kernels, is {surface.level:.6g}{chosen}"
     smoothed = "" if surface.smoothing == 1 else f", supports times {surface.smoothing:g}"
     chosen = "" if look.surface is not None else ", as of a liquid, which lies evenly; --surface none shows a medium"
     return f"where the coverage by particles is {surface.level:g}{smoothed}{chosen}"

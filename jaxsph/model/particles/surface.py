@@ -1,4 +1,4 @@
-r"""Surface: where the coverage of particles reaches a level, as fluids are drawn.
+r"""Surface: where the coverage of particles reaches a level, as fluids are drawn, or where a quantity does.
 
 Flow: user -> [surface] -> scene -> viewing -> media.
 
@@ -8,6 +8,7 @@ a half lies the surface of the fluid, but for the curvature of thin parts.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.trees import tree
 
-FIELDS = ("coverage",)
+FIELDS = ("coverage", "quantity", "extinction_quantity")
+"""What a surface is a level of: see `Surface.of`."""
 MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
@@ -26,12 +28,14 @@ COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 
 @tree(static=("of",), unchecked=True)
 class Surface:
-    r"""The surface of a scene's particles: where a ray first crosses a level of their coverage; `Scene(surface=...)`.
+    r"""The surface of a scene's particles: where a ray first crosses a level of a field of theirs; `Scene(surface=...)`.
 
-    The field is $C(x) = \sum_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. The
-    surface is opaque, and particles are shown by it alone: there is no fog of them. It is lit from the eye (Lambert):
-    $c \, (a + (1 - a) \, |n \cdot d|)$, with d the ray's direction, a the share of ambient light and n along the gradient of C.
-    Its colour c is that of the scene's transfer function, at the quantity that particles interpolate there; without one `color`.
+    The field is $F(x) = \sum_j a_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. With
+    all a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0
+    outside of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of
+    them. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d the ray's direction, a the share of
+    ambient light and n along the gradient of F. Its colour c is that of the scene's transfer function, at the mean of the
+    quantity there, by what particles add to F; without one `color`.
 
     **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding: see
     `jaxsph.engine.media.particle_surface`, which says what of thin parts is found between samples, and what is an estimate.
@@ -42,9 +46,10 @@ class Surface:
     Nothing closes a fluid where a clip cuts it or a ray begins in it: there the first crossing is where the ray leaves it.
 
     Attributes:
-        level: of the coverage, > 0. A half is halfway between fluid and nothing; a droplet of one particle has
+        level: of the field, > 0. Of the coverage a half is halfway between fluid and nothing; a droplet of one particle has
             $V W(0, s H)$ at its centre, and shows at lower levels alone.
-        of: the field, `"coverage"` (static).
+        of: the field (static): `"coverage"`; `"quantity"`, of the particles, by which the transfer function colours them as
+            well; or `"extinction_quantity"`, their second, such that one is coloured by another. Neither may be negative.
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
         ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
@@ -76,6 +81,32 @@ class Surface:
                 )
             elif not ((number >= 0) & (number <= 1)).all():
                 raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
+
+    def check(self, particles: Particles) -> None:
+        """Raise `ValueError` where particles lack the quantity that it is of, or where that is negative, or out of range."""
+        values = particles.volume if self.of == "coverage" else getattr(particles, self.of)
+        if values is None:
+            raise ValueError(f"`surface` is of the {self.of!r} of `particles`, which have one quantity; give them a second")
+        if self.of == "coverage" or is_traced(particles):
+            return
+        numbers, volumes = (np.asarray(column)[np.asarray(particles.valid)] for column in (values, particles.volume))
+        if (numbers < 0).any():
+            raise ValueError(
+                f"`surface` is of a quantity that may not be negative, got {numbers.min():g}: shift it, and the level"
+            )
+        with np.errstate(over="ignore", under="ignore"):
+            made = numbers * volumes
+        if ((made < np.finfo(made.dtype).tiny) & (numbers > 0) & (volumes > 0)).any() or not np.isfinite(made).all():
+            raise ValueError(
+                f"`surface` is of quantity times volume, and {numbers.max():g} times {volumes.max():g} leaves the range of "
+                f"{made.dtype}; give the quantity in other units"
+            )
+
+    def makers(self, particles: Particles, smoothing: Any) -> Particles:
+        """Particles whose coverage is the field: with supports that `smoothing` widens, and the quantity in their volumes."""
+        support = particles.support * smoothing.astype(particles.support.dtype)
+        volume = particles.volume if self.of == "coverage" else particles.volume * getattr(particles, self.of)
+        return dataclasses.replace(particles, support=support, volume=volume)
 
 
 def coverage_at_centers(particles: Particles, most: int = MOST_CENTERS) -> np.ndarray:

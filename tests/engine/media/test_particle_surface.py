@@ -100,6 +100,23 @@ def test_from_within_the_fluid_the_first_crossing_is_where_a_ray_leaves_it():
     check(scene, camera(eye=(0.0, 0.02, -0.05), near=0.01))
 
 
+@pytest.mark.parametrize("of", ["quantity", pytest.param("extinction_quantity", marks=pytest.mark.slow)])
+def test_a_surface_of_a_quantity_is_where_that_has_the_level_and_coloured_by_what_it_is_made_of(of):
+    """A ball whose quantity grows from one side to the other: it is cut off where there is little of it."""
+    particles = ball()
+    grows = jnp.where(particles.valid, particles.position[:, 0] + 0.5, 0)
+    given = {"quantity": grows} if of == "quantity" else {"extinction_quantity": grows}
+    look = js.TransferFunction.from_points([-0.5, 1.0], [[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]], [1.0, 1.0])
+    surface = js.Surface(0.28, of=of, ambient=1.0)
+    scene = js.Scene(particles=dataclasses.replace(particles, **given), transfer=look, surface=surface)
+    image, truth, both = check(scene, camera())
+    share = ((truth.quantity + 0.5) / 1.5)[..., None]
+    color = (1 - share) * np.array([0.1, 0.5, 0.9]) + share * np.array([0.9, 0.5, 0.1])
+    np.testing.assert_allclose(np.asarray(image.color)[both], color[both], atol=2e-3)
+    whole = np.isfinite(crossing(dataclasses.replace(scene, surface=js.Surface(0.28)), camera()).depth)
+    assert 40 < np.isfinite(truth.depth).sum() < 0.9 * whole.sum()
+
+
 CLIPS = {
     "plane": (js.Plane((0.05, 0.0, -0.05), (-0.3, 0.2, 1.0)), lambda x: (x - [0.05, 0, -0.05]) @ [-0.3, 0.2, 1.0] >= 0),
     "~sphere": (~js.Sphere((0.1, 0.1, -0.4), 0.3), lambda x: np.linalg.norm(x - [0.1, 0.1, -0.4], axis=-1) >= 0.3),

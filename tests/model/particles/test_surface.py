@@ -32,7 +32,7 @@ def camera():
         ({"level": np.nan}, "`level` must be finite"),
         ({"level": (1.0, 2.0)}, r"`level` must have shape \(\), got \(2,\); give one number"),
         ({"smoothing": -1.0}, "`smoothing` must be > 0"),
-        ({"of": "density"}, "`of` must be one of 'coverage', got 'density'"),
+        ({"of": "density"}, "`of` must be one of 'coverage', 'quantity', 'extinction_quantity', got 'density'"),
         ({"color": (1.0, 0.5, 2.0)}, r"`color` must lie in \[0, 1\]"),
         ({"ambient": -0.1}, r"`ambient` must lie in \[0, 1\]"),
     ],
@@ -61,6 +61,36 @@ def test_smoothing_widens_supports_once_and_keeps_volumes():
     assert float(wide.surface.smoothing) == 1 and jax.tree.structure(wide) == jax.tree.structure(widened(scene))
 
 
+@pytest.mark.parametrize(
+    ("of", "given", "match"),
+    [
+        ("extinction_quantity", {}, "`surface` is of the 'extinction_quantity' of `particles`, which have one quantity"),
+        ("quantity", {"quantity": [-1.0, 2.0]}, "a quantity that may not be negative, got -1: shift it, and the level"),
+        (
+            "quantity",
+            {"quantity": [1e-30, 1.0], "volume": 1e-12},
+            "leaves the range of float32; give the quantity in other units",
+        ),
+        ("quantity", {"quantity": [1e30, 1.0], "volume": 1e12}, "leaves the range of float32; give the quantity in other units"),
+    ],
+)
+def test_a_quantity_that_makes_no_field_is_refused_by_name(of, given, match):
+    columns = {"position": np.zeros((2, 3)), "support": 1.0, "quantity": [1.0, 2.0], "volume": 1.0} | given
+    with pytest.raises(ValueError, match=match):
+        js.Scene(particles=js.Particles.from_arrays(**columns), surface=js.Surface(of=of)).check()
+
+
+def test_a_surface_of_a_quantity_is_that_of_the_coverage_by_particles_of_so_much_more_volume():
+    particles, more = some(), np.random.default_rng(2).uniform(0.5, 3, 30)
+    second = dataclasses.replace(particles, extinction_quantity=particles.quantity * 0 + 1)
+    scene = widened(js.Scene(particles=second, surface=js.Surface(2.0, of="extinction_quantity", smoothing=1.2)))
+    np.testing.assert_allclose(scene.particles.volume, particles.volume, rtol=1e-6)
+    given = dataclasses.replace(particles, quantity=particles.quantity.at[:30].set(more))
+    scene = widened(js.Scene(particles=given, surface=js.Surface(2.0, of="quantity")))
+    assert scene.surface.of == "coverage" and jax.tree.structure(scene) == jax.tree.structure(widened(scene))
+    np.testing.assert_allclose(scene.particles.volume[:30], 0.01 * more, rtol=1e-6)
+
+
 def test_coverage_at_centers_is_that_of_the_definition():
     particles = some()
     real = np.asarray(particles.valid)
@@ -69,6 +99,11 @@ def test_coverage_at_centers_is_that_of_the_definition():
     wanted = (np.asarray(kernels.evaluate("wendland_c2", apart, support[None])) * 0.01).sum(1)
     np.testing.assert_allclose(coverage_at_centers(particles), wanted, rtol=1e-5)
     assert len(coverage_at_centers(particles, 10)) == 10
+
+
+def test_a_level_of_a_quantity_that_no_ray_meets_is_told_with_its_range():
+    with pytest.warns(UserWarning, match=r"level 50: the particles' quantity, smoothed by their kernels, is 0\.\d+ to [\d.]+ at"):
+        js.render(js.Scene(particles=some(), surface=js.Surface(50.0, of="quantity")), camera(), SETTINGS)
 
 
 def test_a_level_that_no_ray_meets_is_an_empty_picture_and_told_with_the_range():
