@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.visibility import visibility_histogram
     from jaxsph.engine.access.morton import prepare
     from jaxsph.engine.frame.progressive import progressive
-    from jaxsph.engine.media.iso_surface import IsoSurface
+    from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
     from jaxsph.engine.media.within import Within
     from jaxsph.engine.planning.fit import plan
     from jaxsph.engine.render import render
@@ -90,7 +90,7 @@ NAMES = {
     "Particles": "jaxsph.model.particles.particles:Particles",
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
-    "IsoSurface": "jaxsph.engine.media.iso_surface:IsoSurface",
+    "IsoSurface": "jaxsph.engine.media.surfaces.iso_surface:IsoSurface",
     "Surface": "jaxsph.model.particles.surface:Surface",
     "Scene": "jaxsph.model.scene:Scene",
     "Box": "jaxsph.model.clips.shapes:Box",

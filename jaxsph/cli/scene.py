@@ -21,7 +21,7 @@ from jaxsph.cli.options import groups
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.options.values import file_and_options
 from jaxsph.cli.voice import report, say
-from jaxsph.engine.media.iso_surface import IsoSurface
+from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged

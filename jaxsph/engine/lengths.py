@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.engine.access.resolution import longest
-from jaxsph.engine.media.iso_surface import IsoSurface
+from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Both, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere

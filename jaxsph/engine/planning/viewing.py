@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.resolution import too_fine
 from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.lookups.quantities import in_units_of, too_small
-from jaxsph.engine.media.particle_surface import ParticleSurface
 from jaxsph.engine.media.points import PointsMedium
+from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.planning.in_range import scene_in_range

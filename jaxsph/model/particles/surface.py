@@ -38,7 +38,7 @@ class Surface:
     quantity there, by what particles add to F; without one `color`.
 
     **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding: see
-    `jaxsph.engine.media.particle_surface`, which says what of thin parts is found between samples, and what is an estimate.
+    `jaxsph.engine.media.surfaces.particle_surface`, which says what of thin parts is found between samples, and what is an estimate.
 
     **Derivatives** by positions, supports, volumes, quantities, level, smoothing and camera are those of an implicit function, of
     depth, normal and colour alike. Silhouettes have none: a ray that stops meeting the surface is not foreseen.

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.headlight import OPAQUE, headlight, square_of
+from jaxsph.engine.media.surfaces.headlight import OPAQUE, headlight, square_of
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium

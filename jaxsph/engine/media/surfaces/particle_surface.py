@@ -2,7 +2,7 @@ r"""The surface of particles as a medium: opaque where a ray first crosses a lev
 
 Flow: grid, schedule -> [particle_surface: borders -> crossing -> root -> light] -> integrator.
 
-**Where a ray crosses** is found by `field.crossing`, slab by slab, and followed by a step of Newton's (`surface_root`) to some
+**Where a ray crosses** is found by `field.crossing`, slab by slab, and followed by a step of Newton's (`root`) to some
 roundings of a support.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
@@ -35,8 +35,8 @@ from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, columns_of
-from jaxsph.engine.media.headlight import OPAQUE
-from jaxsph.engine.media.surface_root import Root, SurfaceLook, pull_root, root_near
+from jaxsph.engine.media.surfaces.headlight import OPAQUE
+from jaxsph.engine.media.surfaces.root import Root, SurfaceLook, pull_root, root_near
 from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops, added
@@ -123,7 +123,7 @@ class ParticleSurface(Medium):
         """Where the rays of slabs first meet the surface, and how it looks there.
 
         Differentiation:
-            As of an implicit function, see `surface_root`. Which rays meet it has none: silhouettes do not move.
+            As of an implicit function, see `root`. Which rays meet it has none: silhouettes do not move.
         """
         on_borders, still = _on_borders(task), lax.stop_gradient(self)
         sums = gather_scattered if task.scattered else gather

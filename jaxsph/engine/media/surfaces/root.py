@@ -1,6 +1,6 @@
 r"""What a ray finds where it crosses a surface, as a function of the particles that make it: the implicit function theorem.
 
-Flow: bracket -> [surface_root: root -> field -> light] -> particle_surface; cotangents -> [surface_root] -> particles.
+Flow: bracket -> [root: place -> field -> light] -> particle_surface; cotangents -> [root] -> particles.
 
 With F the field, p all that it depends on, and t the depth of a crossing, $F(t, p) = c$ makes t a function of p and c whose
 derivatives are those of one step of Newton's with its slope held fixed, $dt = (dc - F_p \, dp) / F_t$. What is found there, G
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.engine.field.piercing import Found, Piercing
-from jaxsph.engine.media.headlight import headlight
+from jaxsph.engine.media.surfaces.headlight import headlight
 from jaxsph.model.medium import COLORS
 from jaxsph.model.transfer.function import Segments, find, read
 from jaxsph.numerics.extremes import clamped
