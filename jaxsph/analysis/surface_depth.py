@@ -86,7 +86,8 @@ def surface_depth(scene: Scene, camera: Camera, settings: Settings | None = None
         raise ValueError("`surface_depth` needs concrete arrays; call it outside of jit, vmap and grad")
     if scene.surface is None or scene.particles is None:
         raise ValueError("`scene` must have particles and a `surface`, got none; give `jaxsph.Scene` a `jaxsph.Surface()`")
-    alone = Scene(particles=scene.particles, transfer=scene.transfer, surface=scene.surface, within=scene.within)
+    first = dataclasses.replace(scene.surface, opacity=None)
+    alone = Scene(particles=scene.particles, transfer=scene.transfer, surface=first, within=scene.within)
     camera = with_depths(camera, alone)
     image = render(alone, camera, settings)
     depth = np.asarray(image.depth)

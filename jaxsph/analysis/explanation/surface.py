@@ -139,8 +139,10 @@ def explain_surface(scene: Scene, camera: Camera, settings: Settings, row: int, 
     """See `jaxsph.explain`: of a scene with a surface."""
     camera = with_depths(camera, scene)
     image = render(scene, camera, settings)
-    alone = Scene(particles=scene.particles, transfer=scene.transfer, surface=scene.surface, within=scene.within)
-    others = bool(scene.media or scene.volumes or scene.point_sets)
+    assert scene.surface is not None
+    first = dataclasses.replace(scene.surface, opacity=None)
+    alone = Scene(particles=scene.particles, transfer=scene.transfer, surface=first, within=scene.within)
+    others = bool(scene.media or scene.volumes or scene.point_sets) or scene.surface.opacity is not None
     found = float(np.asarray((render(alone, camera, settings) if others else image).depth)[row, column])
     ray = _Ray(alone, camera, row, column)
     borders = sample_borders(camera, settings.samples)

@@ -1,4 +1,4 @@
-r"""Where rays first cross a level of the field: between which two depths, and then to some roundings.
+r"""Where rays cross a level of the field, first or each time: between which two depths, and then to some roundings.
 
 Flow: sums on borders -> [crossing: slabs -> intervals -> places -> bracket -> narrowed] -> particle_surface.
 
@@ -7,6 +7,9 @@ the level at both, particles' largest weights bound it in between (`field.pierci
 level holds no surface, nor does such an interval; a theorem, but for the rounding of sums that are within some eps of the level.
 In what is left the field is asked for at one place more, where it may be largest, and, if the level is not reached there but
 nearly so, at the vertex of the parabola through the three: interval by interval from the front on, up to the first crossing.
+
+That is the first crossing of each ray. Where rays go on, every interval is looked into, and two neighbouring depths of all that
+are known hold a crossing each.
 
 Each of these looks at those slabs alone that the one before could not settle: of some scenes' slabs in front of a surface 94 of
 100 are settled by their first bound, and of those with one a third of all rays cross it.
@@ -94,25 +97,69 @@ def first_crossings(
 ) -> Bracket:
     """Between which two depths rays first cross the level in slabs with samples on borders, given the field there."""
     inside = weight >= level
-    tasks, borders, rays = weight.shape
-    begin, end = _relative(task)[:, :-1], _relative(task)[:, 1:]
-    shape = tasks, borders - 1, rays
-    crossed = inside[:, 1:] != inside[:, :-1]
-    known = tuple(jnp.broadcast_to(at[..., None], shape) for at in (begin, end))
-    found = _at_first(crossed, (*known, weight[:, :-1] - level, weight[:, 1:] - level))
-    below = ~inside[:, 1:] & ~inside[:, :-1]
-    if cut is None:
-        outside = ~inside.any((1, 2))
-        bounded = over_groups(_slab_bounds(rays_of), jnp.zeros((tasks, rays), weight.dtype), task, ~outside[:, None, None])
-        looked_at = jnp.where(outside[:, None], bounded >= level, below.any(1))
-    else:
-        looked_at = ~inside.all(1)
+    found = _at_first(inside[:, 1:] != inside[:, :-1], (*_ends_of(task, weight), weight[:, :-1] - level, weight[:, 1:] - level))
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
         inner, crossing = rows_of((weight, so_far), items)
         return with_rows(so_far, items, _within(rays_of(some), inner, level, cut, crossing))
 
-    return over_groups(look, found, task, ~looked_at[:, None])
+    return over_groups(look, found, task, ~_looked_at(rays_of, task, inside, level, cut)[:, None])
+
+
+def all_crossings(
+    rays_of: Callable[[SlabTask], Piercing],
+    task: SlabTask,
+    weight: Float[Array, "tasks borders rays"],
+    level: Float[Array, ""],
+    cut: Cut | None,
+) -> Bracket:
+    """Between which two depths rays cross the level each time: of each interval its two parts, on a first axis.
+
+    See `first_crossings`; a part that is not crossed is `NOWHERE`, and an interval that is not looked into is all of its first.
+    """
+    asked = _ends_of(task, weight)[1], weight[:, 1:]
+
+    def look(items: Array, some: SlabTask, so_far: tuple[Array, Array]) -> tuple[Array, Array]:
+        inner, known = rows_of((weight, so_far), items)
+        return with_rows(so_far, items, _each_asked(rays_of(some), inner, level, cut, known))
+
+    place, value = over_groups(look, asked, task, ~_looked_at(rays_of, task, weight >= level, level, cut)[:, None])
+    begin, end = _ends_of(task, weight)
+    parts = []
+    for low, high, at_low, at_high in ((begin, place, weight[:, :-1], value), (place, end, value, weight[:, 1:])):
+        crossed = (at_low >= level) != (at_high >= level)
+        if cut is not None:
+            crossed &= cut.clip.contains(rays_of(task).lines.at(0.5 * (low + high)))
+        number = jnp.where(crossed, jnp.arange(low.shape[1], dtype=low.dtype)[:, None], NOWHERE)
+        parts.append(Bracket(number, low, high, at_low - level, at_high - level))
+
+    def in_order(*both: Array) -> Array:
+        tasks, _, rays = both[0].shape
+        return jnp.stack(both, 2).transpose(1, 2, 0, 3).reshape(-1, tasks, rays)
+
+    return jax.tree.map(in_order, *parts)  # type: ignore[no-any-return]
+
+
+def _looked_at(
+    rays_of: Callable[[SlabTask], Piercing],
+    task: SlabTask,
+    inside: Bool[Array, "tasks borders rays"],
+    level: Float[Array, ""],
+    cut: Cut | None,
+) -> Bool[Array, "tasks rays"]:
+    """Rays that may cross between two borders at which they are outside: slabs with one are looked into."""
+    if cut is not None:
+        return ~inside.all(1)
+    tasks, _, rays = inside.shape
+    below, outside = ~inside[:, 1:] & ~inside[:, :-1], ~inside.any((1, 2))
+    bounded = over_groups(_slab_bounds(rays_of), jnp.zeros((tasks, rays), level.dtype), task, ~outside[:, None, None])
+    return jnp.where(outside[:, None], bounded >= level, below.any(1))
+
+
+def _ends_of(task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> tuple[Float[Array, "tasks intervals rays"], ...]:
+    """Where the intervals of all rays begin, and where they end."""
+    shape = weight[:, 1:].shape
+    return tuple(jnp.broadcast_to(at[..., None], shape) for at in (_relative(task)[:, :-1], _relative(task)[:, 1:]))
 
 
 def _slab_bounds(rays_of: Callable[[SlabTask], Piercing]) -> Callable[[Array, SlabTask, Array], Array]:
@@ -133,7 +180,7 @@ def _within(
     border = _relative(rays.task)
     wanted = _wanted(rays, border, weight, level, cut)
     if cut is not None:  # what a clip has cut is looked into piece by piece
-        whole = tuple(jnp.broadcast_to(at[..., None], wanted.place.shape) for at in (border[:, :-1], border[:, 1:]))
+        whole = _ends_of(rays.task, weight)
         crossed = ((weight[:, 1:] >= level) != (weight[:, :-1] >= level)) & ~wanted.cut
         crossed &= cut.clip.contains(rays.lines.at(0.5 * (whole[0] + whole[1])))
         found = _at_first(crossed, (*whole, weight[:, :-1] - level, weight[:, 1:] - level))
@@ -149,30 +196,58 @@ def _within(
     def look(carry: tuple[Array, Bracket]) -> tuple[Array, Bracket]:
         left, so_far = carry
         nth, there = next_of(carry)
-
-        def of_ray(of_intervals: Array) -> Array:
-            return jnp.take_along_axis(of_intervals, nth[:, None], 1)[:, 0]
-
-        at = tuple(jnp.take_along_axis(border, nth + k, 1) for k in (0, 1))
-        ends = of_ray(weight[:, :-1]), of_ray(weight[:, 1:])
-        place, is_cut = of_ray(wanted.place), of_ray(wanted.cut)
-        value = rays.weights(place)
-        vertex, peak = _vertex((at[0], place, at[1]), (ends[0], value, ends[1]))
-        near = there & ~is_cut & (value < level) & (vertex != place) & (peak >= NEAR * level)
-        again = lax.cond(near.any(), lambda: rays.weights(vertex), lambda: value)
-        place, value = jnp.where(near, vertex, place), jnp.where(near, again, value)
-        places = jnp.stack([at[0], place, at[1]], 1)
-        values = jnp.stack([ends[0], value, ends[1]], 1)
+        places, values = _asked(rays, weight, level, wanted, nth, there)
         crossed = ((values[:, 1:] >= level) != (values[:, :-1] >= level)) & there[:, None]
         if cut is not None:
             crossed &= cut.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
         here = _at_first(crossed, (places[:, :-1], places[:, 1:], values[:, :-1] - level, values[:, 1:] - level))
-        here = Bracket(nth.astype(value.dtype), here.low, here.high, here.at_low, here.at_high)
+        here = Bracket(nth.astype(values.dtype), here.low, here.high, here.at_low, here.at_high)
         met = crossed.any(1)
         left &= jnp.arange(number)[:, None] != nth[:, None]
         return left, jax.tree.map(lambda new, old: jnp.where(met, new, old), here, so_far)
 
     return lax.while_loop(lambda carry: next_of(carry)[1].any(), look, (wanted.intervals, found))[1]
+
+
+def _each_asked(
+    rays: Piercing,
+    weight: Float[Array, "tasks borders rays"],
+    level: Float[Array, ""],
+    cut: Cut | None,
+    known: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """A place in each interval that is to be looked into, and the field there; of others what is `known`."""
+    wanted = _wanted(rays, _relative(rays.task), weight, level, cut)
+
+    def look(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
+        left, known = carry
+        nth, there = jnp.argmax(left, 1), left.any(1)
+        places, values = _asked(rays, weight, level, wanted, nth, there)
+        here = (jnp.arange(left.shape[1])[:, None] == nth[:, None]) & there[:, None]
+        found = tuple(jnp.where(here, of[:, 1:2], old) for of, old in zip((places, values), known, strict=True))
+        return left & ~here, found  # type: ignore[return-value]
+
+    return lax.while_loop(lambda carry: carry[0].any(), look, (wanted.intervals, known))[1]
+
+
+def _asked(
+    rays: Piercing, weight: Float[Array, "tasks borders rays"], level: Float[Array, ""], wanted: _Wanted, nth: Array, there: Array
+) -> tuple[Float[Array, "tasks three rays"], Float[Array, "tasks three rays"]]:
+    """The ends of the `nth` interval of each ray and a place in between, and the field there; for rays where one is `there`."""
+
+    def of_ray(of_intervals: Array) -> Array:
+        return jnp.take_along_axis(of_intervals, nth[:, None], 1)[:, 0]
+
+    border = _relative(rays.task)
+    at = tuple(jnp.take_along_axis(border, nth + k, 1) for k in (0, 1))
+    ends = of_ray(weight[:, :-1]), of_ray(weight[:, 1:])
+    place, is_cut = of_ray(wanted.place), of_ray(wanted.cut)
+    value = rays.weights(place)
+    vertex, peak = _vertex((at[0], place, at[1]), (ends[0], value, ends[1]))
+    near = there & ~is_cut & (value < level) & (vertex != place) & (peak >= NEAR * level)
+    again = lax.cond(near.any(), lambda: rays.weights(vertex), lambda: value)
+    place, value = jnp.where(near, vertex, place), jnp.where(near, again, value)
+    return jnp.stack([at[0], place, at[1]], 1), jnp.stack([ends[0], value, ends[1]], 1)
 
 
 def _wanted(rays: Piercing, border: Array, weight: Array, level: Array, cut: Cut | None) -> _Wanted:

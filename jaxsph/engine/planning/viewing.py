@@ -19,6 +19,7 @@ from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.lookups.quantities import in_units_of, too_small
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
+from jaxsph.engine.media.surfaces.surface_layers import SurfaceLayers
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.planning.in_range import scene_in_range
@@ -71,7 +72,8 @@ def view_scene(
     media = _media(scene, camera, dtype)
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        media, transfer = (ParticleSurface.seen(scene.surface, particles, viewed, transfer, clip), *media), None
+        seen = SurfaceLayers.seen_through if scene.surface.opacity is not None else ParticleSurface.seen
+        media, transfer = (seen(scene.surface, particles, viewed, transfer, clip), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)

@@ -21,6 +21,11 @@ from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage", "quantity", "extinction_quantity")
 """What a surface is a level of: see `Surface.of`."""
+NOT_ZERO = {
+    "level": "coverage is 0 away from a fluid",
+    "smoothing": "1 takes supports as given",
+    "opacity": "what lets all light through is not seen",
+}
 MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
@@ -33,12 +38,12 @@ class Surface:
     The field is $F(x) = \sum_j a_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. With
     all a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0
     outside of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of
-    them. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d the ray's direction, a the share of
-    ambient light and n along the gradient of F. Its colour c is that of the scene's transfer function, at the mean of the
-    quantity there, by what particles add to F; without one `color`.
+    them. With an opacity it lets light through. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d
+    the ray's direction, a the share of ambient light and n along the gradient of F. Its colour c is that of the scene's transfer
+    function, at the mean of the quantity there, by what particles add to F; without one `color`.
 
-    **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding: see
-    `jaxsph.engine.media.surfaces.particle_surface`, which says what of thin parts is found between samples, and what is an estimate.
+    **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding; of thin parts see
+    `jaxsph.engine.media.surfaces.particle_surface`, which says what is found between samples, and what is an estimate.
 
     **Derivatives** by positions, supports, volumes, quantities, level, smoothing and camera are those of an implicit function, of
     depth, normal and colour alike. Silhouettes have none: a ray that stops meeting the surface is not foreseen.
@@ -53,6 +58,8 @@ class Surface:
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
         ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
+        opacity: of each layer that a ray crosses, in (0, 1], such that what lies behind shines through: other layers, media,
+            points; None is opaque, and faster.
 
     Raises:
         ValueError: a level or a smoothing that is not > 0 and finite, another field, a colour or a share outside of [0, 1].
@@ -63,23 +70,22 @@ class Surface:
     smoothing: Any = 1.0
     color: Any = COLOR
     ambient: Any = AMBIENT
+    opacity: Any = None
 
     def __post_init__(self) -> None:
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
         shapes: dict[str, tuple[int, ...]] = {"level": (), "smoothing": (), "color": (3,), "ambient": ()}
-        for name, shape in shapes.items():
+        for name, shape in (shapes if self.opacity is None else shapes | {"opacity": ()}).items():
             value = getattr(self, name)
             require_shape(name, value, shape, "give red, green and blue" if shape else "give one number")
             if is_traced(value):
                 continue
             number = np.asarray(value, np.float64)
             require_finite(name, number, "give a finite number")
-            if name in ("level", "smoothing"):
-                require_positive(
-                    name, number, "coverage is 0 away from a fluid" if name == "level" else "1 takes supports as given"
-                )
-            elif not ((number >= 0) & (number <= 1)).all():
+            if name in NOT_ZERO:
+                require_positive(name, number, NOT_ZERO[name])
+            if name not in ("level", "smoothing") and not ((number >= 0) & (number <= 1)).all():
                 raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
 
     def check(self, particles: Particles) -> None:

@@ -28,7 +28,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
-from jaxsph.engine.field.crossing import Cut, first_crossings, narrowed
+from jaxsph.engine.field.crossing import Bracket, Cut, first_crossings, narrowed
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
 from jaxsph.engine.field.scattered import gather_scattered
@@ -59,6 +59,14 @@ class Hit(NamedTuple):
 
     depth: Float[Array, "tasks rays"]
     interval: Int[Array, "tasks rays"]
+    color: Float[Array, "tasks 3 rays"]
+    normal: Float[Array, "tasks 3 rays"]
+
+
+class Place(NamedTuple):
+    """The same of a crossing each, in whichever interval."""
+
+    depth: Float[Array, "tasks rays"]
     color: Float[Array, "tasks 3 rays"]
     normal: Float[Array, "tasks 3 rays"]
 
@@ -125,38 +133,50 @@ class ParticleSurface(Medium):
         Differentiation:
             As of an implicit function, see `root`. Which rays meet it has none: silhouettes do not move.
         """
+        on_borders, weight = self.on_borders(task)
+        still = lax.stop_gradient(self)
+        bracket = first_crossings(still.rays, lax.stop_gradient(on_borders), weight, still.level, still.cut())
+        place = self.place(on_borders, bracket)
+        return Hit(place.depth, bracket.interval.astype(jnp.int32), place.color, place.normal)
+
+    def on_borders(self, task: SlabTask) -> tuple[SlabTask, Float[Array, "tasks borders rays"]]:
+        """The task with samples on the borders of what samples stand for, and the field there, held fixed."""
         on_borders, still = _on_borders(task), lax.stop_gradient(self)
         sums = gather_scattered if task.scattered else gather
-        weight = by_rays(sums(*still._lists(), lax.stop_gradient(on_borders), self.kernel))[0]
-        there = lax.stop_gradient(on_borders)
-        bracket = first_crossings(still._rays, there, weight, still.level, still._cut())
-        bracket = narrowed(still._rays, there, bracket, still.level)
-        tasks, _, rays = weight.shape
+        return on_borders, by_rays(sums(*still.lists(), lax.stop_gradient(on_borders), self.kernel))[0]
+
+    def place(self, on_borders: SlabTask, bracket: Bracket) -> Place:
+        """Where rays cross, of one bracket each, and how the surface looks there."""
+        still, there = lax.stop_gradient(self), lax.stop_gradient(on_borders)
+        bracket = narrowed(still.rays, there, bracket, still.level)
+        tasks, rays = bracket.low.shape
 
         def look(items: Array, some: SlabTask, found: Array) -> Array:
-            here, moving = rows_of(bracket, items), self._rays(some)
+            here, moving = rows_of(bracket, items), self.rays(some)
             root = root_near(moving, here.secant(), (here.low, here.high), self.level)
             colors, normal = self.look.shade(root.found, moving.ray(), some.entry.references[0][:, None])
             rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal], 1)
             return with_rows(found, items, jnp.where(here.met[:, None], rows, 0))
 
-        found = over_groups(look, jnp.zeros((tasks, 7, rays), weight.dtype), on_borders, ~bracket.met[:, None])
-        depth = jnp.where(bracket.met, found[:, 0], jnp.inf)
-        return Hit(depth, bracket.interval.astype(jnp.int32), found[:, 1:4], found[:, 4:])
+        found = over_groups(look, jnp.zeros((tasks, 7, rays), bracket.low.dtype), on_borders, ~bracket.met[:, None])
+        return Place(jnp.where(bracket.met, found[:, 0], jnp.inf), found[:, 1:4], found[:, 4:])
 
-    def _cut(self) -> Cut | None:
+    def cut(self) -> Cut | None:
+        """The clip, as the search asks for it."""
         clip = self.clip
         if clip is None:
             return None
         return Cut(clip, lambda task: parts_of(task, clip, task.depth, jnp.ones((), task.depth.dtype)))
 
-    def _lists(self) -> tuple[Ordered, Int[Array, " pairs"]]:
+    def lists(self) -> tuple[Ordered, Int[Array, " pairs"]]:
+        """Particles and lists of its band."""
         if self.ordered is None or self.rank is None:
             raise ValueError("a surface is asked for without the lists of a band; call `in_band` first")
         return self.ordered, self.rank
 
-    def _rays(self, task: SlabTask) -> Piercing:
-        return Piercing(*self._lists(), task, SlabRays.of(task), self.kernel)
+    def rays(self, task: SlabTask) -> Piercing:
+        """The rays of slabs, and particles in their windows."""
+        return Piercing(*self.lists(), task, SlabRays.of(task), self.kernel)
 
     def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
         """Opaque where the surface is."""
@@ -189,7 +209,7 @@ class ParticleSurface(Medium):
 
     def no_cotangents(self) -> SurfaceCotangents:
         """None yet."""
-        x = self._lists()[0].x
+        x = self.lists()[0].x
         own = jax.tree.map(jnp.zeros_like, dataclasses.replace(self, ordered=None, rank=None))
         return SurfaceCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own)
 
@@ -204,17 +224,22 @@ class ParticleSurface(Medium):
         met = gathered.interval >= 0
         (of_color,) = jax.vjp(lambda color: self.met(gathered._replace(color=color), task), gathered.color)[1](cotangents)
         of_depth, *of_normal = jnp.zeros((4, *met.shape), of_color.dtype) if of_stops is None else of_stops
-        of_hit = jnp.concatenate([of_depth[:, None], of_color, jnp.stack(of_normal, 1)], 1)
-        tasks = met.shape[0]
+        total, factor = self.pull_place(total, task, gathered.depth, Place(of_depth, of_color, jnp.stack(of_normal, 1)))
+        return total, OfPlaces.none(task)._replace(factor=factor)
+
+    def pull_place(
+        self, total: SurfaceCotangents, task: SlabTask, depth: Float[Array, "tasks rays"], cotangents: Place
+    ) -> tuple[SurfaceCotangents, Float[Array, ""]]:
+        """Add what follows from cotangents of a `place`; and those of a common factor of all u and v."""
+        met, tasks = jnp.isfinite(depth), depth.shape[0]
+        of_hit = jnp.concatenate([cotangents.depth[:, None], cotangents.color, cotangents.normal], 1)
 
         def pull_some(items: Array, some: SlabTask, carry: tuple[SurfaceCotangents, Array]) -> tuple[SurfaceCotangents, Array]:
             here, real = jnp.minimum(items, tasks - 1), (items < tasks)[:, None]
             of_rows = jnp.where((met[here] & real)[:, None], of_hit[here], 0)
-            return self._pull_some(some, jnp.where(met[here], gathered.depth[here], 0), of_rows, *carry)
+            return self._pull_some(some, jnp.where(met[here], depth[here], 0), of_rows, *carry)
 
-        start = total, jnp.zeros((), gathered.depth.dtype)
-        total, factor = over_groups(pull_some, start, _on_borders(task), ~met[:, None])
-        return total, OfPlaces.none(task)._replace(factor=factor)
+        return over_groups(pull_some, (total, jnp.zeros((), depth.dtype)), _on_borders(task), ~met[:, None])
 
     def _pull_some(
         self,
@@ -225,7 +250,7 @@ class ParticleSurface(Medium):
         factor: Float[Array, ""],
     ) -> tuple[SurfaceCotangents, Float[Array, ""]]:
         """Add what follows from cotangents of depth, colours and normal, of some slabs whose rays meet the surface at a depth."""
-        rays, reference = self._rays(task), task.entry.references[0][:, None]
+        rays, reference = self.rays(task), task.entry.references[0][:, None]
         place = depth - rays.lines.middle
 
         def shaded(look: SurfaceLook, found: Found, factor: Array) -> Array:

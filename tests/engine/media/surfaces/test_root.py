@@ -16,7 +16,8 @@ import jaxsph as js
 
 STEP = 1e-6  # of a difference: so small that no other ray meets the surface
 CLOSE = 1e-6  # of the sum of a slope's terms
-MOVED = ("position", "support", "quantity", "volume", "level", "smoothing", "color", "ambient", "eye", "axes", "half_height")
+OF_PARTICLES, OF_CAMERA = ("position", "support", "quantity", "volume"), ("eye", "axes", "half_height")
+MOVED = (*OF_PARTICLES, "level", "smoothing", "color", "ambient", "opacity", *OF_CAMERA)
 
 
 def interior(depth):
@@ -40,7 +41,7 @@ def directions(inputs, rng):
     for name in MOVED:
         zero = list(still(inputs))
         for k, part in enumerate(inputs):
-            if name in vars(part):
+            if getattr(part, name, None) is not None:
                 value = getattr(part, name)
                 size = 1 if name in ("position", "quantity", "eye", "axes") else value
                 move = size * jnp.asarray(rng.normal(size=np.shape(value)))
@@ -50,17 +51,20 @@ def directions(inputs, rng):
 
 
 @pytest.mark.parametrize(
-    ("kernel", "projection", "integrator", "coloured", "fogged"),
+    ("kernel", "projection", "integrator", "coloured", "fogged", "opacity"),
     [
-        ("cubic_spline", "perspective", "samples", True, False),
-        pytest.param("poly6", "orthographic", "segments", False, False, marks=pytest.mark.slow),
-        pytest.param("wendland_c2", "perspective", "samples", False, True, marks=pytest.mark.slow),
+        ("cubic_spline", "perspective", "samples", True, False, None),
+        ("cubic_spline", "perspective", "samples", False, False, 0.6),
+        pytest.param("poly6", "orthographic", "segments", False, False, None, marks=pytest.mark.slow),
+        pytest.param("wendland_c2", "perspective", "samples", False, True, None, marks=pytest.mark.slow),
+        pytest.param("poly6", "orthographic", "segments", True, True, 0.55, marks=pytest.mark.slow),
     ],
 )
-def test_both_modes_are_central_differences(kernel, projection, integrator, coloured, fogged, x64):
+def test_both_modes_are_central_differences(kernel, projection, integrator, coloured, fogged, opacity, x64):
     look = js.TransferFunction.from_points(np.array([-0.5, 0.5]), np.array([[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]]), np.ones(2))
     camera = view_of_ball(projection, dtype=np.float64)
     numbers = {"level": 0.45, "smoothing": 1.1, "color": np.array([0.4, 0.6, 0.8]), "ambient": 0.3}
+    numbers |= {} if opacity is None else {"opacity": opacity}
     surface = js.Surface(**{name: jnp.asarray(value, jnp.float64) for name, value in numbers.items()})
     scene = js.Scene(
         particles=ball(kernel, np.float64),
