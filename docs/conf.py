@@ -41,9 +41,10 @@ napoleon_custom_sections = ["Differentiation"]
 napoleon_use_ivar, napoleon_attr_annotations = True, False
 
 CONTENTS = {
-    "Tutorials": "/notebooks/000_first_image /notebooks/010_your_snapshot /notebooks/100_tolerance /notebooks/200_inverse "
-    "/notebooks/210_jax_ways /notebooks/300_the_trade /notebooks/400_progressive /notebooks/500_points_and_grids "
-    "/notebooks/600_surfaces",
+    "Tutorials": "/notebooks/000_first_image /notebooks/010_your_snapshot /notebooks/020_colours_and_opacity "
+    "/notebooks/030_column_density /notebooks/040_a_movie /notebooks/050_liquids /notebooks/060_figure_with_units "
+    "/notebooks/070_from_pandas_and_yt /notebooks/100_tolerance /notebooks/200_inverse /notebooks/210_jax_ways "
+    "/notebooks/300_the_trade /notebooks/400_progressive /notebooks/500_points_and_grids /notebooks/600_surfaces",
     "How to": "rendering colours selecting projections surfaces volumes points movies viewing error_control python gradients "
     "many_machines",
     "Reference": "api command_line files glossary packaging /CHANGELOG",
