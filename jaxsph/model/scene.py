@@ -200,8 +200,8 @@ def widened(scene: Scene) -> Scene:
     given: dict[str, Any] = {
         name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")
     }
-    if surface.opacity is not None:
-        given["opacity"] = jnp.asarray(surface.opacity, scene.dtype)
+    optional = {name: getattr(surface, name) for name in ("opacity", "light")}
+    given |= {name: jnp.asarray(value, scene.dtype) for name, value in optional.items() if value is not None}
     packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": jnp.ones_like(given["smoothing"])})
     return dataclasses.replace(scene, particles=surface.makers(particles, given["smoothing"]), surface=packed)
 

@@ -21,10 +21,21 @@ from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage", "quantity", "extinction_quantity")
 """What a surface is a level of: see `Surface.of`."""
+ONE_NUMBER, RGB = "give one number", "give red, green and blue"
+SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
+    "level": ((), ONE_NUMBER),
+    "smoothing": ((), ONE_NUMBER),
+    "color": ((3,), RGB),
+    "ambient": ((), ONE_NUMBER),
+    "opacity": ((), ONE_NUMBER),
+    "light": ((3,), "give x, y and z of a direction"),
+}
+SHARES = "color", "ambient", "opacity"
 NOT_ZERO = {
     "level": "coverage is 0 away from a fluid",
     "smoothing": "1 takes supports as given",
     "opacity": "what lets all light through is not seen",
+    "light": "a direction has a length",
 }
 MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
@@ -60,9 +71,12 @@ class Surface:
         ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
         opacity: of each layer that a ray crosses, in (0, 1], such that what lies behind shines through: other layers, media,
             points; None is opaque, and faster.
+        light: (3,) direction to a light far away, in the axes of positions, of any length; of a surface that faces it less than
+            that the brightness falls with the cosine, on the side that is seen, and there are no shadows. None is at the eye.
 
     Raises:
-        ValueError: a level or a smoothing that is not > 0 and finite, another field, a colour or a share outside of [0, 1].
+        ValueError: a level, a smoothing or an opacity that is not > 0 and finite, another field, a colour or a share outside of
+            [0, 1], a direction without length.
     """
 
     level: Any = 0.5
@@ -71,21 +85,23 @@ class Surface:
     color: Any = COLOR
     ambient: Any = AMBIENT
     opacity: Any = None
+    light: Any = None
 
     def __post_init__(self) -> None:
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
-        shapes: dict[str, tuple[int, ...]] = {"level": (), "smoothing": (), "color": (3,), "ambient": ()}
-        for name, shape in (shapes if self.opacity is None else shapes | {"opacity": ()}).items():
+        for name, (shape, remedy) in SHAPES.items():
             value = getattr(self, name)
-            require_shape(name, value, shape, "give red, green and blue" if shape else "give one number")
+            if value is None and name in ("opacity", "light"):
+                continue
+            require_shape(name, value, shape, remedy)
             if is_traced(value):
                 continue
             number = np.asarray(value, np.float64)
             require_finite(name, number, "give a finite number")
             if name in NOT_ZERO:
-                require_positive(name, number, NOT_ZERO[name])
-            if name not in ("level", "smoothing") and not ((number >= 0) & (number <= 1)).all():
+                require_positive(name, np.abs(number).max() if name == "light" else number, NOT_ZERO[name])
+            if name in SHARES and not ((number >= 0) & (number <= 1)).all():
                 raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
 
     def check(self, particles: Particles) -> None:

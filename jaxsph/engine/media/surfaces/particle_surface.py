@@ -106,13 +106,15 @@ class ParticleSurface(Medium):
     def seen(
         cls, surface: Surface, particles: Particles, viewed: Viewed, transfer: TransferFunction | None, clip: Clip | None
     ) -> ParticleSurface:
-        """Of particles as a camera sees them, with supports that are widened already."""
+        """Of particles as a camera sees them, with supports that are widened already; its light in view space."""
         dtype = viewed.x.dtype
         level, color, ambient = (jnp.asarray(one, dtype) for one in (surface.level, surface.color, surface.ambient))
         usable = (level > 0) & jnp.isfinite(level) & jnp.isfinite(color).all() & jnp.isfinite(ambient)
+        usable &= True if surface.light is None else jnp.isfinite(surface.light).all()
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         fault = faults.raised(faults.BAD_SURFACE, ~usable)
-        look = SurfaceLook(color, ambient, segments)
+        light = None if surface.light is None else surface.light.astype(dtype)
+        look = SurfaceLook(color, ambient, segments, light)
         return cls(weight_of(level, particles, viewed.live), look, clip, fault, particles.kernel)
 
     def in_band(self, grid: Grid) -> ParticleSurface:

@@ -52,11 +52,13 @@ class SurfaceLook:
         color: red, green and blue where no transfer function colours it.
         ambient: share of the light that it has where it is seen edge on.
         segments: of the transfer function that colours it; None without one.
+        light: x, y and z in view space of a vector of unit length towards the light; None for one at the eye.
     """
 
     color: Float[Array, "3"]
     ambient: Float[Array, ""]
     segments: Segments | None
+    light: Float[Array, "3"] | None = None
 
     def shade(self, found: Found, ray: Vectors, reference: Float[Array, "tasks 1"]) -> tuple[Vectors, Vectors]:
         """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope.
@@ -69,7 +71,7 @@ class SurfaceLook:
         gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
         square = gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2
         normal = [-of * lax.rsqrt(jnp.where(square > 0, square, 1)) for of in gradient]
-        light = headlight(normal, ray, self.ambient)
+        light = headlight(normal, ray, self.ambient, self.light)
         return [color * light for color in self._colors(found, reference)], normal
 
     def _colors(self, found: Found, reference: Float[Array, "tasks 1"]) -> list[Float[Array, "..."]]:

@@ -68,6 +68,18 @@ def test_a_ball_is_in_its_place_without_holes_and_lit_by_its_gradient(projection
     assert image.stats["evaluations"] > 0
 
 
+@pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
+def test_a_light_far_away_lights_the_side_that_is_seen_by_the_cosine(projection):
+    light = np.array([0.3, 2.0, -1.0])
+    surface = js.Surface(0.45, color=(0.8, 0.6, 0.4), ambient=AMBIENT, light=light)
+    image, truth, both = check(js.Scene(particles=ball(), surface=surface), camera(projection))
+    towards = camera(projection).axes @ (light / np.linalg.norm(light))
+    cosine = np.maximum(truth.normal @ np.asarray(towards), 0)  # from outside, the normal faces the eye
+    wanted = (AMBIENT + (1 - AMBIENT) * cosine)[..., None] * np.array([0.8, 0.6, 0.4])
+    np.testing.assert_allclose(np.asarray(image.color)[both], wanted[both], atol=1e-3)
+    assert (cosine[both] == 0).any() and cosine[both].max() > 0.9
+
+
 def test_in_double_precision_depths_are_good_to_many_digits(x64):
     scene = js.Scene(particles=ball(dtype=np.float64), surface=js.Surface(0.45))
     view = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera())
