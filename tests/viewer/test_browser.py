@@ -264,6 +264,14 @@ def test_a_picture_is_saved_and_the_address_holds_the_view(page, browser):
     assert json.loads(page.ask("decodeURIComponent(location.hash.slice(1)) || '{}'")) is not None
 
 
+def test_where_there_is_little_width_the_panel_is_below_the_picture(page):
+    """Of a window, or of a cell of a notebook in a window that has more."""
+    direction = "getComputedStyle(document.querySelector('.whole')).flexDirection"
+    assert page.ask(direction) == "row"
+    page.ask("document.body.style.width = '400px'")
+    page.until(f"{direction} === 'column' && document.querySelector('.picture').clientWidth > 390")
+
+
 def luminance(color):
     red, green, blue = (
         part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in (one / 255 for one in color)

@@ -116,6 +116,12 @@ def test_the_modules_are_one_module_that_shows_pictures(widget, tmp_path):
         page.until("document.querySelector('.chip').textContent !== '…'")
         assert page.ask("sent.map((m) => m.do)") == ["hello", "seen"]
         assert page.ask("document.querySelectorAll('.editor .point').length") == 4
+        page.ask("window.keys = [], document.addEventListener('keydown', (event) => { keys.push(event.key); })")
+        for selector in (".picture", ".editor .point", ".panel button", ".panel select"):
+            page.ask(f"document.querySelector({selector!r}).focus()")
+            page.key("d", text="d")  # twice deletes a cell of a notebook
+            page.key("s", modifiers=2)
+        assert page.ask("keys") == ["s"] * 4  # with Ctrl it is the notebook's
     finally:
         browser.close()
 

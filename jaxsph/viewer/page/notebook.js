@@ -10,6 +10,9 @@ export function render({ model, el }) {
   };
   model.on("msg:custom", receive);
   el.classList.add("inside");
+  el.addEventListener("keydown", (event) => { // a notebook takes letters for commands, such as to delete a cell
+    if (!event.ctrlKey && !event.metaKey && !event.altKey) event.stopPropagation();
+  });
   mount(el, { files: false, on: (one) => heard.push(one), send: (message) => model.send(message) });
   model.send({ do: "hello" });
   return () => model.off("msg:custom", receive);
