@@ -8,12 +8,11 @@ its middle, right and down.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
 
-from jaxsph.viewer.control_points import ControlPoints, Point, Steps
+from jaxsph.viewer.control_points import NORMS, ControlPoints, Point, Steps
 from jaxsph.viewer.pose import Pose
 
 MAX_SHARE, MAX_FACTOR, MAX_DEGREES = 100.0, 100.0, 3600.0
@@ -73,6 +72,7 @@ MOTIONS: dict[str, Callable[[Pose, dict[str, Any]], Pose]] = {
 
 
 def _points(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
+    look = look.normed(word(said, "norm", NORMS)) if "norm" in said else look
     return look.edited(points_of(said))
 
 
@@ -87,7 +87,8 @@ EDITS: dict[str, Callable[[ControlPoints, dict[str, Any]], ControlPoints]] = {
     "points": _points,
     "colormap": _colormap,
     "exposure": lambda look, said: look.exposed(number(said, "stops", -10, 10)),
-    "reset_look": lambda look, said: dataclasses.replace(look, points=None),
+    "norm": lambda look, said: look.normed(word(said, "name", NORMS)),
+    "reset_look": lambda look, said: look.as_given(),
 }
 """What changes the look."""
 

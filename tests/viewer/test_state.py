@@ -49,6 +49,77 @@ def test_a_view_is_restored_whole_or_not_at_all(state, points):
         np.testing.assert_allclose(state.told()["pose"][name], vector, atol=1e-6)
 
 
+def spread(norm="linear", points=16):
+    """A view of densities over decades, as a map of 16 colours shows them by a norm."""
+    scene, camera = js.scenes.load("radial", 60, width=12, height=8)
+    values = np.geomspace(1e-3, 1e3, 60).astype(np.float32)
+    particles = dataclasses.replace(scene.particles, quantity=scene.particles.quantity.at[:60].set(values))
+    laid = js.TransferFunction.control_values(norm, values, points=points, **ENDS.get(norm, {"low": 0.01, "high": 100.0}))
+    transfer = js.TransferFunction.from_colormap("viridis", laid, np.linspace(1, 3, points))
+    return State(dataclasses.replace(scene, particles=particles, transfer=transfer), camera)
+
+
+ENDS = {"percentile": {}}
+NORMS = ["linear", "log", "symlog", "percentile", "equalised"]
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_a_norm_lays_points_where_the_library_lays_them_and_is_undone(norm):
+    state, asked = spread(), spread(norm)
+    before = state.transfer
+    state.do({"do": "norm", "name": norm}, nowhere)
+    for name in ("values", "colors", "extinction"):
+        wanted = np.asarray(getattr(asked.transfer, name))[:16]
+        np.testing.assert_allclose(np.asarray(getattr(state.transfer, name))[:16], wanted, rtol=1e-5, atol=1e-6)
+    assert state.told()["look"]["norm"] == norm
+    state.do({"do": "undo"}, nowhere)
+    assert state.told()["look"]["norm"] == "given"
+    np.testing.assert_array_equal(np.asarray(state.transfer.values), np.asarray(before.values))
+
+
+@pytest.mark.parametrize("norm", ["log", "symlog", "equalised"])
+def test_what_is_shown_as_a_line_is_one_at_even_places_of_the_axis_of_the_norm(norm):
+    state = spread(points=3)
+    state.do({"do": "norm", "name": norm}, nowhere)
+    state.do({"do": "points", "points": [[0.1, 1, 0, 0, 0], [0.9, 3, 1, 0.5, 0]]}, nowhere)
+    place = np.linspace(0, 1, 16)[2:-2]
+    color, extinction = state.transfer(np.float32(state.scale.value(place)))
+    np.testing.assert_allclose(np.asarray(color)[:, 0], (place - 0.1) / 0.8, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(extinction), 1 + 2 * (place - 0.1) / 0.8, atol=3e-6)
+    assert len(state.told()["look"]["points"]) == 2
+
+
+def test_a_norm_that_values_do_not_have_is_refused_and_a_log_of_some_begins_at_the_least_that_has_one(state):
+    for values, least in ((-np.ones(60), None), (np.linspace(-1, 2, 60), 0.0)):
+        scene, camera = js.scenes.load("radial", 60, width=12, height=8)
+        particles = dataclasses.replace(scene.particles, quantity=scene.particles.quantity.at[:60].set(values))
+        transfer = js.TransferFunction.from_colormap("viridis", [-2.0, 2.0 if least == 0 else -0.5])
+        here = State(dataclasses.replace(scene, particles=particles, transfer=transfer), camera)
+        if least is None:
+            with pytest.raises(ValueError, match="log"):
+                here.do({"do": "norm", "name": "log"}, nowhere)
+            assert not here.edited and here.told()["look"]["norm"] == "given"
+        else:
+            here.do({"do": "norm", "name": "log"}, nowhere)
+            assert float(here.transfer.values[0]) > least and float(here.transfer.values.max()) == pytest.approx(2)
+    with pytest.raises(InputError, match="must be one of given, linear, log"):
+        state.do({"do": "norm", "name": "cubic"}, nowhere)
+
+
+def test_a_norm_is_restored_with_its_points_or_neither():
+    there, here = spread(), spread()
+    there.do({"do": "norm", "name": "equalised"}, nowhere)
+    told = json.loads(json.dumps(there.told()))
+    rows = [row[:5] for row in told["look"]["points"]]
+    with pytest.raises(InputError):
+        here.do({"do": "restore", "pose": told["pose"], "points": [[0.5, -1, 0, 0, 0]], "norm": "equalised"}, nowhere)
+    assert not here.edited and here.told()["look"]["norm"] == "given"
+    here.do({"do": "restore", "pose": told["pose"], "points": rows, "norm": "equalised"}, nowhere)
+    np.testing.assert_array_equal(np.asarray(here.transfer.values), np.asarray(there.transfer.values))
+    here.do({"do": "reset_look"}, nowhere)
+    assert not here.edited and here.told()["look"]["norm"] == "given"
+
+
 def test_the_middle_is_what_is_seen_there(state):
     state.do({"do": "center", "right": 0.1, "down": 0.1}, lambda message: np.array([0.25, 0.5, 0.125]))
     np.testing.assert_allclose(state.pose.target, (0.25, 0.5, 0.125))
