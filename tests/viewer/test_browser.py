@@ -306,6 +306,11 @@ def test_where_there_is_little_width_the_panel_is_below_the_picture(page):
     assert page.ask(direction) == "row"
     page.ask("document.body.style.width = '400px'")
     page.until(f"{direction} === 'column' && document.querySelector('.picture').clientWidth > 390")
+    longest = "256 x 192, 64 samples a ray; error not estimated; 737,280 rays left, and 134,312 particles · 135 ms"
+    for width in (400, 700, 1000):  # words that come and go leave the picture where it is
+        page.ask(f"document.body.style.width = '{width}px'")
+        write = "(document.querySelector('.words').textContent = {!r}, document.querySelector('.picture').clientHeight)"
+        assert page.ask(write.format(longest)) == page.ask(write.format("full"))
 
 
 def luminance(color):
