@@ -21,7 +21,7 @@ PACKAGE = ROOT / "jaxsph"
 MAX_LINES = 60  # of a function
 MAX_FILES = 8  # of the package on the stack at once, arithmetic apart
 # Ceilings that come down as the house is put in order, and go up by what a new capability takes; behind them what they are to be.
-MAX_ALL_LINES = 48_200  # of the package: 33,500
+MAX_ALL_LINES = 48_900  # of the package: 33,500
 MAX_NAMES = 40  # that `jaxsph` has for its users
 MAX_PARAMETERS = 10  # of a function
 MAX_ENTRIES = 16  # of a folder, modules and folders
