@@ -28,6 +28,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics import short
 from jaxsph.numerics.checks import require_shape
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.labelled import PLANE, dataset, places
@@ -52,6 +53,9 @@ class Slice:
     camera: Camera
     metadata: tuple[tuple[str, Any], ...] = ()
     length_unit: str = ""
+
+    def __repr__(self) -> str:
+        return short.line("Slice", short.kind(self.values), f"values {short.span(self.values)}")
 
     @property
     def pixel_size(self) -> float:

@@ -16,6 +16,7 @@ from jaxsph.model.image import png_of
 from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
+from jaxsph.numerics import short
 from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
@@ -55,6 +56,10 @@ class Projection:
 
     writer = Method()
     """How projections become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
+
+    def __repr__(self) -> str:
+        told = f"{self.name} {short.span(self.values)} {self.unit}".rstrip()
+        return short.line("Projection", short.kind(self.values), told, f"faults {short.span(self.faults)}")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -24,6 +24,7 @@ from jaxsph.engine.render import render
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.scene_linear import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.numerics import short
 from jaxsph.numerics.version import __version__
 
 Source = Scene | Callable[[], Scene]
@@ -99,6 +100,10 @@ class FrameFile:
     rendered: bool
     stats: dict[str, Any]
     error: str | None = None
+
+    def __repr__(self) -> str:
+        how = self.error or ("rendered" if self.rendered else "there already")
+        return short.line("FrameFile", f"{self.number}", f"{self.path}", how)
 
 
 class FramesError(ValueError):

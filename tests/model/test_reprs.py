@@ -1,12 +1,15 @@
 """Promises of `repr`: one line with counts and ranges, of whatever is in the leaves."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.model.projection import Projection
+from jaxsph.sequence.task import FrameFile
 
 POSITION = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 PARTICLES = js.Particles.from_arrays(POSITION, [0.5, 0.5, 1.0], [1.0, 2.0, 4.0])
@@ -15,6 +18,7 @@ POINTS = js.Points.from_arrays(POSITION, 0.25, extinction=2.0, spread="feet")
 VOLUME = js.Volume.from_array(np.arange(24.0).reshape(2, 3, 4), spacing=0.5)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=8, height=6, near=2, far=6)
 PLANE = np.zeros((6, 8), np.float32)
+COLUMNS = Projection(PLANE + 0.5, None, np.float32(0.1), False, 0, "density", "g/cm**2")
 IMAGE = js.Image(np.zeros((6, 8, 3), np.float32), PLANE + 1, PLANE, PLANE + 0.25, PLANE, True, 0, {})
 
 LINES = {
@@ -27,6 +31,7 @@ LINES = {
     "Volume(float32[2,3,4], values 0 to 23, from (0, 0, 0), spacing (0.5, 0.5, 0.5))": VOLUME,
     "Camera(perspective, 8 x 6, eye (0, 0, 4), forward (0, 0, -1), fov 45 degrees, near 2, far 6)": CAMERA,
     "Image(8 x 6, transmittance 1, error 0.25, certified, faults 0)": IMAGE,
+    "Projection(float32[6,8], density 0.5 g/cm**2, faults 0)": COLUMNS,
     f"Scene(particles={PARTICLES!r}, transfer={LOOK!r})": js.Scene(PARTICLES, LOOK),
     f"Scene(volume={VOLUME!r}, volume_transfer={LOOK!r}, mix='opacity')": js.Scene(
         volume=VOLUME, volume_transfer=LOOK, mix="opacity"
@@ -52,6 +57,15 @@ def test_whatever_is_in_the_leaves_there_is_a_line(of):
 def test_a_plan_is_told_in_a_line():
     plan = js.plan(js.Scene(PARTICLES, LOOK), CAMERA, js.Settings(samples=8))
     assert repr(plan).startswith("Plan(8 x 6 of 8 samples, 3 particles, ") and repr(plan).endswith(" MB)")
+
+
+def test_a_slice_and_a_frame_are_told_in_a_line():
+    assert repr(js.slice(PARTICLES, js.Plane((0, 0, 0), (0, 0, 1)), width=8, height=6)).startswith(
+        "Slice(float32[6,8], values 1 to "
+    )
+    frame = FrameFile(3, Path("out/0003.png"), True, {"seconds": {"cast": 0.1}})
+    assert repr(frame) == "FrameFile(3, out/0003.png, rendered)"
+    assert repr(dataclasses.replace(frame, rendered=False)).endswith("there already)")
 
 
 def test_particles_have_a_length():

@@ -111,7 +111,7 @@ def nearest_neighbour_supports(
 
 def kernel_sum(
     position: Float[np.ndarray, "particles 3"],
-    support: Float[np.ndarray, " particles"],
+    support: Float[np.ndarray, " particles"] | float,
     weight: Float[np.ndarray, " particles"] | None = None,
     *,
     kernel: str = "poly6",
@@ -125,7 +125,7 @@ def kernel_sum(
 
     Args:
         position: (N, 3); distances are computed in float64.
-        support: (N,) support radii $H > 0$, same unit as `position`.
+        support: (N,) support radii $H > 0$, or one of all, same unit as `position`.
         weight: (N,) weights $w$; `None` means 1.
         kernel: name of a kernel of `jaxsph.model.particles.kernels`.
         box: sides of a periodic box, across whose faces sums go, to the nearest image of each particle; None for none.
@@ -139,7 +139,7 @@ def kernel_sum(
     """
     chosen = kernels.by_name(kernel)
     position = in_period(position, box)
-    support = np.asarray(support, dtype=np.float64)
+    support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(position))
     if len(position) == 0:
         return np.zeros(0)
     places, place_of = _distinct(position)

@@ -69,7 +69,7 @@ def test_the_volume_is_mass_over_density_where_both_are_there():
 def test_the_volume_is_the_inverse_kernel_sum_where_density_is_missing_or_not_positive():
     for columns in ({}, {"mass": density}, {"mass": density, "density": np.append(density[1:], 0)}):
         particles, report = io.particles_from_table(ParticleTable(position, columns), "x", 0.5, "cubic_spline")
-        expected = 1 / io.kernel_sum(position, np.full(50, 0.5), kernel="cubic_spline")
+        expected = 1 / io.kernel_sum(position, 0.5, kernel="cubic_spline")
         np.testing.assert_allclose(there(particles.volume), expected, rtol=1e-5)
         assert report.volume.startswith("1 / sum of kernels")
 
