@@ -35,6 +35,7 @@ from jaxsph.numerics.trees import tree
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
 STEPS, FIRST = 64, 2  # of false position, at most, and those after which most rays are done
 ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step of Newton's squares that
+CLOSE = 2.0**7  # eps of the level that the field is off at a root: some times what sums over particles are rounded by
 NOWHERE = -1.0  # number of no interval
 
 
@@ -264,13 +265,24 @@ def _wanted(rays: Piercing, border: Array, weight: Array, level: Array, cut: Cut
     return _Wanted(intervals | enters | leaves, place, enters | leaves)
 
 
-def narrowed(rays_of: Callable[[SlabTask], Piercing], task: SlabTask, bracket: Bracket, level: Float[Array, ""]) -> Bracket:
+def narrowed(
+    rays_of: Callable[[SlabTask], Piercing],
+    task: SlabTask,
+    bracket: Bracket,
+    level: Float[Array, ""],
+    active: Bool[Array, "tasks rays"] | None = None,
+) -> Bracket:
     """Brackets of the rays that cross by false position: Newton's step from their secant is to some roundings of a root.
 
     It is the Illinois form (Dahlquist & Bjoerck 1974, section 6.2): an end that stays twice weighs half. Most rays take two
     steps; slabs with one that takes more are looked at again.
+
+    Args:
+        active: rays that go on until the secant is the root, `CLOSE`, as those do that graze the surface: where the field has
+            hardly a slope, Newton's step leads away. None is all, for that step.
     """
-    enough = level * float(jnp.finfo(level.dtype).eps) ** ENOUGH
+    eps = float(jnp.finfo(level.dtype).eps)
+    enough = level * (eps**ENOUGH if active is None else CLOSE * eps)
 
     def narrow(search: _Search, most: int) -> _Search:
         def of_some(items: Array, some: SlabTask, all_rays: _Search) -> _Search:
@@ -286,7 +298,7 @@ def narrowed(rays_of: Callable[[SlabTask], Piercing], task: SlabTask, bracket: B
 
         return over_groups(of_some, search, task, ~search.active[:, None])
 
-    found = _Search(bracket, jnp.zeros(bracket.low.shape, jnp.int32), bracket.met)
+    found = _Search(bracket, jnp.zeros(bracket.low.shape, jnp.int32), bracket.met if active is None else active)
     for most in (FIRST, STEPS - FIRST):
         found = narrow(found, most)
     return found.ends

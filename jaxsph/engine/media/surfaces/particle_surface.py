@@ -3,7 +3,7 @@ r"""The surface of particles as a medium: opaque where a ray first crosses a lev
 Flow: grid, schedule -> [particle_surface: borders -> crossing -> root -> light] -> integrator.
 
 **Where a ray crosses** is found by `field.crossing`, slab by slab, and followed by a step of Newton's (`root`) to some
-roundings of a support.
+roundings of a support. Slabs with a ray that this leaves farther off, as it grazes the surface, are looked at again.
 
 **What is found, and what may be missed.** All that crosses the level an odd number of times between neighbouring borders. Of
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
@@ -17,6 +17,7 @@ A clip's face is such a place, too, in the intervals that it cuts: what is thin 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
-from jaxsph.engine.field.crossing import Bracket, Cut, first_crossings, narrowed
+from jaxsph.engine.field.crossing import CLOSE, Bracket, Cut, first_crossings, narrowed
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
 from jaxsph.engine.field.scattered import gather_scattered
@@ -153,15 +154,19 @@ class ParticleSurface(Medium):
         bracket = narrowed(still.rays, there, bracket, still.level)
         tasks, rays = bracket.low.shape
 
-        def look(items: Array, some: SlabTask, found: Array) -> Array:
-            here, moving = rows_of(bracket, items), self.rays(some)
-            root = root_near(moving, here.secant(), (here.low, here.high), self.level)
+        def look(between: Bracket, asked: Array, steps: bool, items: Array, some: SlabTask, found: Array) -> Array:
+            (here, there, old), moving = rows_of((between, asked, found), items), self.rays(some)
+            root = root_near(moving, here.secant(), (here.low, here.high), self.level, steps)
             colors, normal = self.look.shade(root.found, moving.ray(), some.entry.references[0][:, None])
-            rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal], 1)
-            return with_rows(found, items, jnp.where(here.met[:, None], rows, 0))
+            rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal, root.found.weight - self.level], 1)
+            return with_rows(found, items, jnp.where(there[:, None], rows, old))
 
-        found = over_groups(look, jnp.zeros((tasks, 7, rays), bracket.low.dtype), on_borders, ~bracket.met[:, None])
-        return Place(jnp.where(bracket.met, found[:, 0], jnp.inf), found[:, 1:4], found[:, 4:])
+        nothing = jnp.zeros((tasks, 8, rays), bracket.low.dtype)
+        found = over_groups(functools.partial(look, bracket, bracket.met, True), nothing, on_borders, ~bracket.met[:, None])
+        off = jnp.abs(lax.stop_gradient(found[:, 7])) > CLOSE * float(jnp.finfo(nothing.dtype).eps) * still.level
+        bracket = narrowed(still.rays, there, bracket, still.level, off)
+        found = over_groups(functools.partial(look, bracket, off, False), found, on_borders, ~off[:, None])
+        return Place(jnp.where(bracket.met, found[:, 0], jnp.inf), found[:, 1:4], found[:, 4:7])
 
     def cut(self) -> Cut | None:
         """The clip, as the search asks for it."""

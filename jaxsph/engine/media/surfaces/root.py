@@ -87,20 +87,24 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
     return found.gradient[0] * ray[0] + found.gradient[1] * ray[1] + found.gradient[2] * ray[2]
 
 
-def root_near(rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""]) -> Root:
+def root_near(
+    rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""], steps: bool = True
+) -> Root:
     """The root that a place is near to, by a step of Newton's, which has the derivatives; and what is found there.
 
     Args:
         between: where it lies, relative to the middle of the slab as places are.
+        steps: whether the step is made; else the place is the root, and has the derivatives alone.
 
     Differentiation:
         By the particles, the rays and the level, as of an implicit function; `place` and `between` have none.
     """
     low, high = lax.stop_gradient(between)
-    here = rays.found(lax.stop_gradient(place))
+    given = lax.stop_gradient(place)
+    here = rays.found(given)
     slope = lax.stop_gradient(slope_along(here, rays.ray()))
-    place = lax.stop_gradient(place) + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
-    place = place + lax.stop_gradient(clamped(place, low, high) - place)
+    place = given + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
+    place = place + lax.stop_gradient((clamped(place, low, high) if steps else given) - place)
     return Root(place, rays.found(place))
 
 
