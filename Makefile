@@ -47,7 +47,7 @@ COMPILED ?= $(VENV)/compiled-tests
 SUITE = compiled=$$($(VENV)/bin/python tests/shared/kept_programs.py $(COMPILED) $(JOBS)) && $(SHARE_COMPILED)=$$compiled \
 	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal
 # Programs that the whole suite may compile: new tests use the shapes of others. Other numbers of processes share fewer or more.
-MOST_PROGRAMS ?= 2100
+MOST_PROGRAMS ?= 2200
 ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--most-programs=$(MOST_PROGRAMS)))
 
 check: lint

@@ -19,7 +19,7 @@ from jaxsph.reference.where import inside, to_world
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 LEVEL, OPACITY, AMBIENT, COLOR = 0.45, 0.35, 0.2, np.array([0.9, 0.6, 0.3])
-SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=10)
+SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)  # of `test_particle_surface`, whose programs these share
 PLACES = 2000  # of each ray
 GRAZED = 3e-3  # of the level: a field that turns so near to it may be on either side
 
@@ -37,7 +37,7 @@ def scene(**more):
 
 
 def camera(projection="perspective"):
-    return view_of_ball(projection, 14, 12)
+    return view_of_ball(projection, 16, 14)
 
 
 def layers(scene, camera):
@@ -88,12 +88,12 @@ def test_every_crossing_is_a_layer(projection, settings, within):
 
 def test_droplets_between_samples_are_two_layers_each():
     """Three particles behind one another, each of which a ray enters and leaves between two samples."""
-    position = np.array([[0.0, 0.0, z] for z in (-0.5, 0.02, 0.31)])
-    drops = js.Particles.from_arrays(position, 0.05, np.zeros(3), 1e-4)
-    shown = js.Scene(particles=drops, surface=js.Surface(0.3, opacity=0.25))
-    view = js.Camera.orthographic((0.0, 0.0, -2.0), (0.0, 0.0, 0.0), width=3, height=3, view_height=0.03, near=1.0, far=3.0)
-    image = js.render(shown, view, COARSE)
-    np.testing.assert_allclose(np.asarray(image.transmittance)[1, 1], 0.75**6, rtol=1e-5)
+    view = camera()
+    rays = rays_of(view, np.array([6]), np.array([9]))
+    position = to_world(rays.start + np.array([[1.7], [2.02], [2.31]]) * rays.direction, view)
+    drops = js.Particles.from_arrays(position, 0.1, np.zeros(3), 2e-4).padded(12)
+    image = js.render(js.Scene(particles=drops, surface=js.Surface(0.3, opacity=0.25)), view, COARSE)
+    np.testing.assert_allclose(np.asarray(image.transmittance)[6, 9], 0.75**6, rtol=1e-5)
 
 
 def test_one_opacity_of_one_is_the_opaque_surface_and_a_number_changes_without_compiling():
