@@ -142,18 +142,16 @@ def half_constant(frames, kernel, projection, dtype):
     factor=st.sampled_from([2.0, 6.0]),
     spread=st.sampled_from([0.0, 1e-3, 0.03]),
 )
-def test_a_smaller_tolerance_never_spends_less_and_more_relaxation_never_more(frames, data, relax, factor, spread):
+def test_a_smaller_tolerance_never_spends_less(frames, data, relax, factor, spread):
     frames = frames.deep(4)
     scene, camera = wide(data.draw(scenes("poly6", np.float32)), factor, spread), data.draw(cameras(frames, dtype=np.float32))
 
-    def spent(tolerance, relax):
+    def spent(tolerance):
         asked = asking(frames, tolerance, "budget", relax=relax)
         return np.asarray(js.render(scene, camera, asked, plan=with_control(frames, "budget")).evaluations)
 
-    work = [spent(tolerance, relax) for tolerance in (1e-5, 1e-3, 0.1)]
+    work = [spent(tolerance) for tolerance in (1e-5, 1e-3, 0.1)]
     assert all((more >= less).all() for more, less in itertools.pairwise(work))
-    relaxed = [spent(1e-2, share).sum() for share in (0.0, 1.0)]
-    assert relaxed[0] >= relaxed[1]
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-46, 1e-12])
