@@ -98,7 +98,8 @@ class Slice:
         Raises:
             ImportError: xarray is not installed.
         """
-        where = places(self.values.shape, self.pixel_size, self._middle, self.length_unit)
+        height, width = self.values.shape
+        where = places((height, width), self.pixel_size, self._middle, self.length_unit)
         return dataset({"values": (PLANE, self.values)}, where, self.metadata)
 
     @property

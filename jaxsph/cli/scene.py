@@ -161,7 +161,7 @@ def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     if getattr(options, "surface_of", None) is not None:
-        refuse(options, ("opacity_by",), "and --surface-of exclude each other, as a surface is opaque")
+        refuse(options, ("opacity_by",), "and --surface-of exclude each other, as a surface has no extinction")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, options)
     if not opacity:

@@ -39,8 +39,8 @@ class OfPlaces(NamedTuple):
 
 
 Stops = tuple[Array, Array, Array, Array]
-"""Where rays end at something opaque: view depths, infinite where they do not; and x, y and z of its normal in view space, of
-unit length and out of it, 0 where there is none."""
+"""Where rays first meet a surface: view depths, infinite where they do not; and x, y and z of its normal in view space, of unit
+length and out of it, 0 where there is none. One that is opaque ends them."""
 
 
 class Medium(abc.ABC):
@@ -52,7 +52,7 @@ class Medium(abc.ABC):
         at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
-        stops_rays: whether `stops` tells where rays end at something opaque, behind which nothing is marched.
+        stops_rays: whether `stops` tells where rays meet a surface; behind one that is opaque nothing is marched.
         in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
             part of an interval.
     """
@@ -146,7 +146,7 @@ class Medium(abc.ABC):
         return jnp.zeros(task.shape[::2], task.depth.dtype)
 
     def stops(self, gathered: Any, task: Any) -> Stops:
-        """Where rays end in slabs, (tasks, rays) each; of media that `stops_rays`.
+        """Where rays first meet a surface in slabs, (tasks, rays) each; of media that `stops_rays`.
 
         There lies the half depth of rays that arrive with more, exactly and not to within a sample.
         """

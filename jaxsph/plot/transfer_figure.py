@@ -133,14 +133,14 @@ def _draw_histogram(upper: Any, axis: Axis, found: VisibilityHistogram) -> None:
     upper.bar(edges[:-1], absorbed, np.diff(edges), align="edge", color=colors, edgecolor=DARK, linewidth=0.3)
     upper.stairs(there, edges, color=GRAY, linewidth=1.3, label="there: path length")
     upper.set_ylabel("share")
-    upper.set_ylim(0, 1.08 * max(absorbed.max(), there.max(), np.finfo(float).tiny))
+    upper.set_ylim(0, 1.08 * max(float(absorbed.max()), float(there.max()), float(np.finfo(float).tiny)))
 
 
 def _draw_extinction(right: Any, axis: Axis, low: float, high: float) -> None:
     shown = np.union1d(_places(axis, low, high), axis.shown(np.asarray(axis.transfer.values)))
     extinction = look_up(axis.transfer, axis.quantity(shown))[1]
     right.plot(shown, extinction, color=DARK, linewidth=1.6, label="extinction")
-    right.set_ylim(0, 1.08 * max(float(extinction.max()), np.finfo(float).tiny))
+    right.set_ylim(0, 1.08 * max(float(extinction.max()), float(np.finfo(float).tiny)))
     right.set_ylabel("extinction, per length unit")
     right.tick_params(axis="x", labelbottom=False)
 

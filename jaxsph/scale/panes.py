@@ -194,7 +194,8 @@ class Crowd:
             tiles.append((len(high) - 1 - last, len(high) - 1 - first) if descending else (first, last))
             kept &= first <= last
         (top, bottom), (left, right) = ([side[kept] for side in ends] for ends in tiles)
-        self.of_tiles += _boxes(Sides(left, right, top, bottom), self.of_tiles.shape)
+        rows, columns = self.of_tiles.shape
+        self.of_tiles += _boxes(Sides(left, right, top, bottom), (rows, columns))
         nothing = np.zeros_like(top)
         self.of_rows += _boxes(Sides(nothing, nothing, top, bottom), (len(self.of_rows), 1))[:, 0]
 

@@ -55,7 +55,7 @@ def surface_figure(made: Any, quantity: str, title: str) -> Any:
     upper.plot(made.depth, made.coverage, color=DARK, linewidth=1.2)
     upper.axhline(made.level, color=RED, linewidth=0.8, label=f"level {made.level:g}")
     lower.plot(made.depth, made.quantity, color=BLUE, linewidth=1.2)
-    for axes, label in ((upper, "coverage"), (lower, quantity)):
+    for axes, label in ((upper, made.field), (lower, quantity)):
         axes.set_ylabel(label)
         if np.isfinite(made.surface_depth):
             axes.axvline(made.surface_depth, color=GRAY, linewidth=0.8, linestyle=":", label="surface")
@@ -64,7 +64,9 @@ def surface_figure(made: Any, quantity: str, title: str) -> Any:
     lower.set_xlim(made.depth[0], made.depth[-1])
     most = np.argsort(-made.shares, kind="stable")[:PARTICLES]
     shares = [(f"{made.particles[which]}", float(made.shares[which])) for which in most]
-    told = f"{len(made.particles):,} particles reach the surface;\nof its coverage these have most" if shares else "no surface"
+    told = (
+        f"{len(made.particles):,} particles reach the surface;\nof its {made.field} these have most" if shares else "no surface"
+    )
     _draw_bars(right.subplots(), told, shares, PARTICLES)
     return figure
 

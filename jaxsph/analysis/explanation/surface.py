@@ -40,7 +40,8 @@ class SurfaceExplanation:
     Attributes:
         pixel: row and column.
         color, alpha: of the pixel, as rendered, with all that is in the scene.
-        level: of the coverage, where the surface is.
+        field: what the surface is a level of, for people; `coverage` is that field.
+        level: of it, where the surface is.
         surface_depth: view depth of the surface, as rendered; infinite where the ray does not meet it.
         position: of that place in space; NaN without one.
         normal: of unit length, out of the fluid, in the axes of positions; 0 without one.
@@ -74,6 +75,7 @@ class SurfaceExplanation:
     sources: dict[str, float] = dataclasses.field(default_factory=dict)
     total: float = float("nan")
     certified: bool = False
+    field: str = "coverage"
 
     def __repr__(self) -> str:
         where = f"surface at depth {self.surface_depth:.4g}" if np.isfinite(self.surface_depth) else "no surface"
@@ -173,4 +175,5 @@ def explain_surface(scene: Scene, camera: Camera, settings: Settings, row: int, 
         quantity,
         near.entry[order],
         near.weight[order] / near.weight.sum(),
+        field="coverage" if scene.surface.of == "coverage" else "smoothed quantity",
     )

@@ -99,7 +99,7 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
         return Loaded(str(path), volume, name)
     table = read_with(find_format(file), file, source.part_type)
     if look.surface_of is not None and source.opacity_by is not None:
-        raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface is opaque; leave one of them out")
+        raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     if look.surface_of is not None:

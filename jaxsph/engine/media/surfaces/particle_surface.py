@@ -203,8 +203,8 @@ class ParticleSurface(Medium):
 
     def means(self, intervals: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """See `Medium.means`."""
-        extinction, _ = self.extinction(intervals, task)
-        return [*(color * extinction for color in self.colors(intervals, task, COLORS)), extinction][channels]
+        extinction, samples = self.extinction(intervals, task)
+        return [*(color * extinction for color in self.colors(samples, task, COLORS)), extinction][channels]
 
     def every_other(self, gathered: Hit) -> Hit:
         """See `Medium.every_other`."""
@@ -242,9 +242,9 @@ class ParticleSurface(Medium):
         of_hit = jnp.concatenate([cotangents.depth[:, None], cotangents.color, cotangents.normal], 1)
 
         def pull_some(items: Array, some: SlabTask, carry: tuple[SurfaceCotangents, Array]) -> tuple[SurfaceCotangents, Array]:
-            here, real = jnp.minimum(items, tasks - 1), (items < tasks)[:, None]
-            of_rows = jnp.where((met[here] & real)[:, None], of_hit[here], 0)
-            return self._pull_some(some, jnp.where(met[here], depth[here], 0), of_rows, *carry)
+            (there, at, of_rows), real = rows_of((met, depth, of_hit), items), (items < tasks)[:, None]
+            of_rows = jnp.where((there & real)[:, None], of_rows, 0)
+            return self._pull_some(some, jnp.where(there, at, 0), of_rows, *carry)
 
         return over_groups(pull_some, (total, jnp.zeros((), depth.dtype)), _on_borders(task), ~met[:, None])
 

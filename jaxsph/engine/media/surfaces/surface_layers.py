@@ -23,7 +23,7 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.surfaces.headlight import OPAQUE
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Place, SurfaceCotangents
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.medium import COLORS, OfPlaces, Stops
+from jaxsph.model.medium import OfPlaces, Stops
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
@@ -108,11 +108,6 @@ class SurfaceLayers(ParticleSurface):
             return of.reshape(tasks, intervals // 2, 2 * places, *of.shape[3:])
 
         return Layers(*map(joined, gathered))
-
-    def means(self, intervals: Layers, task: SlabTask, channels: slice) -> list[Array]:  # type: ignore[override]
-        """See `Medium.means`."""
-        extinction, color = self.extinction(intervals, task)
-        return [*(one * extinction for one in self.colors(color, task, COLORS)), extinction][channels]
 
     def stops(self, gathered: Layers, task: SlabTask) -> Stops:  # type: ignore[override]
         """See `Medium.stops`: the first layer of each ray, which does not end it."""
