@@ -134,30 +134,4 @@ NAMES = {
     "sequence": "jaxsph.sequence",
 }
 
-FORMER = {
-    "FrameFile": ("jaxsph.sequence.task:FrameFile", "jaxsph.sequence.FrameFile"),
-    "FramesError": ("jaxsph.sequence.task:FramesError", "jaxsph.sequence.FramesError"),
-    "OnDisk": ("jaxsph.scale.on_disk:OnDisk", "jaxsph.scale.OnDisk"),
-    "Plan": ("jaxsph.engine.planning.plan:Plan", "jaxsph.engine.planning.plan.Plan"),
-    "Projection": ("jaxsph.model.projection:Projection", "jaxsph.model.projection.Projection"),
-    "ProjectionPlan": ("jaxsph.analysis.projection.plan:ProjectionPlan", "jaxsph.analysis.projection.plan.ProjectionPlan"),
-    "Slice": ("jaxsph.analysis.slices:Slice", "jaxsph.analysis.slices.Slice"),
-    "Snapshots": ("jaxsph.sequence.snapshots:Snapshots", "jaxsph.sequence.Snapshots"),
-    "along_axis": ("jaxsph.model.camera.camera:Camera.along_axis", "jaxsph.Camera.along_axis"),
-    "control_values": (
-        "jaxsph.model.transfer.function:TransferFunction.control_values",
-        "jaxsph.TransferFunction.control_values",
-    ),
-    "emission": ("jaxsph.model.particles.held:emission_measure", "jaxsph.model.particles.held.emission_measure"),
-    "emission_measure": ("jaxsph.model.particles.held:emission_measure", "jaxsph.model.particles.held.emission_measure"),
-    "in_octree": ("jaxsph.engine.media.in_octree:in_octree", "jaxsph.engine.media.in_octree.in_octree"),
-    "merge": ("jaxsph.scale.parts:merge_tiles", "jaxsph.scale.merge_tiles"),
-    "met": ("jaxsph.analysis.visibility:visibility_histogram", "jaxsph.visibility_histogram"),
-    "plan_projection": ("jaxsph.analysis.projection.plan:plan_projection", "jaxsph.analysis.projection.plan.plan_projection"),
-    "render_from_disk": ("jaxsph.scale.from_disk:render_from_disk", "jaxsph.scale.render_from_disk"),
-    "render_tile": ("jaxsph.scale.parts:render_tile", "jaxsph.scale.render_tile"),
-    "slice_of": ("jaxsph.analysis.slices:slice", "jaxsph.slice"),
-}
-"""Names of the version before, and what they are called now."""
-
-__getattr__, __dir__ = lazy(__name__, NAMES, FORMER)
+__getattr__, __dir__ = lazy(__name__, NAMES)

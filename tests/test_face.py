@@ -1,4 +1,4 @@
-"""The names that `jaxsph` has for its users: few, found when they are used, and former ones for one version."""
+"""The names that `jaxsph` has for its users: few, and found when they are used."""
 
 import ast
 import importlib
@@ -70,20 +70,6 @@ def test_all_names_are_found_and_known_to_editors(package):
 def test_there_are_few_names():
     assert len(js.__all__) <= 40
     assert js.__version__
-
-
-@pytest.mark.parametrize("old", sorted(js.FORMER))
-def test_former_names_warn_once_and_are_what_they_are_called_now(old):
-    entry, now = js.FORMER[old]
-    vars(js).pop(old, None)
-    with pytest.warns(FutureWarning, match=f"`jaxsph.{old}` is now `{now}`") as told:
-        assert getattr(js, old) == registry.found(entry) == getattr(js, old)
-    assert len(told) == 1 and old not in js.__all__
-    module, *path = now.removeprefix("jaxsph.").split(".")
-    if hasattr(js, module):  # the new word is one that users can write
-        assert registry.found(f"jaxsph:{'.'.join([module, *path])}") == registry.found(entry)
-    else:
-        assert registry.found(":".join(now.rsplit(".", 1))) == registry.found(entry)
 
 
 def test_jaxsph_has_no_other_names():

@@ -18,7 +18,6 @@ from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import short
 from jaxsph.numerics.labelled import PLANE, dataset, places
-from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 
 COLORS = 256  # of a map in a picture
@@ -79,7 +78,6 @@ class Projection:
             return np.asarray(self.values, np.float64).sum() * self.pixel_area
         return self.values.sum() * self.pixel_area
 
-    @renamed(value_span="range")
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
         type(self).writer(path, self, **look)
@@ -100,7 +98,6 @@ class Projection:
         coordinates = {} if self.perspective else places(self.shape, side, (0.0, 0.0), self.length_unit)
         return dataset(layers, coordinates, self.metadata, pixel_area=float(self.pixel_area), faults=int(self.faults))
 
-    @renamed(value_span="range")
     def to_uint8(
         self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None
     ) -> np.ndarray:
@@ -125,7 +122,6 @@ class Projection:
         picture = np.where((np.isfinite(values) & ~there & filled)[..., None], colors[0], picture)
         return (np.where(filled[..., None], picture, EMPTY) * 255 + 0.5).astype(np.uint8)
 
-    @renamed(value_span="range")
     def span(self, norm: str | None = None, range: tuple[float, float] | None = None) -> tuple[bool, tuple[float, float]]:
         """Whether colours are of logarithms, and the values that they span.
 
@@ -146,7 +142,6 @@ class Projection:
             raise ValueError(f"`range` must be two finite values that ascend{more}, got ({low}, {high})")
         return log, (low, high)
 
-    @renamed(value_span="range")
     def figure(self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None) -> Any:
         """A figure of matplotlib with a colour bar; arguments as for `to_uint8`.
 

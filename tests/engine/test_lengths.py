@@ -9,6 +9,7 @@ from extreme import Extreme, error_and_allowance
 
 import jaxsph as js
 from jaxsph.engine.lengths import POWERS, digits_to_scale, scaled, scaled_camera, times
+from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.engine.request import Request
 from jaxsph.numerics import faults
 
@@ -95,7 +96,7 @@ def test_periodic_sets_have_their_box_scaled(frames):
 
 def test_a_medium_of_unknown_lengths_is_not_scaled(frames):
     scene, camera = frame(frames, length=1e24)
-    within = js.in_octree(frame(frames)[0])
+    within = in_octree(frame(frames)[0])
     assert digits_to_scale(dataclasses.replace(within, transfer=None), camera) == 0 and digits_to_scale(scene, camera) != 0
 
 
@@ -112,6 +113,6 @@ def test_stages_of_a_quadtree_and_parts_of_a_picture_are_in_the_unit_that_was_gi
     scene, camera = frame(frames)
     moved, seen = scaled(scene, 80), scaled_camera(camera, 80)
     settings = js.Settings(samples=8)
-    same(js.render_tile(moved, seen, settings, 0, 1), js.render_tile(scene, camera, settings, 0, 1), 80)
+    same(js.scale.render_tile(moved, seen, settings, 0, 1), js.scale.render_tile(scene, camera, settings, 0, 1), 80)
     for image, other in zip(js.progressive(moved, seen, settings), js.progressive(scene, camera, settings), strict=True):
         same(image, other, 80)

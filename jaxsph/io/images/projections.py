@@ -27,14 +27,12 @@ from jaxsph.io.images.exr import read_layers, write_layers
 from jaxsph.io.images.png import write_pixels
 from jaxsph.io.replace import written_whole
 from jaxsph.model.projection import Projection
-from jaxsph.numerics.names import renamed
 
 SUFFIXES = (".exr", ".npy", ".fits", ".png")
 WEIGHT = "weight"
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
 
-@renamed(value_span="range")
 def write_projection(path: str | os.PathLike[str], projection: Projection, **look: Any) -> None:
     """Write a projection, whole or not at all; `look` is that of `Projection.to_uint8`, for pictures.
 

@@ -25,7 +25,6 @@ from jaxsph.model.registry import Method
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
-from jaxsph.numerics.names import renamed
 from jaxsph.numerics.trees import tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
@@ -213,7 +212,6 @@ class Camera:
         return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
 
     @classmethod
-    @renamed(slab="depth_range")
     def along_axis(
         cls,
         shown: Bounded,

@@ -34,7 +34,6 @@ from jaxtyping import Float
 
 from jaxsph.model.transfer.maps import POINTS, TAILS, value_range
 from jaxsph.numerics.given import own
-from jaxsph.numerics.names import renamed
 
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
 EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
@@ -43,7 +42,6 @@ WIDE = 2.0  # largest over least of control values from which an even spacing of
 UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
 
 
-@renamed(domain="norm")
 def control_values(
     norm: str,
     quantity: Any = None,

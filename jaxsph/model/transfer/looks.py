@@ -29,7 +29,6 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.names import renamed
 
 __all__ = ["COLORMAPS", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
@@ -87,7 +86,6 @@ PRESETS: dict[str, Preset] = {
 """By name."""
 
 
-@renamed(colormap_name="colormap", values="range")
 def default_transfer(
     particles: Particles,
     colormap: str = "viridis",
@@ -149,7 +147,6 @@ def opacity_by_second(
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
 
 
-@renamed(colormap_name="colormap", values="range")
 def default_volume_transfer(
     volume: Volume,
     colormap: str = "viridis",
@@ -162,7 +159,6 @@ def default_volume_transfer(
     return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
 
 
-@renamed(domain="norm", colormap_name="colormap", values="range")
 def domain_transfer(
     shown: Particles | Volume,
     norm: str,
@@ -181,7 +177,6 @@ def domain_transfer(
     return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
 
-@renamed(domain="norm", colormap_name="colormap", values="range")
 def preset(
     name: str,
     shown: Any,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
-from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, default_transfer, domain_transfer, opacity_by_second, value_range
+from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, default_transfer, opacity_by_second, value_range
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.scenes.sampling import scatter
 
@@ -97,14 +97,3 @@ def test_ramps_are_even_rising_or_steep_and_nothing_else():
     assert float(steep(np.array([0.0]))[1][0]) == 0
     with pytest.raises(ValueError, match="even, rising, steep"):
         default_transfer(block(), ramp="falling")
-
-
-def test_former_keywords_make_the_same_looks_and_warn():
-    shown = block(100)
-    for call, new, old in (
-        (default_transfer, {"colormap": "gray", "range": (0, 1)}, {"colormap_name": "gray", "values": (0, 1)}),
-        (domain_transfer, {"norm": "log", "range": (1, 10)}, {"domain": "log", "values": (1, 10)}),
-    ):
-        with pytest.warns(FutureWarning, match="is now"):
-            former = call(shown, **old)
-        np.testing.assert_array_equal(former.values, call(shown, **new).values)
