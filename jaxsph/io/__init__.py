@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.disk.sort import sort_snapshot
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.images.image_files import read_image, write_image
 from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
@@ -65,7 +64,6 @@ __all__ = [
     "read_transfer",
     "read_volume",
     "read_volume_table",
-    "sort_snapshot",
     "volume_from_table",
     "write_camera_path",
     "write_image",

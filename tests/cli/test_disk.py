@@ -19,16 +19,14 @@ def file(tmp_path, monkeypatch):
     return write(tmp_path, particles(800, ordered=False))
 
 
-def test_a_snapshot_is_sorted_and_rendered_from_disk_as_from_memory(file, capsys):
-    code, out, _ = run(capsys, "sort", file, "-o", "sorted.hdf5")
-    assert code == 0 and "800 particles" in out
+def test_a_snapshot_is_rendered_from_disk_as_from_memory(file, capsys):
     transfer = js.TransferFunction.from_points([0.5, 1.0, 2.5], [[0, 0, 1], [0, 1, 0], [1, 0, 0]], [0.1, 2.0, 5.0])
     io.write_transfer("look.json", transfer)  # else opacity would be chosen by a sample of what is on disk
     look = ["--transfer", "look.json", "--quantity", "InternalEnergy", *TINY]
-    code, out, err = run(capsys, "render", "sorted.hdf5", "--from-disk", 0.1, "-o", "a.exr", *look)
+    code, out, err = run(capsys, "render", file, "--from-disk", 0.1, "-o", "a.exr", *look)
     assert (code, err) == (0, []) and "1, of at most 800 particles" in out and "jaxsph-index.npz" in out
-    scene = js.Scene(particles=io.read_particles("sorted.hdf5", "InternalEnergy"), transfer=transfer)
-    camera = js.Camera.framing(js.scale.OnDisk.open("sorted.hdf5", "InternalEnergy"), width=24, height=32)
+    scene = js.Scene(particles=io.read_particles(file, "InternalEnergy"), transfer=transfer)
+    camera = js.Camera.framing(js.scale.OnDisk.open(file, "InternalEnergy"), width=24, height=32)
     a = np.asarray(io.read_image("a.exr").color)
     b = np.asarray(js.render(scene, camera, js.Settings(samples=16)).color)
     assert b.max() > 0.1
@@ -55,14 +53,13 @@ def test_too_little_memory_names_the_file_the_option_and_the_least_of_it_that_wo
     assert run(capsys, "render", file, "--from-disk", least, "-o", "a.png", *TINY)[0] == 0
 
 
-@pytest.mark.parametrize("command", [["sort", "OTHER", "-o", "sorted.hdf5"], ["render", "OTHER", "--from-disk", "1"]])
 @pytest.mark.parametrize("kind", ["a folder", "bytes", "nothing"])
-def test_what_is_not_gadget_like_hdf5_is_refused_in_one_line_that_says_what_can_be_read(file, capsys, command, kind):
+def test_what_is_not_gadget_like_hdf5_is_refused_in_one_line_that_says_what_can_be_read(file, capsys, kind):
     other = file.parent / "other.dat"
     if kind == "a folder":
         (other / "gas").mkdir(parents=True)
         (other / "gas" / "pos").write_bytes(bytes(40))
     else:
         other.write_bytes(b"" if kind == "nothing" else bytes(range(256)))
-    code, _, err = run(capsys, *(str(other) if part == "OTHER" else part for part in command))
+    code, _, err = run(capsys, "render", other, "--from-disk", 1)
     assert code == 1 and len(err) == 1 and f"{other}: is not a Gadget-like HDF5 snapshot, all that" in err[0]

@@ -38,7 +38,6 @@ RUNS = {
     "slice": (["slice", "FILE", *SMALL], ["slice", SCENE, *SMALL]),
     "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"], ["sweep", SCENE, "-o", "out"]),
     "merge": (["merge", "FILE.exr", "-o", "a.png"],),
-    "sort": (["sort", "FILE", "-o", "a.hdf5"],),
     "demo": (["demo", *SMALL],),
     "doctor": (["doctor"],),
     "cache": (["cache"],),

@@ -16,7 +16,6 @@ from jaxsph.cli import main as cli
 MOMENTS = 10
 TINY = ["--size", "24x32", "--samples", "16"]
 COMMANDS = {
-    "sort": ["sort", "snap.0.hdf5", "-o", "out.hdf5"],
     "render": ["render", "snap.0.hdf5", *TINY, "-o", "out.png"],
     "movie": ["movie", "snap.0.hdf5", "--orbit", "90", "--frames", "3", *TINY, "-o", "out.mp4"],
 }
@@ -159,8 +158,6 @@ def ends(group):
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [*COMMANDS, "workers"])
 def test_a_process_that_is_asked_to_end_at_any_moment_leaves_nothing(command, folder):
-    if command == "sort":
-        write(folder, particles(100_000, ordered=False))
     more = ["--workers", "2"] if command == "workers" else []
     arguments = [*COMMANDS[{"workers": "movie"}.get(command, command)], *more]
     output = folder / arguments[arguments.index("-o") + 1]

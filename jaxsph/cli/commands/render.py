@@ -19,7 +19,8 @@ from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.commands import disk, merge
+from jaxsph.cli import disk
+from jaxsph.cli.commands import merge
 from jaxsph.cli.console import (
     IMAGES,
     UsageError,

@@ -66,12 +66,6 @@ COMMANDS = {
         ("jaxsph view snap_042.hdf5", "jaxsph view scene:mixer --size 800x600 --port 8765 --no-browser"),
     ),
     "info": Command(DATA, "info", "say what a file holds, and what `render` would show of it", ("jaxsph info snap_042.hdf5",)),
-    "sort": Command(
-        DATA,
-        "disk",
-        "order a snapshot in space, for reading parts of it",
-        ("jaxsph sort snap.0.hdf5 -o sorted.hdf5",),
-    ),
     "transfer": Command(
         DATA,
         "transfer",

@@ -27,7 +27,7 @@ RUN = 1 << 14
 READ = 1 << 17
 """Rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run."""
 OTHER_FORMAT = (
-    "is not a Gadget-like HDF5 snapshot, all that `--from-disk`, `OnDisk.open` and `sort` can read, as they read "
+    "is not a Gadget-like HDF5 snapshot, all that `--from-disk` and `OnDisk.open` can read, as they read "
     "some rows at a time; render it as a whole, without `--from-disk`"
 )
 
@@ -79,10 +79,6 @@ class Snapshot:
                 return dataclasses.replace(self.first, position=np.zeros((0, 3), np.float32), columns={}, support=None)
             names = None if only is None else {plain(name) for name in only}
             return gadget_hdf5.from_hdf5(source, self.part_type, rows, names)
-
-    def reads(self) -> list[tuple[int, int, int]]:
-        """File, first row and end of what is read at once where all is read."""
-        return [(file, rows[0][0], rows[-1][1]) for file, rows in together(self.runs())]
 
     def runs(self) -> Iterator[tuple[int, int, int]]:
         """File, first row and end of each run."""

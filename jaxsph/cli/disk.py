@@ -1,31 +1,22 @@
-"""Snapshots larger than memory on the command line: `render --from-disk`, and the command `sort`.
+"""Snapshots larger than memory on the command line: `render --from-disk`.
 
-Flow: options -> [cli_disk] -> OnDisk, Image -> cli.
+Flow: options -> [disk] -> OnDisk, Image -> render.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from cyclopts import Parameter
 
 from jaxsph.cli import look as cli_look
-from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, camera_line, progress, refuse, span, time_line
-from jaxsph.cli.options import groups
-from jaxsph.cli.options.groups import DATA, option, output
 from jaxsph.cli.options.settings import SCENE
-from jaxsph.cli.options.values import whole
 from jaxsph.cli.voice import say
 from jaxsph.io.disk.index import index_path
-from jaxsph.io.disk.rows import Snapshot
-from jaxsph.io.disk.sort import sort_snapshot
 from jaxsph.model import Camera, Image, Settings
 from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
 from jaxsph.scale.on_disk import OnDisk
@@ -87,32 +78,3 @@ def _too_little(options: Any, error: TooLittleMemoryError) -> str:
     option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
     least = math.ceil(error.least / GIB * FRACTIONS) / FRACTIONS
     return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
-
-
-@Parameter(name="*")
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sort(groups.Options):
-    """Options of the command `sort`."""
-
-    output: Annotated[
-        Path | None, output("one file; one that is there is replaced only if it was sorted from a FILE of this name", "OUT.hdf5")
-    ] = None
-    part_type: Annotated[
-        int | None, option("--part-type", "N", whole, DATA, "kind of particles (default: gas, else the first)")
-    ] = None
-
-
-SORT = Sort()
-
-
-def sort(
-    file: Annotated[str, Parameter(help="Gadget-like HDF5; any file of a snapshot in several")], /, *, asked: Sort = SORT
-) -> None:
-    """Order a snapshot in space."""
-    if asked.output is None:
-        raise UsageError("-o OUT.hdf5 is needed: where should the sorted particles go?")
-    with progress("sort", " reads") as show:
-        sort_snapshot(file, asked.output, part_type=asked.part_type, progress=show)
-    particles = len(Snapshot(asked.output, asked.part_type))
-    say("sorted", f"{asked.output}, {particles:,} particles")
-    voice.written(asked.output, particles=particles)
