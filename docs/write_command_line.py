@@ -26,8 +26,8 @@ whole or not at all.
 **Where results go.** Paths and numbers are on stdout, prose is on stderr; `--json` makes one object of it on stdout, `--quiet`
 leaves the prose out.
 
-**Where options come from.** The command line, else a variable such as `JAXSPH_COLORMAP`, else the file of `--config`. Options are
-never abbreviated; one that is misspelt gets a suggestion.
+**Where options come from.** The command line, else the file of `--config`. Options are never abbreviated; one that is misspelt
+gets a suggestion. Numbers between commas may be words of their own, as in `--eye 0 0 9`.
 """
 
 

@@ -1,6 +1,6 @@
 """Command line: a picture from files of particles, volumes and points in one command.
 
-Flow: words -> former spellings, files of options -> cyclopts -> [main] -> a command -> files, results on stdout, prose on stderr.
+Flow: words, files of options -> cyclopts -> [main] -> a command -> files, results on stdout, prose on stderr.
 
 Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted (SIGINT), 143 asked to end (SIGTERM); one line on stderr
 says why. A command's module is imported when that command is asked for, so that help comes at once.
@@ -19,12 +19,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from cyclopts import ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
+from cyclopts import Argument, ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
 
 from jaxsph.cli import voice
-from jaxsph.cli.options.former import Rewritten, rewritten
 from jaxsph.cli.options.table import COMMANDS, app
-from jaxsph.cli.options.words import Declared, Entry, completed, joined, saved
+from jaxsph.cli.options.words import completed
 from jaxsph.cli.voice import UsageError, by_option
 from jaxsph.numerics.nearest import did_you_mean
 from jaxsph.numerics.version import __version__
@@ -51,15 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = [str(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     command = next(iter(words), "")
-    verbose = any(word in ("--verbose", "-v", "--debug") for word in words)
+    verbose = any(word in ("--verbose", "-v") for word in words)
     try:
         if _helped(command, words):
             return DONE
-        new = _rewritten(command, words[1:])
-        command = new.command
-        run, entries = _asked(new)
+        run, options = _asked(command, words[1:])
         with _ending_in_order(arguments is None):
-            _work(run, entries, own_process=arguments is None)
+            _work(run, options, own_process=arguments is None)
     except _Terminated:
         return _failed(command, "terminated", TERMINATED, verbose)
     except KeyboardInterrupt:
@@ -75,28 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return DONE
 
 
-@dataclasses.dataclass(frozen=True)
-class _Run:
-    """A command, its files, and its options."""
-
-    function: Callable[..., bool | None]
-    files: tuple[str, ...]
-    options: Any
-
-
-def _work(run: _Run, entries: Sequence[Entry], *, own_process: bool) -> None:
+def _work(run: Callable[..., bool | None], options: Any, *, own_process: bool) -> None:
     """Do what is asked for."""
     from jaxsph.cli import cache
     from jaxsph.cli.console import warnings_in_lines
 
-    options = run.options
     if own_process:
         cache.begin(keep=not options.no_cache)
     with warnings_in_lines(options.command, cache.mended):
-        left = run.function(*run.files, asked=options)
-        if options.save_config is not None:
-            options.save_config.write_text(saved(entries), encoding="utf-8")
-            voice.say("saved", f"{options.save_config}: the options, for --config")
+        left = run(asked=options)
         voice.end(options.command)
     if left and own_process:  # threads that nothing can end: the interpreter would wait for them
         sys.stdout.flush()
@@ -104,38 +88,26 @@ def _work(run: _Run, entries: Sequence[Entry], *, own_process: bool) -> None:
         os._exit(DONE)
 
 
-def _rewritten(command: str, words: list[str]) -> Rewritten:
-    """The words as they are written now.
-
-    Raises:
-        UsageError: no command.
-    """
-    if command not in COMMANDS:
-        known = ", ".join(COMMANDS)
-        raise UsageError(f"there is no command {command!r}; there are {known}{did_you_mean(command, COMMANDS)}")
-    return rewritten(command, words, lambda of, name: name in declared(of).names)
-
-
-def _asked(new: Rewritten) -> tuple[_Run, list[Entry]]:
-    """The command that is asked for, with its options.
+def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], Any]:
+    """The command that is asked for, with its files, and its options.
 
     Raises:
         UsageError: what cannot be understood.
     """
-    entries = completed(new.command, new.words, declared(new.command))
-    said = joined(entries)
-    voice.begin(quiet="--quiet" in said, verbose="--verbose" in said, as_json="--json" in said, aloud=new.command in ALOUD)
-    for text in new.told:
-        voice.warn(new.command, text)
+    if command not in COMMANDS:
+        known = ", ".join(COMMANDS)
+        raise UsageError(f"there is no command {command!r}; there are {known}{did_you_mean(command, COMMANDS)}")
+    said = completed(command, words, declared(command))
+    voice.begin(quiet="--quiet" in said, verbose="--verbose" in said, as_json="--json" in said, aloud=command in ALOUD)
     try:
-        function, bound, _ = app()[new.command].parse_args(said, exit_on_error=False, print_error=False)
+        function, bound, _ = app()[command].parse_args(said, exit_on_error=False, print_error=False)
     except CycloptsError as error:
         raise UsageError(_one_line(error)) from error
     except ValueError as error:  # of a group whose options do not go together
         raise UsageError(str(error)) from error
     bound.apply_defaults()
-    options = dataclasses.replace(bound.arguments["asked"], command=new.command, words=tuple(said))
-    return _Run(function, bound.args, options), entries
+    options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said))
+    return functools.partial(function, *bound.args), options
 
 
 def _one_line(error: CycloptsError) -> str:
@@ -153,22 +125,9 @@ def arguments_of(command: str) -> ArgumentCollection:
     return app()[command].assemble_argument_collection()
 
 
-@functools.cache
-def declared(command: str) -> Declared:
-    """Names of the options of a command."""
-    flags, valued, several, full = {HELP}, set(), set(), {SHORT_HELP: HELP}
-    for one in arguments_of(command):
-        names = [name for name in one.names if name.startswith("--")]
-        if not names or not one.parse:
-            continue
-        full.update(dict.fromkeys(one.names, names[0]))
-        if one.hint is bool:
-            flags.add(names[0])
-        else:
-            valued.add(names[0])
-            if one.parameter.allow_repeating:
-                several.add(names[0])
-    return Declared(frozenset(flags), frozenset(valued), frozenset(several), full)
+def declared(command: str) -> dict[str, Argument]:
+    """The options of a command, by each of their names."""
+    return {name: one for one in arguments_of(command) if one.parse for name in one.names if name.startswith("-")}
 
 
 def _helped(command: str, words: list[str]) -> bool:

@@ -75,7 +75,7 @@ def render_from_disk(
     """Render a snapshot that is larger than memory.
 
     The image is rendered pane by pane, each with the particles whose supports its rays can meet; those of the next pane are
-    read meanwhile. A snapshot whose rows are ordered in space, as SWIFT's are, is read a few times, one whose are not once a pane.
+    read meanwhile. Where rows are ordered in space, as SWIFT's are, all is read a few times, else once a pane.
 
     Args:
         on_disk: the snapshot.

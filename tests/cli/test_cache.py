@@ -10,7 +10,7 @@ import pytest
 from jaxsph.cli import cache as cli_cache
 from jaxsph.cli.console import warnings_in_lines
 
-RENDER = ["render", "scene:radial", "--particles", "200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
+RENDER = ["render", "scene:radial:particles=200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
 COMPILING = "compiling for frames of this kind"
 
 

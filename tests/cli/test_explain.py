@@ -44,25 +44,6 @@ def test_a_figure_is_written_and_its_path_said(capsys):
         assert file.read(4) == b"\x89PNG"
 
 
-def test_a_pixel_of_a_picture_is_explained_by_the_options_that_it_was_made_by(capsys):
-    more = ["--color-by", "heat", "--eye", 0, 0, 6, "--background", "white", "--draft", "--size", "24x16"]
-    assert run(capsys, "render", "a.npz", *more, "-o", "x.png")[0] == 0
-    code, out, _, wrong = apart(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 8, 12)
-    assert (code, wrong) == (0, [])
-    scene, camera = js.io.read_scene("a.npz", color_by="heat", size=(24, 16), eye=(0, 0, 6))
-    assert out.strip() == str(js.explain(scene, camera, js.Settings(samples=64), pixel=(8, 12)))
-
-
-def test_a_picture_made_by_what_explain_does_not_know_is_refused(capsys):
-    layer = np.zeros((4, 4), np.float32)
-    command = json.dumps(["render", "a.npz", "--progressive", "--output=x.png"])
-    image = js.Image(np.zeros((4, 4, 3), np.float32), layer, layer, layer, layer, True, 0, {}, (("jaxsph.command", command),))
-    image.save("x.png")
-    code, _, err = run(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 1, 1)
-    assert code == 2 and len(err) == 1
-    assert "--like x.png: it was made with --progressive, which `jaxsph explain` does not know" in err[0]
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -84,8 +65,7 @@ def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, sai
 
 def test_a_pixel_of_a_picture_of_a_surface_is_explained_as_one(capsys):
     more = ["--color-by", "heat", "--surface", "0.2", "--size", "24x16", "--samples", 16]
-    assert run(capsys, "render", "a.npz", *more, "-o", "x.png")[0] == 0
-    code, out, _, wrong = apart(capsys, "explain", "a.npz", "--like", "x.png", "--pixel", 8, 12, "--json")
+    code, out, _, wrong = apart(capsys, "explain", "a.npz", *more, "--pixel", 8, 12, "--json")
     told = json.loads(out)
     scene, camera = js.io.read_scene("a.npz", color_by="heat", surface=0.2, size=(24, 16))
     made = js.explain(scene, camera, js.Settings(samples=16), pixel=(8, 12))

@@ -191,7 +191,6 @@ WRONG_USAGE = [
     (["render", "FILE", "--support", "0"], "--support must be > 0"),
     (["render", "FILE", "--colormap", "nope"], "viridis"),
     (["render", "FILE", "--range", "1,0"], "--range must be two finite numbers that ascend"),
-    (["render", "FILE", "--frame", "1"], "built-in scenes"),
     (["render", "FILE", "--memory", "0"], "--memory"),
     (["render", "scene:nowhere"], "mixer, radial, checker_board, dam_break"),
     (["render", "scene:mixer:frame=9"], "one of [0, 1, 2]"),
@@ -229,8 +228,8 @@ def test_an_image_that_would_not_fit_the_memory_limit_says_so(file, capsys):
     assert code == 1 and len(err) == 1 and "memory_limit" in err[0]
 
 
-def test_debug_shows_where_a_failure_comes_from(tmp_path, capsys):
-    code, _, err = run(capsys, "render", tmp_path / "absent.npz", "--debug")
+def test_verbose_shows_where_a_failure_comes_from(tmp_path, capsys):
+    code, _, err = run(capsys, "render", tmp_path / "absent.npz", "--verbose")
     assert code == 1 and err[0].startswith("Traceback") and err[-1].startswith("jaxsph render:")
 
 

@@ -146,7 +146,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, ca
         (["s_0.npz", "s_1.npz", "--where", "entropy > 1"], "no quantity 'entropy'"),
         (["s_0.npz", "s_1.npz", "--share", 0], "--share must be above 0"),
         (["s_0.npz", "s_1.npz", "--center", 0, 0, 0], "--center is for periodic boxes"),
-        (["s_0.npz", "s_1.npz", "--clip-plane", 0, 0, 0, 0, 0, 0], "--clip: plane:0,0,0,0,0,0: normal"),
+        (["s_0.npz", "s_1.npz", "--clip", "plane:0,0,0,0,0,0"], "--clip: plane:0,0,0,0,0,0: normal"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
         ([], "is needed as FILE"),
     ],

@@ -43,7 +43,7 @@ RUNS = {
     "cache": (["cache"],),
     "completion": (["completion", "bash"],),
 }  # fmt: skip
-OF_ALL = {"quiet", "verbose", "json", "config", "save_config", "no_cache", "like"}
+OF_ALL = {"quiet", "verbose", "json", "config", "no_cache"}
 """What is read before a command is, see `test_words.py` and `test_voice.py`."""
 
 
@@ -110,6 +110,7 @@ def test_render_shows_no_more_options_than_a_person_can_take_in(capsys):
         *(name for name in shown),
         *(f"{name}:" for name in shown),
         *(f"{name}," for name in shown),
+        "--quantity",
     }
 
 

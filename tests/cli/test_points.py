@@ -106,15 +106,9 @@ def test_all_parts_are_in_one_scene_and_in_view(files, monkeypatch, capsys):
     assert not err and framed(camera, scene.particles, scene.volumes[0][0], scene.point_sets[0])
 
 
-@pytest.mark.parametrize("source", ["scene:mixer", "gas.vti", None])
+@pytest.mark.parametrize("source", ["scene:mixer:particles=300", "gas.vti", None])
 def test_any_source_takes_points_and_none_too(files, monkeypatch, capsys, source):
-    arguments = [
-        "--points",
-        "stars.csv",
-        *([source] if source else []),
-        *(["--particles", "300"] if source == "scene:mixer" else []),
-    ]
-    scene, camera, *_ = pictured(monkeypatch, capsys, *arguments)
+    scene, camera, *_ = pictured(monkeypatch, capsys, "--points", "stars.csv", *([source] if source else []))
     scene.check()
     assert scene.point_sets[0].num_points == 2 and framed(camera, scene.point_sets[0])
 
@@ -184,18 +178,16 @@ def test_info_says_what_would_be_taken(files, capsys):
 WRONG_USAGE = [
     (["render"], "a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE"),
     (["info"], "or --points FILE, or --volume FILE"),
-    (["render", "gas.vti", "--point-radius", "1"], "--point-radius is for --points FILE, and there is none"),
-    (["render", "gas.vti", "--volume-colormap", "ice"], "--volume-colormap is for --volume FILE, and there is none"),
-    (["render", "--points", "stars.csv", "--point-radius", "0"], "--points stars.csv: radius must be > 0, got 0"),
+    (["render", "--points", "stars.csv:radius=0"], "--points stars.csv: radius must be > 0, got 0"),
     (["render", "--points", "stars.csv:radius=nan"], "--points stars.csv: radius must be > 0, got nan"),
     (["render", "--points", "stars.csv:opacity=1"], "--points stars.csv: opacity must be in [0, 1), got 1"),
     (
         ["render", "--points", "stars.csv:radus=1"],
         "no option 'radus'; there are type, radius, opacity, color, colormap; did you mean radius?",
     ),
-    (["render", "--points", "stars.csv", "--point-color", "1,2"], "R,G,B from 0 to 1, as in 1,0.5,0; got '1,2'"),
-    (["render", "--points", "stars.csv", "--point-color", "255,0,0"], "got '255,0,0'"),
-    (["render", "--points", "stars.csv", "--point-color", "a,b,c"], "got 'a,b,c'"),
+    (["render", "--points", "stars.csv:color=1,2"], "R,G,B from 0 to 1, as in 1,0.5,0; got '1,2'"),
+    (["render", "--points", "stars.csv:color=255,0,0"], "got '255,0,0'"),
+    (["render", "--points", "stars.csv:color=a,b,c"], "got 'a,b,c'"),
     (["render", "--points", "stars.csv", "--quantity", "mass"], "--color-by is for FILE or scene:NAME, and there is none"),
     (["render", "--points", "stars.csv", "--mix", "sum"], "--mix must be one of extinction, opacity, got 'sum'"),
     (["render", "--points"], "--points needs a value"),
@@ -214,13 +206,13 @@ FAILURES = [
         "bare.csv: has no radius of its points: there are mass; give `radius=NUMBER` (:radius=R)",
     ),
     (
-        ["--points", "stars.csv", "--point-color", "age"],
+        ["--points", "stars.csv:color=age"],
         "`color`: there is no column 'age': there are radius, r, g, b,",
     ),
-    (["--points", "stars.csv", "--point-type", "4"], "have no particle types"),
+    (["--points", "stars.csv:type=4"], "have no particle types"),
     (["--points", "nowhere.csv"], "there is no such file"),
     (["drop.npz", "--volume", "drop.npz"], "volumes are read from .vti"),
-    (["--volume", "gas.vti", "--volume-quantity", "rho"], "gas.vti: has no quantity 'rho'"),
+    (["--volume", "gas.vti:quantity=rho"], "gas.vti: has no quantity 'rho'"),
 ]
 
 

@@ -148,7 +148,7 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, capsys):
         (["--annotate"], "--annotate is for a picture"),
         (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
         (["--support", 0], "--support must be > 0"),
-        (["--axis", "w"], "--view must be one of x, y, z, got 'w'"),
+        (["--view", "w"], "--view must be one of x, y, z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--target", 0, 0, 0], "--target needs --eye"),
         (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
@@ -157,7 +157,6 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, capsys):
         (["--eye", 0, 0, 9, "--target", 0, 0, 9], "must differ"),
         (["--size", "0x4"], "at least 1 pixel"),
         (["--where", "entropy > 1"], "no quantity 'entropy'"),
-        (["--box", 1, 1, 1, "--not-periodic"], "exclude each other"),
     ],
 )
 def test_wrong_usage_is_told_in_one_line(file, capsys, arguments, said):

@@ -173,7 +173,6 @@ def test_info_says_what_would_be_left(file, capsys):
         (["--where", "temperature > 1 and (pressure"], "at character 21, '(pressure'"),
         (["--share", 0], "--share must be above 0 and at most 1, got 0"),
         (["--share", 2], "--share must be above 0 and at most 1, got 2"),
-        (["--box", 1, 1, 1, "--not-periodic"], "--box and --not-periodic exclude each other"),
         (["--box-size", "1,0,1"], "--box-size must be three lengths > 0 as LX,LY,LZ, or none; got '1,0,1'"),
         (["--center", "9,9,9"], "--center = 9 9 9 is outside of everything: that lies from"),
         (["--center", "middle"], "--center must be X,Y,Z, densest or mass, got 'middle'"),

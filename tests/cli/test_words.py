@@ -1,7 +1,6 @@
-"""Options from files, pictures and the environment: what wins, what is refused, and that a picture can be made again."""
+"""Words and files of options: how they may be spelled, what wins, what is refused, and that a picture holds its command."""
 
 import json
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,8 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli import main as cli
+from jaxsph.cli.options.words import completed
 
 TINY = ["--size", "24x16", "--samples", "16"]
 
@@ -36,7 +37,7 @@ def seen(monkeypatch):
     return found
 
 
-def test_a_file_of_options_holds_where_nothing_else_is_said(seen, monkeypatch, capsys):
+def test_a_file_of_options_holds_where_nothing_else_is_said(seen, capsys):
     text = 'samples = 32\n[camera]\nsize = "20x10"\neye = [0, 0, 9]\nfov = 30\n[movie]\norbit = 9\n[render]\ncolor-by = "cold"\n'
     Path("look.toml").write_text(text)
     code, out, err = run(capsys, "render", "a.npz", "--config", "look.toml", "--fov", 20)
@@ -45,9 +46,6 @@ def test_a_file_of_options_holds_where_nothing_else_is_said(seen, monkeypatch, c
     assert settings.samples == 32 and (camera.width, camera.height) == (20, 10)
     np.testing.assert_array_equal(camera.exact_eye(), (0, 0, 9))
     assert np.degrees(np.arctan(float(camera.half_height))) * 2 == pytest.approx(20)
-    monkeypatch.setenv("JAXSPH_SAMPLES", "8")
-    assert run(capsys, "render", "a.npz", "--config", "look.toml")[0] == 0 and seen[-1][2].samples == 8
-    assert run(capsys, "render", "a.npz", "--samples", 64)[0] == 0 and seen[-1][2].samples == 64
 
 
 @pytest.mark.parametrize(
@@ -68,16 +66,13 @@ def test_a_file_that_cannot_be_is_named_with_its_place(seen, capsys, text, said)
     assert code == 1 and len(err) == 1 and "gone.toml" in err[0]
 
 
-def test_options_are_saved_and_give_the_same_command(seen, capsys):
-    more = ["--clip", "box:-1,-1,-1,1,1,1", "--clip", "~sphere:0,0,0,0.2", "--where", "heat > -1 and cold < 3", "-q"]
-    code, *_ = run(capsys, "render", "a.npz", *TINY, *more, "--save-config", "look.toml", "-o", "x.png")
-    assert code == 0
-    saved = tomllib.loads(Path("look.toml").read_text())
-    assert saved["clip"] == ["box:-1,-1,-1,1,1,1", "~sphere:0,0,0,0.2"] and saved["samples"] == "16"
-    assert not {"output", "quiet", "save-config"} & set(saved)
-    assert run(capsys, "render", "a.npz", "--config", "look.toml")[0] == 0
-    (_, one, first), (_, other, second) = seen
-    assert one.describe() == other.describe() and first == second
+def test_an_option_of_a_file_may_be_a_list(seen, capsys):
+    Path("look.toml").write_text('clip = ["box:-1,-1,-1,1,1,1", "~sphere:0,0,0,0.2"]\nwhere = "heat > -1 and cold < 3"\n')
+    assert run(capsys, "render", "a.npz", *TINY, "--config", "look.toml")[0] == 0
+    more = ["--clip", "box:-1,-1,-1,1,1,1", "--clip", "~sphere:0,0,0,0.2", "--where", "heat > -1 and cold < 3"]
+    assert run(capsys, "render", "a.npz", *TINY, *more)[0] == 0
+    (one, camera, settings), (other, again, same) = seen
+    assert repr(one) == repr(other) and camera.describe() == again.describe() and settings == same
 
 
 @pytest.mark.parametrize("suffix", ["png", "exr"])
@@ -85,24 +80,25 @@ def test_a_picture_holds_its_command_and_is_made_again_by_it(seen, capsys, suffi
     assert run(capsys, "render", "a.npz", *TINY, "--eye", 0, 0, 9, "--quantity", "cold", "-o", f"x.{suffix}")[0] == 0
     words = json.loads(dict(io.read_image(f"x.{suffix}").metadata)["jaxsph.command"])
     assert words[0] == "render" and "a.npz" in words and "--eye=0,0,9" in words and "--color-by=cold" in words
-    code, out, _ = run(capsys, "render", "--like", f"x.{suffix}", "a.npz", "--samples", 8)
-    assert code == 0 and out.splitlines()[0] == "a.png"
-    (_, one, _), (_, other, settings) = seen
-    assert one.describe() == other.describe() and settings.samples == 8
+    assert run(capsys, *words)[0] == 0
+    (_, one, first), (_, other, second) = seen
+    assert one.describe() == other.describe() and first == second
 
 
-def test_a_picture_that_says_no_command_is_refused(seen, capsys):
-    layer = np.zeros((4, 4), np.float32)
-    io.write_image("bare.png", js.Image(np.zeros((4, 4, 3), np.float32), layer, layer, layer, layer, True, 0, {}))
-    code, _, err = run(capsys, "render", "--like", "bare.png", "a.npz")
-    assert code == 2 and len(err) == 1 and "--like bare.png: it does not say by which command it was made" in err[0]
-
-
-def test_a_variable_of_the_environment_is_as_good_as_an_option(seen, monkeypatch, capsys):
-    monkeypatch.setenv("JAXSPH_QUIET", "1")
-    monkeypatch.setenv("JAXSPH_COLORMAP", "virdis")
-    code, out, err = run(capsys, "render", "a.npz", *TINY)
-    assert code == 2 and len(err) == 1 and "--colormap must be one of" in err[0]
-    monkeypatch.setenv("JAXSPH_COLORMAP", "heat")
-    code, out, err = run(capsys, "render", "a.npz", *TINY)
-    assert (code, out, err) == (0, "a.png\n", []), "JAXSPH_QUIET"
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        (["f", "--eye", "1", "-2", "3", "--target", "0", "0", "0"], ["f", "--eye=1,-2,3", "--target=0,0,0"]),
+        (["--eye", "-1,-2,3", "--target=0,0,0", "f"], ["--eye=-1,-2,3", "--target=0,0,0", "f"]),
+        (["--center", "densest", "f"], ["--center=densest", "f"]),
+        (["--eye", "1,2,3", "4", "--eye", "0", "0", "f"], ["4", "--eye=0,0", "f"]),
+        (["--quantity", "T"], ["--color-by=T"]),
+        (["--surface", "f", "-q"], ["--surface=0.5", "f", "--quiet"]),
+        (["--surface", "none", "f", "--quiet", "-q"], ["--surface=none", "f", "--quiet"]),
+        (["--clip", "box:a", "--clip", "box:b", "-o", "x", "-o=y"], ["--clip=box:a", "--clip=box:b", "--output=y"]),
+        (["--fov", "--size", "8x8", "--", "-f"], ["--fov", "--size=8x8", "--", "-f"]),
+    ],
+    ids=" ".join,
+)
+def test_places_may_be_several_words_and_each_option_has_one_spelling(words, new):
+    assert completed("render", words, cli.declared("render")) == new

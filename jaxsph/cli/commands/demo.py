@@ -34,7 +34,7 @@ CHECK = 64
 class Demo(groups.Options):
     """Options of the command."""
 
-    output: Annotated[Path, option("--output", "STEM", Path, OUTPUT, "path without suffix (default: demo)", short="-o")] = Path(
+    output: Annotated[Path, option(("--output", "-o"), "STEM", Path, OUTPUT, "path without suffix (default: demo)")] = Path(
         "demo"
     )
     size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default 512x512)")] = (512, 512)

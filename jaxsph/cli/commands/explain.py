@@ -29,7 +29,7 @@ from jaxsph.cli.voice import say
 class Explain(groups.Options, groups.Draft, groups.SurfaceLook, groups.View, groups.Beside, groups.Source):
     """Options of the command."""
 
-    pixel: Annotated[Any, option("--pixel", "R C", values.pixel, OWN, "row and column, from 0 at the top and the left")] = None
+    pixel: Annotated[Any, option("--pixel", "R,C", values.pixel, OWN, "row and column, from 0 at the top and the left")] = None
     output: Annotated[Path | None, output("a figure too: .png, .pdf or .svg")] = None
 
 

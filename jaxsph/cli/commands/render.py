@@ -15,11 +15,10 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph.analysis.surface_depth import surface_depth
+from jaxsph.cli import disk, voice
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli import disk
 from jaxsph.cli.commands import merge
 from jaxsph.cli.console import (
     IMAGES,

@@ -1,1 +1,1 @@
-"""Options of the commands: groups that Python shares, values as text, former spellings, and files that hold options."""
+"""Options of the commands: groups that Python shares, values as text, and files that hold options."""

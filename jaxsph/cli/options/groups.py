@@ -41,13 +41,12 @@ MAX_OPTICAL_DEPTH = 1e6
 
 
 def option(
-    name: str,
+    name: str | tuple[str, ...],
     metavar: str,
     read: Callable[[str], Any],
     group: Group,
     help: str,
     *,
-    short: str | None = None,
     show: bool = True,
     several: bool = False,
 ) -> Parameter:
@@ -56,9 +55,8 @@ def option(
     def made(_: Any, tokens: Sequence[Token]) -> Any:
         return tuple(read(token.value) for token in tokens) if several else read(tokens[-1].value)
 
-    names = (name,) if short is None else (name, short)
     return Parameter(
-        name=names,
+        name=name,
         metavar=metavar,
         converter=made,
         n_tokens=1,
@@ -71,10 +69,9 @@ def option(
     )
 
 
-def flag(name: str, group: Group, help: str, *, short: str | None = None, show: bool = True) -> Parameter:
+def flag(name: str | tuple[str, ...], group: Group, help: str, *, show: bool = True) -> Parameter:
     """An option without a value."""
-    names = (name,) if short is None else (name, short)
-    return Parameter(name=names, group=group, help=help, show=show, show_default=False, negative="")
+    return Parameter(name=name, group=group, help=help, show=show, show_default=False, negative="")
 
 
 @Parameter(name="*")
@@ -91,11 +88,10 @@ class Options:
     source: Annotated[Any, NOT_HERE] = None
     command: Annotated[str, NOT_HERE] = ""
     words: Annotated[tuple[str, ...], NOT_HERE] = ()
-    quiet: Annotated[bool, flag("--quiet", COMMON, "say nothing but results and what is wrong", short="-q")] = False
-    verbose: Annotated[bool, flag("--verbose", COMMON, "show where an error comes from", short="-v")] = False
+    quiet: Annotated[bool, flag(("--quiet", "-q"), COMMON, "say nothing but results and what is wrong")] = False
+    verbose: Annotated[bool, flag(("--verbose", "-v"), COMMON, "show where an error comes from")] = False
     json: Annotated[bool, flag("--json", COMMON, "results and what was chosen as one JSON object on stdout")] = False
     config: Annotated[Any, option("--config", "FILE.toml", Path, COMMON, "take options from a file; those beside it win")] = None
-    save_config: Annotated[Any, option("--save-config", "FILE.toml", Path, COMMON, "write the options to a file")] = None
     no_cache: Annotated[bool, flag("--no-cache", COMMON, "keep no compiled programs for the next command", show=False)] = False
 
     def __post_init__(self) -> None:
@@ -141,7 +137,13 @@ class Source(Selection):
 
     color_by: Annotated[
         str | None,
-        option("--color-by", "NAME", str, DATA, "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values"),
+        option(
+            ("--color-by", "--quantity"),
+            "NAME",
+            str,
+            DATA,
+            "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values",
+        ),
     ] = None
     opacity_by: Annotated[
         str | None, option("--opacity-by", "NAME", str, DATA, "the same for opacity alone (default: density where it spreads)")
@@ -358,9 +360,6 @@ class Draft(Control):
     """The same, of pictures that may be drafts."""
 
     draft: Annotated[bool, flag("--draft", QUALITY, "a quarter of the samples, for looking around")] = False
-    like: Annotated[
-        Any, option("--like", "PICTURE", Path, DATA, "take the options by which a picture was made; those beside it win")
-    ] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -378,4 +377,4 @@ class Key:
 
 def output(help: str, metavar: str = "OUT") -> Parameter:
     """The option of what is written."""
-    return option("--output", metavar, Path, OUTPUT, help, short="-o")
+    return option(("--output", "-o"), metavar, Path, OUTPUT, help)

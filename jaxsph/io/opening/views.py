@@ -96,7 +96,7 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
         outside = num_outside(scene, camera)
         if outside and clip is None:
             count = scene.particle_set.num_particles
-            said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --frame-all shows them"))
+            said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --width all shows them"))
         return camera, clip, said
     width, told = length_of(view.width, "width", unit)
     if center is None:
