@@ -31,7 +31,7 @@ from jaxsph.numerics.version import __version__
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 AGAIN_SECONDS = 0.02
 HELP, SHORT_HELP, VERSION = "--help", "-h", "--version"
-ALOUD = ("info", "demo", "doctor", "cache")
+ALOUD = ("info", "demo", "doctor")
 """Commands whose result is what they say."""
 WIDTH, MIN_WIDTH = 110, 95
 FIRST_STEPS = "Examples:\n  jaxsph render snap_042.hdf5\n  jaxsph info snap_042.hdf5\n"

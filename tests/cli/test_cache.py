@@ -45,7 +45,7 @@ def test_a_second_process_loads_what_the_first_compiled(command, tmp_path):
     assert COMPILING not in said, "nothing was missing from the cache"
     assert (tmp_path / "out.png").read_bytes() == first
     assert sorted((tmp_path / "cache").rglob("*-cache")) == kept
-    told, _ = command("info", "--cache")
+    told, _ = command("doctor")
     assert str(tmp_path / "cache") in told and f"{len(kept)} compiled programs" in told and "268 MB" in told
 
 
@@ -58,7 +58,7 @@ def test_without_the_cache_nothing_is_written(command, tmp_path):
 @pytest.mark.slow
 def test_a_folder_that_the_user_names_is_taken(command, tmp_path):
     folder = tmp_path / "mine"
-    told, _ = command("info", "--cache", JAX_COMPILATION_CACHE_DIR=str(folder))
+    told, _ = command("doctor", JAX_COMPILATION_CACHE_DIR=str(folder))
     assert str(folder) in told and "0 compiled programs" in told
     command(*RENDER, JAX_COMPILATION_CACHE_DIR=str(folder), JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
     assert list(folder.iterdir()) and not (tmp_path / "cache").exists()

@@ -39,9 +39,7 @@ RUNS = {
     "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"], ["sweep", SCENE, "-o", "out"]),
     "merge": (["merge", "FILE.exr", "-o", "a.png"],),
     "demo": (["demo", *SMALL],),
-    "doctor": (["doctor"],),
-    "cache": (["cache"],),
-    "completion": (["completion", "bash"],),
+    "doctor": (["doctor"], ["doctor", "--completion", "bash"]),
 }  # fmt: skip
 OF_ALL = {"quiet", "verbose", "json", "config", "no_cache"}
 """What is read before a command is, see `test_words.py` and `test_voice.py`."""

@@ -102,11 +102,11 @@ def test_asking_is_heard_while_an_object_is_thrown_away(folder, capsys, monkeypa
         Asking()
         time.sleep(60)
 
-    monkeypatch.setattr(sys, "argv", ["jaxsph", "info", "--cache"])
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
     monkeypatch.setattr(cli_cache, "begin", work)
     started, hook = time.monotonic(), sys.unraisablehook
     assert cli.main() == 143 and time.monotonic() - started < 50
-    assert capsys.readouterr().err.splitlines() == ["jaxsph info: terminated"] and sys.unraisablehook is hook
+    assert capsys.readouterr().err.splitlines() == ["jaxsph doctor: terminated"] and sys.unraisablehook is hook
 
 
 @posix
@@ -119,7 +119,7 @@ def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
         Asking()
 
     late = []
-    monkeypatch.setattr(sys, "argv", ["jaxsph", "info", "--cache"])
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
     monkeypatch.setattr(cli_cache, "begin", work)
     monkeypatch.setattr(cli, "AGAIN_SECONDS", 5)
     assert cli.main() == 0
@@ -134,12 +134,12 @@ def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
 @pytest.mark.parametrize("handler", [signal.SIG_IGN, signal.default_int_handler])
 def test_signals_that_are_ignored_or_somebody_elses_are_left_alone(handler, folder, capsys, monkeypatch):
     seen = []
-    monkeypatch.setattr(sys, "argv", ["jaxsph", "info", "--cache"])
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
     monkeypatch.setattr(cli_cache, "begin", lambda **_: seen.append(signal.getsignal(signal.SIGTERM)))
     signal.signal(signal.SIGTERM, handler)
     assert cli.main() == 0 and seen == [handler] and signal.getsignal(signal.SIGTERM) is handler
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    assert cli.main(["info", "--cache"]) == 0 and len(seen) == 1
+    assert cli.main(["doctor"]) == 0 and len(seen) == 1
 
 
 def ends(group):

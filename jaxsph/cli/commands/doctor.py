@@ -5,13 +5,19 @@ Flow: installed packages, JAX -> [doctor] -> lines on stdout.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import platform
 import sys
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from jaxsph.cli import cache as kept
 from jaxsph.cli import voice
 from jaxsph.cli.options import groups
+from jaxsph.cli.options.table import app
+from jaxsph.cli.options.values import one_of
 from jaxsph.cli.voice import say
 from jaxsph.numerics.version import __version__
 
@@ -27,11 +33,30 @@ WANTED = {
     "distributed": "movies by several processes",
     "xarray": "labelled arrays",
 }
-OPTIONS = groups.Options()
+SHELLS = ("bash", "zsh", "fish")
+_COMPLETION = groups.option(
+    "--completion", "SHELL", one_of(SHELLS), groups.OWN, f"print what completes commands: {', '.join(SHELLS)}"
+)
 
 
-def doctor(*, asked: groups.Options = OPTIONS) -> None:
-    """Say versions, devices and the cache."""
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Doctor(groups.Options):
+    """Options of the command."""
+
+    completion: Annotated[str | None, _COMPLETION] = None
+
+
+OPTIONS = Doctor()
+
+
+def doctor(*, asked: Doctor = OPTIONS) -> None:
+    """Say versions, devices and the cache; or print a script by which a shell completes commands, options and names."""
+    if asked.completion is not None:
+        script = app().generate_completion(shell=asked.completion)  # type: ignore[arg-type]
+        voice.result(script)
+        voice.report(shell=asked.completion, script=script)
+        return
     import jax
 
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"

@@ -11,13 +11,11 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import cache
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import attributes, camera_line, refuse, say_notes, say_report, span, wrong_usage
 from jaxsph.cli.options import groups
-from jaxsph.cli.options.groups import COMMON, flag
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import report, result, say
 from jaxsph.io.opening.opened import Loaded, load, staged
@@ -31,8 +29,6 @@ from jaxsph.model.camera.camera import Bounded, BoundingBox
 class Info(groups.Options, groups.Beside, groups.Source):
     """Options of the command."""
 
-    cache: Annotated[bool, flag("--cache", COMMON, "what `jaxsph cache` says", show=False)] = False
-
 
 INFO = Info()
 
@@ -45,10 +41,6 @@ def info(
 ) -> None:
     """Say what a file holds, and what `render` would show of it."""
     options = dataclasses.replace(asked, source=file)
-    if options.cache:
-        cache.say_kept()
-        if options.source is None:
-            return
     cli_scene.require_something(options)
     parts: list[tuple[str, Bounded]] = []
     camera = None

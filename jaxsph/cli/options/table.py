@@ -84,13 +84,11 @@ COMMANDS = {
         ),
     ),
     "demo": Command(QUALITY, "demo", "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
-    "doctor": Command(SYSTEM, "doctor", "say versions, devices and the cache", ("jaxsph doctor",)),
-    "cache": Command(SYSTEM, "cache", "say where compiled programs are kept, and how large they are", ("jaxsph cache",)),
-    "completion": Command(
+    "doctor": Command(
         SYSTEM,
-        "completion",
-        "print what completes commands in a shell",
-        ('eval "$(jaxsph completion bash)"', "jaxsph completion zsh"),
+        "doctor",
+        "say versions, devices and the cache",
+        ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"'),
     ),
 }
 EXIT_CODES = (
