@@ -142,9 +142,10 @@ def _number_or_name(text: str | None) -> float | str | None:
 
 def _type(beside: Beside) -> int | None:
     text = beside.options.get("type")
-    if text is not None and not text.isdecimal():
-        raise UsageError(f"--points {beside.file}: type must be a whole number, got {text!r}")
-    return None if text is None else int(text)
+    try:
+        return None if text is None else int(text)
+    except ValueError:
+        raise UsageError(f"--points {beside.file}: type must be a whole number, got {text!r}") from None
 
 
 def _color(beside: Beside) -> tuple[float, ...] | str | None:

@@ -19,12 +19,10 @@ OPTIONS = {
     "values": "--range",
     "low": "the low end of --range",
     "fov_degrees": "--fov",
-    "num_particles": "particles of scene:NAME",
     "frame": "frame of scene:NAME",
     "box": "--box-size",
     "clips": "--clip",
     "frame_all": "--width all",
-    "domain": "--norm",
 }
 """Options whose names in the library differ."""
 SAME = (

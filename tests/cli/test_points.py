@@ -210,6 +210,7 @@ FAILURES = [
         "`color`: there is no column 'age': there are radius, r, g, b,",
     ),
     (["--points", "stars.csv:type=4"], "have no particle types"),
+    (["--points", "stars.csv:type=-1"], "have no particle types"),
     (["--points", "nowhere.csv"], "there is no such file"),
     (["drop.npz", "--volume", "drop.npz"], "volumes are read from .vti"),
     (["--volume", "gas.vti:quantity=rho"], "gas.vti: has no quantity 'rho'"),
