@@ -140,7 +140,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, ca
         (["s_0.npz", "s_1.npz", "--progressive"], "--progressive"),
         (["s_0.npz", "s_1.npz", "--support", -1], "--support"),
         (["s_0.npz", "s_1.npz", "--iso", 1], "--iso"),
-        (["s_0.npz", "s_1.npz", "--workers", 0], "--workers must be at least 1"),
+        (["s_0.npz", "s_1.npz", "--workers", 0], "--workers must be a whole number of at least 1, got '0'"),
         (["s_0.npz", "s_1.npz", "--workers", 2, "--client", "tcp://x:1"], "--workers and --client exclude each other"),
         (["s_0.npz", "s_1.npz", "--client", "nonsense"], "no address of a scheduler"),
         (["s_0.npz", "s_1.npz", "--where", "entropy > 1"], "no quantity 'entropy'"),

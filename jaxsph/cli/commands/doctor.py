@@ -17,7 +17,6 @@ from jaxsph.cli import cache as kept
 from jaxsph.cli import voice
 from jaxsph.cli.options import groups
 from jaxsph.cli.options.table import app
-from jaxsph.cli.options.values import one_of
 from jaxsph.cli.voice import say
 from jaxsph.numerics.version import __version__
 
@@ -34,9 +33,6 @@ WANTED = {
     "xarray": "labelled arrays",
 }
 SHELLS = ("bash", "zsh", "fish")
-_COMPLETION = groups.option(
-    "--completion", "SHELL", one_of(SHELLS), groups.OWN, f"print what completes commands: {', '.join(SHELLS)}"
-)
 
 
 @Parameter(name="*")
@@ -44,7 +40,7 @@ _COMPLETION = groups.option(
 class Doctor(groups.Options):
     """Options of the command."""
 
-    completion: Annotated[str | None, _COMPLETION] = None
+    completion: Annotated[str | None, groups.choice("--completion", SHELLS, groups.OWN, "print what completes commands")] = None
 
 
 OPTIONS = Doctor()

@@ -75,15 +75,13 @@ class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, gro
     ] = None
     fps: Annotated[float, option("--fps", "F", values.number, OWN, "frames a second (default 24)")] = 24.0
     frames: Annotated[
-        int | None, option("--frames", "N", values.whole, OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
+        int | None, option("--frames", "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
     ] = None
-    frame_format: Annotated[
-        str, option("--frame-format", "NAME", values.one_of(FORMATS), OUTPUT, "of the frames: png or exr (default png)")
-    ] = "png"
+    frame_format: Annotated[str, groups.choice("--frame-format", FORMATS, OUTPUT, "of the frames", more=" (default png)")] = "png"
     gaps: Annotated[bool, flag("--gaps", OWN, "go on where numbers are missing in the names of a sequence")] = False
     strict: Annotated[bool, flag("--strict", OWN, "end where a file cannot be read (default: render the others)")] = False
     workers: Annotated[
-        int | None, option("--workers", "N", values.whole, MEANS, "render frames by N processes of this machine")
+        int | None, option("--workers", "N", values.count(1), MEANS, "render frames by N processes of this machine")
     ] = None
     client: Annotated[
         str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
@@ -146,13 +144,9 @@ def _checked(options: Any) -> Path:
     if not options.source:
         raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
     output: Path = options.output or Path(f"{_stem(options.source[0])}.mp4")
-    if output.suffix.lower() != ".mp4":
-        raise UsageError(f"{output}: a movie must be .mp4; its frames may be EXR by --frame-format exr")
-    require_writable(output, "a movie must be", (".mp4",))
+    require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
     if not 0 < options.fps <= io.images.movie.MAX_FPS:
         raise UsageError(f"--fps must lie in (0, {io.images.movie.MAX_FPS:g}], got {options.fps:g}")
-    if options.frames is not None and options.frames < 1:
-        raise UsageError(f"--frames must be at least 1, got {options.frames}")
     if (options.frames or 0) > MAX_FRAMES:
         lasting = f"that is {options.frames / options.fps / 3600:,.4g} hours at --fps {options.fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
@@ -166,8 +160,6 @@ def _checked(options: Any) -> Path:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
     if options.camera is not None:
         refuse(options, cli_where.PLACED, "and --camera exclude each other; KEYS.json places the camera")
-    if options.workers is not None and options.workers < 1:
-        raise UsageError(f"--workers must be at least 1, got {options.workers}")
     return output
 
 

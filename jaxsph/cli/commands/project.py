@@ -90,10 +90,7 @@ class Project(groups.Options, groups.Selection, groups.View):
         ),
     ] = None
     colormap: Annotated[str | None, groups.colormap_option("of a .png: a colour map (default viridis)")] = None
-    norm: Annotated[
-        str | None,
-        option("--norm", "NAME", values.one_of(NORMS), LOOK, f"of a .png: {', '.join(NORMS)} (default: log over a decade)"),
-    ] = None
+    norm: Annotated[str | None, groups.choice("--norm", NORMS, LOOK, "of a .png", more=" (default: log over a decade)")] = None
     range: Annotated[
         Any, option("--range", "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
     ] = None

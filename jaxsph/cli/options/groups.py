@@ -6,7 +6,7 @@ A command offers what its groups hold, and nothing else. Options that are seldom
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -69,6 +69,12 @@ def option(
     )
 
 
+def choice(name: str, names: Iterable[str], group: Group, help: str, *, more: str = "", show: bool = True) -> Parameter:
+    """An option whose value is one of some names, which its help lists, with `more` behind them."""
+    known = tuple(names)
+    return option(name, "NAME", values.one_of(known), group, f"{help}: {', '.join(known)}{more}", show=show)
+
+
 def flag(name: str | tuple[str, ...], group: Group, help: str, *, show: bool = True) -> Parameter:
     """An option without a value."""
     return Parameter(name=name, group=group, help=help, show=show, show_default=False, negative="")
@@ -103,14 +109,7 @@ class Options:
 
 
 _SUPPORT = option("--support", "H", values.number, DATA, "support radius (default: the file's, or from neighbours)")
-_KERNEL = option(
-    "--kernel",
-    "NAME",
-    values.one_of(tuple(KERNELS)),
-    DATA,
-    f"smoothing kernel: {', '.join(KERNELS)} (default: the file's)",
-    show=False,
-)
+_KERNEL = choice("--kernel", KERNELS, DATA, "smoothing kernel", more=" (default: the file's)", show=False)
 _TYPE = option("--part-type", "N", values.whole, DATA, "of a Gadget-like file (default: gas, else the first)")
 _BOX = option("--box-size", "LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)")
 _WHERE = option("--where", "CONDITION", str, DATA, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them')
@@ -185,9 +184,7 @@ class Mixed(Beside):
     iso: Annotated[
         float | None, option("--iso", "LEVEL", values.number, DATA, "of a volume, the surface on which its values are LEVEL")
     ] = None
-    mix: Annotated[
-        str | None, option("--mix", "NAME", values.one_of(MIXES), DATA, f"how parts mix colours: {', '.join(MIXES)}", show=False)
-    ] = None
+    mix: Annotated[str | None, choice("--mix", MIXES, DATA, "how parts mix colours", show=False)] = None
 
 
 def require_length(text: str) -> None:
@@ -217,9 +214,7 @@ class View(opening.View):
 
     center: Annotated[Any, _CENTER] = None
     width: Annotated[Any, _WIDTH] = None
-    view: Annotated[
-        str | None, option("--view", "NAME", values.one_of(opening.VIEWS), CAMERA, f"{', '.join(opening.VIEWS)} (default iso)")
-    ] = None
+    view: Annotated[str | None, choice("--view", opening.VIEWS, CAMERA, "from where", more=" (default iso)")] = None
     eye: Annotated[Any, option("--eye", "X,Y,Z", values.place, CAMERA, "perspective from here")] = None
     target: Annotated[Any, option("--target", "X,Y,Z", values.place, CAMERA, "what the eye looks at")] = None
     up: Annotated[Any, _UP] = None
@@ -259,14 +254,9 @@ class Look(opening.Look):
     """Colours and opacity."""
 
     colormap: Annotated[str | None, _COLORMAP] = None
-    norm: Annotated[
-        str | None, option("--norm", "NAME", values.one_of(tuple(DOMAINS)), LOOK, f"where colours sit: {', '.join(DOMAINS)}")
-    ] = None
+    norm: Annotated[str | None, choice("--norm", DOMAINS, LOOK, "where colours sit")] = None
     range: Annotated[Any, _RANGE] = None
-    preset: Annotated[
-        str | None,
-        option("--preset", "NAME", values.one_of(tuple(PRESETS)), LOOK, f"kind of data: {', '.join(PRESETS)}"),
-    ] = None
+    preset: Annotated[str | None, choice("--preset", PRESETS, LOOK, "kind of data")] = None
     transfer: Annotated[Any, option("--transfer", "FILE.json", Path, LOOK, "a transfer function that was saved")] = None
     exposure: Annotated[
         float, option("--exposure", "STOPS", values.number, LOOK, "more, or less, opaque than what is chosen")
@@ -307,6 +297,12 @@ class SurfaceLook(Look):
     ] = None
 
 
+_INTEGRATOR = choice(
+    "--integrator", registry.INTEGRATORS, QUALITY, "how samples become light", more=f" (default {Settings().integrator})"
+)
+_SCREEN = choice("--screen", SCREENS, QUALITY, "how rays become pixels", more=" (interpolated within the tolerance)", show=False)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Quality:
     """How exactly light is summed up along rays."""
@@ -314,16 +310,7 @@ class Quality:
     samples: Annotated[
         int | None, option("--samples", "N", values.whole, QUALITY, f"samples along a ray (default {Settings().samples})")
     ] = None
-    integrator: Annotated[
-        str | None,
-        option(
-            "--integrator",
-            "NAME",
-            values.one_of(tuple(registry.INTEGRATORS)),
-            QUALITY,
-            f"how samples become light: {', '.join(registry.INTEGRATORS)} (default {Settings().integrator})",
-        ),
-    ] = None
+    integrator: Annotated[str | None, _INTEGRATOR] = None
     memory: Annotated[float | None, option("--memory", "GIB", values.memory, MEANS, "working memory (default 4)")] = None
 
 
@@ -334,25 +321,12 @@ class Control(Quality):
     tolerance: Annotated[
         float | None, option("--tolerance", "T", values.number, QUALITY, "largest error of a pixel (default: none asked for)")
     ] = None
-    estimator: Annotated[
-        str | None,
-        option("--estimator", "NAME", values.one_of(ESTIMATORS), QUALITY, ", ".join(ESTIMATORS)),
-    ] = None
+    estimator: Annotated[str | None, choice("--estimator", ESTIMATORS, QUALITY, "how errors are known")] = None
     relax: Annotated[
         float | None,
         option("--relax", "R", values.number, QUALITY, "0 is certified, 1 takes neighbouring rays for alike", show=False),
     ] = None
-    screen: Annotated[
-        str | None,
-        option(
-            "--screen",
-            "NAME",
-            values.one_of(SCREENS),
-            QUALITY,
-            "pixels, or quadtree: pixels are interpolated where the tolerance allows it",
-            show=False,
-        ),
-    ] = None
+    screen: Annotated[str | None, _SCREEN] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

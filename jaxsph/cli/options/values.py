@@ -156,11 +156,17 @@ class Named:
     ends: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
-SHAPES: dict[str, tuple[str, Callable[[tuple[float, ...]], Clip]]] = {
-    "box": ("X0,Y0,Z0,X1,Y1,Z1", lambda given: Box(given[:3], given[3:])),
-    "sphere": ("X,Y,Z,R", lambda given: Sphere(given[:3], given[3])),
-    "plane": ("X,Y,Z,NX,NY,NZ", lambda given: Plane(given[:3], given[3:])),
+Numbers = tuple[float, ...]
+SHAPES: dict[str, tuple[str, Callable[[Numbers], Clip], Callable[[Numbers], tuple[Numbers, Numbers] | None]]] = {
+    "box": ("X0,Y0,Z0,X1,Y1,Z1", lambda given: Box(given[:3], given[3:]), lambda given: (given[:3], given[3:])),
+    "sphere": (
+        "X,Y,Z,R",
+        lambda given: Sphere(given[:3], given[3]),
+        lambda given: (tuple(one - given[3] for one in given[:3]), tuple(one + given[3] for one in given[:3])),
+    ),
+    "plane": ("X,Y,Z,NX,NY,NZ", lambda given: Plane(given[:3], given[3:]), lambda given: None),
 }
+"""Of each: its numbers, the clip that they make, and corners of the box around it, where it is bounded."""
 
 
 def clip(text: str) -> Named:
@@ -169,28 +175,17 @@ def clip(text: str) -> Named:
         return Named(text, None)
     kind, _, given = text.removeprefix("~").partition(":")
     if kind not in SHAPES:
-        kinds = ", ".join(f"{name}:{names}" for name, (names, _) in SHAPES.items())
+        kinds = ", ".join(f"{name}:{names}" for name, (names, *_) in SHAPES.items())
         raise ValueError(
             f"must be {kinds}, with ~ before it for what is outside, or none; got {text!r}{did_you_mean(kind, SHAPES)}"
         )
-    names, make = SHAPES[kind]
+    names, make, ends = SHAPES[kind]
     try:
         found = numbers(names)(given)
         made = make(found)
     except ValueError as error:
         raise ValueError(f"{text}: {str(error).replace('`', '')}") from None
-    if text.startswith("~"):
-        return Named(text, ~made)
-    return Named(text, made, _ends(kind, found))
-
-
-def _ends(kind: str, given: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    """Corners of the box around a shape."""
-    if kind == "box":
-        return given[:3], given[3:]
-    if kind == "sphere":
-        return tuple(one - given[3] for one in given[:3]), tuple(one + given[3] for one in given[:3])
-    return None
+    return Named(text, ~made) if text.startswith("~") else Named(text, made, ends(found))
 
 
 def plane(text: str) -> Plane:
