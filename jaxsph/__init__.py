@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from jaxsph.model.points import Points
     from jaxsph.model.scene import Scene
     from jaxsph.model.settings import Settings
-    from jaxsph.model.strategies import Bounds, Pilot, Quadtree, Samples, Segments, StepDoubling
     from jaxsph.model.transfer.function import TransferFunction
     from jaxsph.model.volume import Volume
     from jaxsph.numerics.faults import CapacityError
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
     from jaxsph.viewer.widget import view
 
 __all__ = [
-    "Bounds",
     "Box",
     "Camera",
     "CameraPath",
@@ -51,16 +49,11 @@ __all__ = [
     "Image",
     "IsoSurface",
     "Particles",
-    "Pilot",
     "Plane",
     "Points",
-    "Quadtree",
-    "Samples",
     "Scene",
-    "Segments",
     "Settings",
     "Sphere",
-    "StepDoubling",
     "Surface",
     "TransferFunction",
     "Volume",
@@ -117,12 +110,6 @@ NAMES = {
     "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",
-    "Samples": "jaxsph.model.strategies:Samples",
-    "Bounds": "jaxsph.model.strategies:Bounds",
-    "Pilot": "jaxsph.model.strategies:Pilot",
-    "Segments": "jaxsph.model.strategies:Segments",
-    "StepDoubling": "jaxsph.model.strategies:StepDoubling",
-    "Quadtree": "jaxsph.model.strategies:Quadtree",
     "CapacityError": "jaxsph.numerics.faults:CapacityError",
     # Sequences.
     "render_frames": "jaxsph.sequence.frames:render_frames",

@@ -10,23 +10,19 @@ import jax
 import numpy as np
 
 from jaxsph.model.registry import INTEGRATORS, SCREENS, estimates
-from jaxsph.model.strategies import alike, spread
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.trees import fill, tree
+from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
 NUMBERS = "tolerance", "relax", "min_transmittance"
 LEAF_PIXELS = 4, 8, 16, 32
 ALLOCATIONS = ("budget", "greedy")
+PLAIN = str, int, float, type(None)
 
 
 @tree(traced=NUMBERS, unchecked=True, kw_only=True)
 class Settings:
     """Choices of the user; hashable where they fix a shape.
-
-    `integrator` and `screen` take names, or objects that have the knobs of what reads them: `js.Samples(errors=js.Pilot())`,
-    `js.Segments()`, `js.StepDoubling(tolerance=1e-3)`, `js.Quadtree(leaf_pixels=8)`. These are spread over the fields below: what
-    is kept is the name, and settings that say the same are equal.
 
     `tolerance`, `relax` and `min_transmittance` are leaves, and floats.
 
@@ -49,7 +45,7 @@ class Settings:
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does.
-        integrator: how samples along a ray become light, a name or a strategy; `"samples"` are points, each of which stands for
+        integrator: how samples along a ray become light; `"samples"` are points, each of which stands for
             what lies around it (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear
             from one to the next, the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where
             supports begin and end in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those
@@ -75,16 +71,17 @@ class Settings:
     super_pixels: bool = True
     merge: bool = True
     allocation: str = "budget"
-    integrator: Any = "samples"
+    integrator: str = "samples"
     step_tolerance: float = 1e-3
-    screen: Any = "pixels"
+    screen: str = "pixels"
     leaf_pixels: int = 8
     min_transmittance: Any = 0.0
     memory_limit: int | None = None
 
     def __repr__(self) -> str:
         changed = ((field.name, getattr(self, field.name), field.default) for field in dataclasses.fields(self))
-        return f"Settings({', '.join(f'{name}={value!r}' for name, value, default in changed if not alike(value, default))})"
+        told = (f"{name}={one!r}" for name, one, usual in changed if not (isinstance(one, PLAIN) and one == usual))
+        return f"Settings({', '.join(told)})"
 
     @property
     def is_refined(self) -> bool:
@@ -92,7 +89,6 @@ class Settings:
         return self.tolerance is not None and estimates(self.integrator) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
-        fill(self, **spread(vars(self), {field.name: field.default for field in dataclasses.fields(self)}))
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         self._require_choices()

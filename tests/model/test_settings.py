@@ -1,5 +1,7 @@
 """Promises of settings and scene: what cannot be meant is refused when made."""
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import jaxsph as js
@@ -18,6 +20,10 @@ import jaxsph as js
         ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
         ({"estimator": "guess"}, "`estimator` must be one of interval, pilot, got 'guess'"),
         ({"allocation": "fair"}, "`allocation` must be one of budget, greedy"),
+        ({"leaf_pixels": 5}, "`leaf_pixels` must be one of"),
+        ({"step_tolerance": 0}, "`step_tolerance` must be"),
+        ({"integrator": 3}, "`integrator` must be one of samples, segments, step_doubling, got 3"),
+        ({"integrator": ["samples"]}, "`integrator` must be one of"),
     ],
 )
 def test_bad_settings_are_refused(change, message):
@@ -28,6 +34,21 @@ def test_bad_settings_are_refused(change, message):
 def test_settings_are_hashable_and_equal_by_value():
     assert hash(js.Settings(samples=8)) == hash(js.Settings(samples=8))
     assert js.Settings(samples=8) != js.Settings(samples=9)
+
+
+def test_numbers_of_settings_may_be_traced():
+    assert jax.jit(lambda relax: js.Settings(tolerance=0.1, relax=relax).relax * 2)(jnp.float32(0.25)) == 0.5
+
+
+def test_settings_say_what_differs_from_the_defaults():
+    assert repr(js.Settings()) == "Settings()"
+    told = repr(js.Settings(tolerance=0.004, integrator="segments", screen="quadtree"))
+    assert told == "Settings(tolerance=0.004, integrator='segments', screen='quadtree')"
+    assert "relax=" in repr(jax.tree.map(lambda _: object(), js.Settings(relax=0.5)))
+    assert "tolerance=Array(" in repr(js.Settings(tolerance=jnp.zeros(2)))
+    names = []
+    jax.make_jaxpr(lambda one: names.append(repr(one)) or one.relax)(js.Settings(samples=3))
+    assert names[0].startswith("Settings(samples=3, relax=")
 
 
 def test_a_scene_of_the_wrong_parts_is_refused():
