@@ -30,6 +30,7 @@ from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, make
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
+from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
 from jaxsph.model.transfer.function import TransferFunction
 
@@ -75,8 +76,7 @@ class Frame:
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
         inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
-        integrator, packets = registry.integrator(*self.plan.chosen_integrator), registry.screen(self.plan.screen).packets
-        method = CastMethod(self.kernel, self.plan.cast, integrator, packets)
+        method = CastMethod(self.kernel, self.plan.cast, registry.integrator(*self.plan.chosen_integrator), every_bundle)
         rays = cast_shard(*inputs, shards=1, method=method, **self.sizes).rays
         return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
 

@@ -6,8 +6,7 @@ Names are imported when they are first used (PEP 562), so that importing this mo
 from typing import TYPE_CHECKING
 
 import jaxsph.engine.cast
-import jaxsph.engine.screen
-import jaxsph.plot.methods  # noqa: F401 (integrators, screens and methods are entered there)
+import jaxsph.plot.methods  # noqa: F401 (integrators and methods are entered there)
 from jaxsph.numerics.names import lazy
 from jaxsph.numerics.version import __version__ as __version__
 

@@ -16,18 +16,18 @@ from jaxsph.model import registry
 
 PAGE = (Path(__file__).parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = {re.match(r"# (\w+)\.py\n", block)[1]: block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)}
-ENTRIES = re.findall(r'`(INTEGRATORS|SCREENS)\["(\w+)"\] = "jaxsph\.(?:\w+\.)+(\w+:\w+)"`', PAGE)
+ENTRIES = re.findall(r'`INTEGRATORS\["(\w+)"\] = "jaxsph\.(?:\w+\.)+(\w+:\w+)"`', PAGE)
 CENTRE, RADIUS, DENSITY, COLOR = (0.1, -0.05, 0.0), 0.6, 1.5, (0.2, 0.5, 0.9)
 
 
 @pytest.fixture
 def added(tmp_path, monkeypatch):
-    """The page's files, where they can be imported, and its entries in the registry."""
+    """The page's files, where they can be imported, and its entry in the registry."""
     for name, code in FILES.items():
         (tmp_path / f"{name}.py").write_text(code, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    for table, name, place in ENTRIES:
-        monkeypatch.setitem(getattr(registry, table), name, place)
+    for name, place in ENTRIES:
+        monkeypatch.setitem(registry.INTEGRATORS, name, place)
     return {name: importlib.import_module(name) for name in FILES}
 
 
@@ -60,7 +60,7 @@ def chords(view):
 
 
 def test_the_page_adds_one_of_each():
-    assert set(FILES) == {"ball", "trapezoids", "every_other"} and len(ENTRIES) == 2
+    assert set(FILES) == {"ball", "trapezoids"} and len(ENTRIES) == 1
 
 
 def test_a_ball_without_particles_is_the_light_integral_but_for_its_borders(added):
@@ -142,25 +142,10 @@ def test_trapezoids_are_differentiable_without_an_adjoint_of_their_own(added):
         np.testing.assert_allclose(found[k], wanted, rtol=5e-3, atol=1e-2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "size", [(37, 29), pytest.param((8, 8), marks=pytest.mark.slow), pytest.param((1, 1), marks=pytest.mark.slow)]
-)
-def test_every_other_pixel_shows_the_ray_that_was_cast_there(added, size):
-    scene, view = js.Scene(**particles(60)), camera(*size)
-    every, other = (js.render(scene, view, js.Settings(samples=64, screen=screen)) for screen in ("pixels", "every_other"))
-    for layer in ("color", "transmittance", "depth"):
-        wanted, found = (np.asarray(getattr(image, layer)) for image in (every, other))
-        np.testing.assert_array_equal(found[::2, ::2], wanted[::2, ::2])
-        np.testing.assert_array_equal(found[1::2, 1::2], found[::2, ::2][: found.shape[0] // 2, : found.shape[1] // 2])
-    assert other.stats["evaluations"] == pytest.approx(every.stats["evaluations"] / 4)
-
-
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
         ({"integrator": "trapezoids"}, "integrator='trapezoids'"),
-        ({"screen": "every_other"}, "screen='every_other'"),
         ({}, "media"),
     ],
 )

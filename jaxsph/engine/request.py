@@ -85,7 +85,6 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         return settings
     beyond = {
         f"`integrator={settings.integrator!r}`": settings.integrator != "samples" and not registry.estimates(settings.integrator),
-        f"`screen={settings.screen!r}`": settings.screen not in ("pixels", "quadtree"),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
         "`Scene(points=...)`": bool(scene.point_sets),

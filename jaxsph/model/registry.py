@@ -1,9 +1,9 @@
-"""What rooms above this one enter: integrators and screen samplers that are chosen by name, and methods of what is here.
+"""What rooms above this one enter: integrators that are chosen by name, and methods of what is here.
 
 Flow: settings -> [registry] -> stages; `Image.save`, `TransferFunction.figure`, ... -> [registry] -> files, figures.
 
-Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast`,
-`jaxsph.engine.screen` and `jaxsph.plot.methods`, which `jaxsph` imports; any other package may enter its own.
+Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast` and
+`jaxsph.plot.methods`, which `jaxsph` imports; any other package may enter its own.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from jaxsph.numerics.names import found
 
 INTEGRATORS: dict[str, str] = {}
 """Classes, each a `jaxsph.engine.cast.integrator.Integrator`; without arguments, but for those that ask for points."""
-SCREENS: dict[str, str] = {}  # classes without arguments, each a `jaxsph.engine.screen.sampler.ScreenSampler`
 METHODS: dict[str, str] = {}  # functions, by class and attribute: `"Image.writer"`
 
 
@@ -45,11 +44,6 @@ def integrator_class(name: str) -> Any:
 def estimates(name: str) -> bool:
     """Whether there is an integrator of that name that estimates its error, against the light integral."""
     return name in INTEGRATORS and bool(integrator_class(name).estimates)
-
-
-def screen(name: str) -> Any:
-    """The screen sampler of that name: one object a process, so that it may be static in what is compiled."""
-    return _made(SCREENS[name])
 
 
 @functools.cache

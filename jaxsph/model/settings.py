@@ -9,11 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.model.registry import INTEGRATORS, SCREENS, estimates
+from jaxsph.model.registry import INTEGRATORS, estimates
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
+SCREENS = ("pixels", "quadtree")
 NUMBERS = "tolerance", "relax", "min_transmittance"
 LEAF_PIXELS = 4, 8, 16, 32
 ALLOCATIONS = ("budget", "greedy")

@@ -6,8 +6,8 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.cast.integrator import Integrator
-from jaxsph.engine.screen.sampler import ScreenSampler
 from jaxsph.model import registry
+from jaxsph.model.settings import SCREENS
 
 
 @pytest.mark.parametrize("name", registry.INTEGRATORS)
@@ -17,23 +17,16 @@ def test_integrators_are_found(name):
     assert js.Settings(integrator=name).integrator == name
 
 
-@pytest.mark.parametrize("name", registry.SCREENS)
-def test_screens_are_found(name):
-    found = registry.screen(name)
-    assert isinstance(found, ScreenSampler) and found is registry.screen(name)
-    assert js.Settings(screen=name).screen == name
-
-
-@pytest.mark.parametrize(("choice", "known"), [("integrator", registry.INTEGRATORS), ("screen", registry.SCREENS)])
+@pytest.mark.parametrize(("choice", "known"), [("integrator", registry.INTEGRATORS), ("screen", SCREENS)])
 def test_unknown_names_are_refused_with_those_that_are_known(choice, known):
     with pytest.raises(ValueError, match=f"`{choice}` must be one of {', '.join(known)}, got 'none such'"):
         js.Settings(**{choice: "none such"})
 
 
 def test_what_is_entered_can_be_chosen(monkeypatch):
-    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
-    assert js.Settings(screen="again").screen == "again"
-    assert registry.screen("again") is registry.screen("pixels")
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    assert js.Settings(integrator="again").integrator == "again"
+    assert registry.integrator("again") is registry.integrator("samples")
 
 
 def test_integrators_say_themselves_what_they_ask_for():

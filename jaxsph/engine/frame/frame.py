@@ -44,6 +44,7 @@ from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.runtime.executors import Executor
+from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
@@ -135,8 +136,8 @@ class Frame:
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.min_transmittance, tolerance)
         inputs = [(grid, shown, schedule, lattice, limits, nth) for schedule, nth in zip(schedules, each, strict=True)]
-        integrator, packets = registry.integrator(*plan.chosen_integrator), registry.screen(plan.screen).packets
-        method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets, self.formulas.mix)
+        integrator = registry.integrator(*plan.chosen_integrator)
+        method = CastMethod(self.formulas.kernel, plan.cast, integrator, every_bundle, self.formulas.mix)
         rays: list[Cast] = run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
         return rays
 

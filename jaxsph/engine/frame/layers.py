@@ -17,11 +17,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.shards import unshard
-from jaxsph.engine.cast.march import RayResult
 from jaxsph.engine.frame.stages import Cast, Verdict
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import compiled_quickly
-from jaxsph.model import registry
 from jaxsph.numerics.checks import is_traced
 
 REFERENCE = "samples"
@@ -101,22 +99,20 @@ def develop(bands: tuple[OfShards, ...], *, plan: Plan) -> Layers:
 
 def of_band(band: OfShards, *, plan: Plan) -> Layers:
     """The layers of a band."""
-    lists, over_pixels, verdict = plan.lists, plan.lists.over_pixels, unshard(band.verdicts)
+    as_image, over_pixels, verdict = plan.lists.as_image, plan.lists.over_pixels, unshard(band.verdicts)
     spent = unshard(tuple(shard.evaluations for shard in band.cast))
     color = unshard(tuple(shard.rays.color for shard in band.cast), 1)
     transmittance = unshard(tuple(shard.rays.transmittance for shard in band.cast), 0)
     depth = unshard(tuple(shard.rays.depth for shard in band.cast), 0)
-    pixels = registry.screen(plan.screen).resolve(RayResult(color, transmittance, depth), lists)
-    levels = None if verdict.levels is None else lists.as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
+    color, transmittance, depth = as_image(jnp.moveaxis(color, 0, -1)), as_image(transmittance), as_image(depth)
+    levels = None if verdict.levels is None else as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
     bound = over_pixels(verdict.bound)
     if band.cast[0].rays.error is not None:
-        error = unshard(tuple(shard.rays.error for shard in band.cast), 0)
-        bound = registry.screen(plan.screen).resolve(RayResult(color, error, depth), lists)[1]
+        bound = as_image(unshard(tuple(shard.rays.error for shard in band.cast), 0))
     normal = None
     if band.cast[0].rays.stop is not None:
         stop = unshard(tuple(shard.rays.stop for shard in band.cast), 1)
-        normal = registry.screen(plan.screen).resolve(RayResult(stop[1:], transmittance, depth), lists)[0]
-    color, transmittance, depth = pixels
+        normal = as_image(jnp.moveaxis(stop[1:], 0, -1))
     if band.cast[0].cut is not None:  # what may be left out by rays that ended is what they let through
         cut = unshard(tuple(shard.cut for shard in band.cast))
         bound = bound + jnp.where(over_pixels(cut), lax.stop_gradient(transmittance), 0)

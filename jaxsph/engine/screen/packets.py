@@ -99,6 +99,14 @@ def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
     return queue((count > 0) & (count <= SCATTERED), SCATTERED), queue(count > SCATTERED, PIXELS)
 
 
+def every_bundle(grid: Grid, camera: Camera) -> RayPackets:
+    """The rays of all pixels of a band, or of a shard of it: of every bundle, through the middles of its 8 x 8.
+
+    Differentiable by the camera.
+    """
+    return RayPackets(*grid.rays(camera, jnp.arange(grid.row.shape[0], dtype=jnp.int32)))
+
+
 def packets_of(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
     """Their rays: whole bundles as tensor products; of scattered ones, those that are room go where the first one does.
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jaxsph.engine.access.extents import slab_extents
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.field.schedule import full_rate
-from jaxsph.model import registry
+from jaxsph.engine.screen.packets import every_bundle
 
 boxes = jax.jit(slab_extents, static_argnums=2)
 
@@ -22,7 +22,7 @@ boxes = jax.jit(slab_extents, static_argnums=2)
 @functools.partial(jax.jit, static_argnames=("plan", "on_borders"))
 def positions(grid, reference, camera, *, plan, on_borders):
     """Where the samples of all slabs are, (slabs, bundles, samples, rays) each."""
-    schedule, packets = full_rate(grid.windows, reference), registry.screen("pixels").packets(grid, camera)
+    schedule, packets = full_rate(grid.windows, reference), every_bundle(grid, camera)
     batches = batches_of(grid, schedule, packets, plan.cast, camera.is_perspective, on_borders)
     task = batches.task(jnp.arange(schedule.count.size))
     return [value.reshape(*schedule.count.shape, *value.shape[1:]) for value in task.positions()]

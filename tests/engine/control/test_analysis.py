@@ -23,6 +23,7 @@ from jaxsph.engine.control.levels import bound
 from jaxsph.engine.control.merge import coarse_schedule, merged_levels
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
 
 CANDIDATES = range(SUPER_PIXEL + 1)
@@ -55,7 +56,7 @@ def look(scene, camera, frame, wished, *, plan, kernel, form):
     tables, unrelaxed = tables_of_parts(scene.transfer), jnp.zeros((), reference[0].dtype)
     sizes = slab_samples, 2, plan.cast.tuning.cells_bounded
     analysis = analyse(grid, beside, camera, reference, filled, tables, unrelaxed, *sizes)
-    method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), registry.screen(plan.screen).packets)
+    method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), every_bundle)
 
     def pixels(levels):
         schedule = coarse_schedule(windows, levels, reference, analysis.paint, slab_samples)

@@ -167,12 +167,10 @@ def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypat
     """By whatever is asked first: a plan, an image with one, or without."""
     scene, camera = snapshot(100)
     plan = js.plan(scene, camera, dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator))
-    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
     monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
     with_medium = dataclasses.replace(scene, media=(Nothing(),))
     for changed, choices, name in (
         (with_medium, {}, r"`Scene\(media=\.\.\.\)`"),
-        (scene, {"screen": "again"}, "`screen='again'`"),
         (scene, {"integrator": "again"}, "`integrator='again'`"),
     ):
         asked = dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator, **choices)
@@ -216,19 +214,18 @@ def test_the_room_of_an_earlier_frame_is_no_reason_to_refuse_the_next():
 
 
 @pytest.mark.slow
-def test_at_full_rate_media_screens_and_integrators_are_free_to_choose(monkeypatch):
+def test_at_full_rate_media_and_integrators_are_free_to_choose(monkeypatch):
     scene, camera = snapshot(100)
-    monkeypatch.setitem(registry.SCREENS, "again", registry.SCREENS["pixels"])
     monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
     usual = js.render(scene, camera, SETTINGS)
-    other = dataclasses.replace(SETTINGS, screen="again", integrator="again")
+    other = dataclasses.replace(SETTINGS, integrator="again")
     plan = js.plan(scene, camera, other)
-    assert (plan.screen, plan.integrator) == ("again", "again")
+    assert plan.integrator == "again"
     image = js.render(dataclasses.replace(scene, media=(Nothing(),)), camera, other, plan=plan)
     np.testing.assert_allclose(image.color, usual.color, atol=1e-6)
-    for choice in ({"screen": "pixels"}, {"integrator": "samples"}):
-        with pytest.raises(ValueError, match=f"`plan` was made for settings.{next(iter(choice))} = again, got"):
-            js.render(scene, camera, dataclasses.replace(other, **choice), plan=plan)
+    for name, made, choice in (("screen", "pixels", "quadtree"), ("integrator", "again", "samples")):
+        with pytest.raises(ValueError, match=f"`plan` was made for settings.{name} = {made}, got {choice}"):
+            js.render(scene, camera, dataclasses.replace(other, **{name: choice}), plan=plan)
 
 
 @pytest.mark.parametrize("count", [1, 5, 100, 4097, 10**6])
