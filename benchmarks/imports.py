@@ -15,7 +15,7 @@ import time
 
 from jaxsph.trade.measurement import of_this_run
 
-USED = ("Particles", "TransferFunction", "Camera", "Scene", "Settings", "render", "Image.writer")
+USED = ("Particles", "TransferFunction", "Camera", "Scene", "Settings", "render", "io.write_image")
 RESULTS = pathlib.Path(__file__).with_name("results") / "imports.json"
 CONTENDERS = {
     "nothing": "pass",

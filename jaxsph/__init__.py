@@ -5,8 +5,7 @@ Names are imported when they are first used (PEP 562), so that importing this mo
 
 from typing import TYPE_CHECKING
 
-import jaxsph.engine.cast
-import jaxsph.plot.methods  # noqa: F401 (integrators and methods are entered there)
+import jaxsph.engine.cast  # noqa: F401 (integrators are entered there)
 from jaxsph.numerics.names import lazy
 from jaxsph.numerics.version import __version__ as __version__
 

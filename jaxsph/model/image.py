@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.registry import Method
 from jaxsph.numerics import faults, short
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.colors import rgb
 from jaxsph.numerics.labelled import PLANE, dataset
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 
@@ -56,11 +56,6 @@ class Image:
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
     normal: Float[Array, "height width 3"] | None = None
-
-    writer = Method()
-    """How images become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
-    drawer = Method()
-    """How images become figures: entered by `jaxsph.plot.methods`, from `jaxsph.plot.image_figure`."""
 
     def __repr__(self) -> str:
         shape: tuple[int, ...] = getattr(self.color, "shape", ())
@@ -127,7 +122,7 @@ class Image:
 
     def save(self, path: str | os.PathLike[str], background: Any = None) -> None:
         """Write to `path`: `.exr` (all layers) or `.png` (colour over black, or `background`). See `jaxsph.io.write_image`."""
-        type(self).writer(path, self, background)
+        found("jaxsph.io.images.image_files:write_image")(path, self, background)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's with colour bar, scale bar, axes, outline and time.
@@ -137,7 +132,7 @@ class Image:
             camera: that of the picture, gives scale bar, axes and outline.
             more: `labels`, `target`, `outline`, `triad` and `title` of `jaxsph.plot.image_figure.image_figure`.
         """
-        return type(self).drawer(self, scene, camera, **more)
+        return found("jaxsph.plot.image_figure:image_figure")(self, scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import png_of
-from jaxsph.model.registry import Method
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import short
 from jaxsph.numerics.labelled import PLANE, dataset, places
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 COLORS = 256  # of a map in a picture
@@ -53,9 +53,6 @@ class Projection:
     metadata: tuple[tuple[str, Any], ...] = ()
     length_unit: str = ""
 
-    writer = Method()
-    """How projections become files: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows the formats."""
-
     def __repr__(self) -> str:
         told = f"{self.name} {short.span(self.values)} {self.unit}".rstrip()
         return short.line("Projection", short.kind(self.values), told, f"faults {short.span(self.faults)}")
@@ -80,7 +77,7 @@ class Projection:
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
-        type(self).writer(path, self, **look)
+        found("jaxsph.io.images.projections:write_projection")(path, self, **look)
 
     def to_xarray(self) -> Any:
         """Values, and weights where there are any, as an `xarray.Dataset` over `row` and `column`; metadata are its attributes.

@@ -1,9 +1,9 @@
-"""What rooms above this one enter: integrators that are chosen by name, and methods of what is here.
+"""Integrators that are chosen by name: a room above this one enters them.
 
-Flow: settings -> [registry] -> stages; `Image.save`, `TransferFunction.figure`, ... -> [registry] -> files, figures.
+Flow: settings -> [registry] -> stages.
 
-Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast` and
-`jaxsph.plot.methods`, which `jaxsph` imports; any other package may enter its own.
+Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast`, which `jaxsph`
+imports; any other package may enter its own.
 """
 
 from __future__ import annotations
@@ -15,20 +15,6 @@ from jaxsph.numerics.names import found
 
 INTEGRATORS: dict[str, str] = {}
 """Classes, each a `jaxsph.engine.cast.integrator.Integrator`; without arguments, but for those that ask for points."""
-METHODS: dict[str, str] = {}  # functions, by class and attribute: `"Image.writer"`
-
-
-class Method:
-    """An attribute of a class that is a function of a room above, imported when it is first used.
-
-    It is assigned without an annotation, as dataclasses would look up what is annotated.
-    """
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = f"{owner.__name__}.{name}"
-
-    def __get__(self, one: Any, owner: type) -> Any:
-        return found(METHODS[self.name])
 
 
 def integrator(name: str, *arguments: Any) -> Any:

@@ -1,5 +1,6 @@
 """What is chosen by name is found, and is one object: so that it may be static in what is compiled."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def test_integrators_say_themselves_what_they_ask_for():
     assert not registry.estimates("none such")
 
 
-def test_the_model_names_no_room_above_it():
-    for file in Path(registry.__file__).parent.glob("*.py"):
-        text = file.read_text(encoding="utf-8")
+def test_the_model_names_no_room_above_it_but_where_a_method_calls_what_it_finds_there():
+    for file in Path(registry.__file__).parent.rglob("*.py"):
+        text = re.sub(r' found\("jaxsph\.(io|plot)\.[\w.:]+"\)\(', "", file.read_text(encoding="utf-8"))
         assert '"jaxsph.' not in text.replace('"jaxsph.model.', "").replace('"jaxsph.numerics.', ""), file.name

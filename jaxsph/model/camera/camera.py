@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
-from jaxsph.model.registry import Method
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
@@ -86,8 +86,6 @@ class Camera:
     projection: str = "perspective"
     eye_rest: Float[Array, "3"] | None = None
     stride: int = 1
-
-    fitter = Method()
 
     def __repr__(self) -> str:
         half = short.known(self.half_height)
@@ -251,8 +249,8 @@ class Camera:
         Raises:
             ValueError: an option that there is not, or that does not suit the scene.
         """
-        found: Camera = cls.fitter(scene, (width, height), **view)
-        return found
+        fitted: Camera = found("jaxsph.io.opening.views:fitted_camera")(scene, (width, height), **view)
+        return fitted
 
     @property
     def is_perspective(self) -> bool:

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.leg import Leg, made
-from jaxsph.model.registry import Method
 from jaxsph.numerics.given import plain
+from jaxsph.numerics.names import found
 
 MAX_TURN = 90.0  # degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one
 NEAREST = 1e-3  # smallest near over far where a ball reaches the eye: sample depths are geometric between them
@@ -36,10 +36,6 @@ class CameraPath:
     """
 
     legs: tuple[Leg, ...]
-
-    writer = Method()
-    reader = Method()
-    """How paths become files, and files paths: entered by `jaxsph.plot.methods`, from `jaxsph.io`."""
 
     def __post_init__(self) -> None:
         if not self.legs:
@@ -161,12 +157,13 @@ class CameraPath:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_camera_path`."""
-        type(self).writer(path, self)
+        found("jaxsph.io.saved.camera_paths:write_camera_path")(path, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **more: Any) -> CameraPath:
         """Read what `save`, or a person, wrote. See `jaxsph.io.read_camera_path` for `more`."""
-        return cls.reader(path, **more)
+        read: CameraPath = found("jaxsph.io.saved.camera_paths:read_camera_path")(path, **more)
+        return read
 
 
 def middle(camera: Camera) -> tuple[float, float, float]:

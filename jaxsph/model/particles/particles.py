@@ -19,10 +19,10 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
-from jaxsph.model.registry import Method
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
@@ -75,9 +75,6 @@ class Particles:
     extinction_quantity: Float[Array, " particles"] | None = None
     box: Box | None = None
     length_unit: str | None = None
-
-    settler = Method()
-    """How columns become particles: entered by `jaxsph.plot.methods`, from `jaxsph.io`, which knows their names."""
 
     def __len__(self) -> int:
         """How many exist, without padding (host side)."""
@@ -195,8 +192,9 @@ class Particles:
             `js.Particles.from_columns({"x": x, "y": y, "z": z, "h": h, "mass": m, "rho": rho}, quantity="rho", support_in_h=2)`
         """
         settle = {"quantity": quantity, "support": support, "support_in_h": support_in_h, "kernel": kernel, "box": box}
-        found: Particles = cls.settler(columns, **settle, where=where, share=share, opacity_by=opacity_by)[0]
-        return found
+        settle |= {"where": where, "share": share, "opacity_by": opacity_by}
+        made: Particles = found("jaxsph.io.settle.columns:particles_from_columns")(columns, **settle)[0]
+        return made
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.

@@ -14,12 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.registry import Method
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 
@@ -41,12 +41,6 @@ class TransferFunction:
     colors: Float[Array, "points 3"]
     extinction: Float[Array, " points_of_extinction"]
     extinction_values: Float[Array, " points_of_extinction"] | None = None
-
-    presets = Method()
-    writer = Method()
-    reader = Method()
-    drawer = Method()
-    """What rooms above this one know, and looks: presets, files and figures."""
 
     def __repr__(self) -> str:
         shape, second = getattr(self.values, "shape", ()), self.extinction_values
@@ -161,23 +155,25 @@ class TransferFunction:
             shown: particles or a volume.
             more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
         """
-        return cls.presets(name, shown, **more)
+        made: TransferFunction = found("jaxsph.model.transfer.looks:preset")(name, shown, **more)
+        return made
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
         """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
-        return cls.reader(path)
+        read: TransferFunction = found("jaxsph.io.saved.transfers:read_transfer")(path)
+        return read
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
-        type(self).writer(path, self)
+        found("jaxsph.io.saved.transfers:write_transfer")(path, self)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's: colours and extinction, over the histogram of what rays of `camera` meet in `scene`.
 
         See `jaxsph.plot.transfer_figure.transfer_figure` for `more`.
         """
-        return type(self).drawer(self, scene, camera, **more)
+        return found("jaxsph.plot.transfer_figure:transfer_figure")(self, scene, camera, **more)
 
     def __call__(
         self, quantity: Float[Array, "..."], extinction_quantity: Float[Array, "..."] | None = None
