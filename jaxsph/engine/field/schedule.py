@@ -21,7 +21,7 @@ from jaxsph.numerics.trees import tree
 
 SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that a subsampled slab is marched at
 MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs
-DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `field.methods`; to the last, the level is added
+DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `media.particles`; to the last, the level is added
 NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
 
 

@@ -22,9 +22,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.cover import cover_of, over_groups
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.interpolation import interpolate_slabs
 from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
 from jaxsph.engine.field.lattice import Lattice
-from jaxsph.engine.field.methods import methods_of
+from jaxsph.engine.field.nodes import gather_subsampled
+from jaxsph.engine.field.scattered import gather_scattered
+from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
@@ -101,12 +105,17 @@ class ParticleMedium(Medium):
         return SumsBetween(sums, cover_of(self.grid.ordered, self.grid.lists.rank, task, by_rays(sums)[0] > 0))
 
     def _sums(self, task: SlabTask) -> Sums:
-        methods = methods_of(self.grid, self.kernel, self.lattice, task.scattered)
-        if len(methods) == 1 or task.entry.method is None:
-            return methods[0](task)
+        """By the method that slabs which are marched together have in common; without a lattice there is one."""
+        particles = self.grid.ordered, self.grid.lists.rank
+        dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
+        if self.lattice is None or task.entry.method is None:
+            return dense()
         # a dummy has any method, and drops what it finds
         method = jnp.where(task.slab < self.grid.windows.count.shape[0], task.entry.method, 0).max()
-        return lax.switch(method, [functools.partial(one, task) for one in methods])
+        interpolated = functools.partial(interpolate_slabs, self.lattice, self.grid, task)
+        by_level = [functools.partial(interpolated, level=level) for level in range(MAX_SPACING_LEVEL + 1)]
+        subsampled = functools.partial(gather_subsampled, *particles, task, kernel=self.kernel)
+        return lax.switch(method, [dense, subsampled, *by_level])  # `schedule.DENSE`, `SUBSAMPLED`, `INTERPOLATED` and on
 
     def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
         """Extinction, and places in the transfer function."""
