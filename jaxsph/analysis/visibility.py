@@ -84,27 +84,18 @@ def visibility_histogram(
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= most:
             raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
     camera = with_depths(camera, scene)
-    parts, (transfer, record) = parts_of(scene, camera), _recording(scene, part)
-    looked = [one for one in (whole.bare for whole in parts) if isinstance(one, AllParticles | AllOfVolume)][part]
-    looked.look = record
-    chosen = _pixels(camera, rays, seed)
-    for some in blocks(chosen, BLOCK):
-        _cast(chosen.some(some), parts, record)
-    return _histogram(record, transfer, bins, len(chosen.u))
-
-
-def _recording(scene: Scene, part: int) -> tuple[TransferFunction, Recording]:
-    looks = scene.looks
+    looks, number = scene.looks, camera.width * camera.height
     if not 0 <= part < len(looks):
         there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
         raise ValueError(f"`part` must be the number of a part with a transfer function, got {part}; there are {there}")
-    return looks[part], Recording(looks[part])
-
-
-def _pixels(camera: Camera, rays: int, seed: int) -> Rays:
-    number = camera.width * camera.height
-    chosen = np.random.default_rng(seed).choice(number, min(rays, number), replace=False)
-    return rays_of(camera, *np.unravel_index(chosen, (camera.height, camera.width)))
+    parts, record = parts_of(scene, camera), Recording(looks[part])
+    looked = [one for one in (whole.bare for whole in parts) if isinstance(one, AllParticles | AllOfVolume)][part]
+    looked.look = record
+    pixels = np.random.default_rng(seed).choice(number, min(rays, number), replace=False)
+    chosen = rays_of(camera, *np.unravel_index(pixels, (camera.height, camera.width)))
+    for some in blocks(chosen, BLOCK):
+        _cast(chosen.some(some), parts, record)
+    return _histogram(record, looks[part], bins, len(chosen.u))
 
 
 class Recording(Look):
@@ -138,15 +129,9 @@ def _cast(rays: Rays, wholes: list[Whole], record: Recording) -> None:
     seen = at_nodes(parts, portions)
     half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
     thickness = light_of(seen, half_path).thickness
-    front = np.exp(-_in_front(portions.ray, thickness[:, -1]))
+    before = np.cumsum(thickness[:, -1]) - thickness[:, -1]  # of all portions before each, which come in order
+    front = np.exp(-(before - before[np.searchsorted(portions.ray, portions.ray)]))
     record.weigh(WEIGHTS[:, None] * half_path, (front[:, None] * np.exp(-thickness)).T)
-
-
-def _in_front(ray: np.ndarray, thickness: np.ndarray) -> np.ndarray:
-    """Optical thickness of the portions of the same ray that lie before each; they come in order."""
-    before = np.cumsum(thickness) - thickness
-    first = np.searchsorted(ray, ray)
-    return before - before[first] if len(ray) else before
 
 
 def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:

@@ -83,7 +83,11 @@ class Scene:
         media = self.media if isinstance(self.media, tuple) else (self.media,)
         if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
-        _require_one_unit({name: _all_of(getattr(self, name)) for name in ("particles", "volume", "points")})
+        each = ((name, one) for name in ("particles", "volume", "points") for one in _all_of(getattr(self, name)))
+        units = {unit: name for name, one in each if (unit := getattr(one, "length_unit", None)) is not None}
+        if len(units) > 1:  # parts given as numbers are meant in that of the others
+            told = " and ".join(f"`{name}` in {unit}" for unit, name in units.items())
+            raise ValueError(f"all parts of a scene must have one unit of length, got {told}; convert positions to one unit")
 
     def __repr__(self) -> str:
         told = ((field.name, getattr(self, field.name), field.default) for field in dataclasses.fields(self))
@@ -219,14 +223,6 @@ def first_spheres(scene: Scene) -> tuple[int, ...]:
 def num_spheres(scene: Scene) -> int:
     """Entries of all sets, padding included, static; at least 1."""
     return sum(one.capacity for one in ((scene.particles,) if scene.particles is not None else ()) + scene.point_sets) or 1
-
-
-def _require_one_unit(parts: dict[str, tuple[Any, ...]]) -> None:
-    """Raise where parts were given in different units of length; those given as numbers are meant in that of the others."""
-    units = {unit: name for name, of in parts.items() for one in of if (unit := getattr(one, "length_unit", None)) is not None}
-    if len(units) > 1:
-        told = " and ".join(f"`{name}` in {unit}" for unit, name in units.items())
-        raise ValueError(f"all parts of a scene must have one unit of length, got {told}; convert positions to one unit")
 
 
 def _all_of(part: Any) -> tuple[Any, ...]:

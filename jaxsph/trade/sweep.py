@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import statistics
 import time
@@ -145,8 +146,15 @@ def _rows(
     held = {} if journal is None else {row.key: row for row in read_journal(journal)}
     tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
     truths = 2 + bool(effort.integral)
-    tick = _ticker(progress, sum(_num_renders(missing, truths, effort.repeats) for _, missing in tasks))
+    turns = [[[one for one in group if one.method != FULL_RATE] for group in missing if group] for _, missing in tasks]
+    total = sum(truths * bool(each) + sum(len(one) + effort.repeats * (1 + len(one)) for one in each) for each in turns)
     plans: Plans = {}
+    done = itertools.count(1)
+
+    def tick() -> None:
+        if progress is not None:
+            progress(next(done), total)
+
     for frame, missing in tasks:
         for row in _measure(frame, groups[0][0], missing, plans, tick):
             held[row.key] = row
@@ -171,24 +179,6 @@ def _views(
     if len(set(frames)) != len(scenes) or len(frames) != len(scenes):
         raise ValueError(f"`frames` must be {len(scenes)} different numbers, one a scene, got {list(frames)}")
     return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
-
-
-def _num_renders(missing: list[list[Contender]], truths: int, repeats: int) -> int:
-    """Images that `_measure` makes: truths, one of each setting, and the turns."""
-    turns = [[setting for setting in group if setting.method != FULL_RATE] for group in missing if group]
-    return truths * bool(turns) + sum(len(turn) + repeats * (1 + len(turn)) for turn in turns)
-
-
-def _ticker(progress: Progress | None, total: int) -> Callable[[], None]:
-    done = 0
-
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
-    return tick
 
 
 def _measure(
@@ -287,7 +277,11 @@ def _compared(
         "compile": first.compile_seconds,
         "bytes": first.plan.bytes,
     }
-    return found | _kept(first, error, integral) | _to_integral(first, integral)
+    far: dict[str, float | None] = dict.fromkeys(("integral_mean", "integral_p999", "integral_max"))
+    if integral is not None:
+        errors = integral.errors(first.layers)
+        far = dict(zip(far, map(float, (errors.mean(), np.quantile(errors, 0.999), errors.max())), strict=True))
+    return found | _kept(first, error, integral) | far
 
 
 def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: IntegralAt | None) -> dict[str, float | None]:
@@ -303,15 +297,6 @@ def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: Int
         error, bound = integral.errors(first.layers), integral.at(bound)
     over, beyond = float((error > tolerance).mean()), float((error > bound).mean())
     return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
-
-
-def _to_integral(first: _First, integral: IntegralAt | None) -> dict[str, float | None]:
-    """How far an image is from the light integral."""
-    if integral is None:
-        return dict.fromkeys(("integral_mean", "integral_p999", "integral_max"))
-    errors = integral.errors(first.layers)
-    mean, quantile, largest = float(errors.mean()), float(np.quantile(errors, 0.999)), float(errors.max())
-    return {"integral_mean": mean, "integral_p999": quantile, "integral_max": largest}
 
 
 def _journal(folder: str | os.PathLike[str]) -> Path:

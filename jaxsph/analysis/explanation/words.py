@@ -35,7 +35,8 @@ def table_of(made: Any) -> str:
     """An `Explanation` as a table."""
     row, column = made.pixel
     seen, truth = (" ".join(f"{float(channel):.3f}" for channel in color) for color in (made.color, made.integral_color))
-    lines = [f"pixel {row} {column}: colour {seen}, alpha {made.alpha:.4f}{_half(made.half_depth)}", *_budget(made)]
+    half = f", half of the light gone at depth {made.half_depth:.5g}" if np.isfinite(made.half_depth) else ""
+    lines = [f"pixel {row} {column}: colour {seen}, alpha {made.alpha:.4f}{half}", *_budget(made)]
     told = f"colour {truth}, alpha {made.integral_alpha:.4f}; the pixel is {made.off_integral:.2g} off"
     lines.append(_line("light integral", told))
     if made.levels is not None:
@@ -75,21 +76,14 @@ def _line(what: str, text: str) -> str:
     return f"{what:<16}{text}"
 
 
-def _half(depth: float) -> str:
-    return f", half of the light gone at depth {depth:.5g}" if np.isfinite(depth) else ""
-
-
 def _budget(made: Any) -> list[str]:
     if np.isnan(made.total):
         return [_line("error", made.note)]
     kind = "certified" if made.certified else "estimated"
     lines = [_line("error", f"{f'{made.total:.3g}':<11}{kind}{f': {made.note}' if made.note else ''}")]
     shares = sorted(made.sources.items(), key=lambda one: -one[1])
-    return lines + [_line(f"  {name}", f"{f'{share:.3g}':<11}{_percent(share, made.total)}") for name, share in shares]
-
-
-def _percent(share: float, total: float) -> str:
-    return f"{share / total:6.1%}" if total > 0 else ""
+    parts = [(name, f"{share:.3g}", f"{share / made.total:6.1%}" if made.total > 0 else "") for name, share in shares]
+    return lines + [_line(f"  {name}", f"{told:<11}{percent}") for name, told, percent in parts]
 
 
 def _cells(levels: np.ndarray) -> str:

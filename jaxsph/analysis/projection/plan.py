@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from jaxsph.analysis.projection.column_sums import BLOCK, subrays_of
 from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
@@ -173,22 +173,12 @@ def beside(subrays: int) -> float:
     return 0.5 if subrays == SHARES else float(np.max(np.abs(subrays_of(subrays)[0] - 0.5)))
 
 
-def wanted_all(placed: Placed) -> Bool[Array, " particles"]:
-    """Particles that follow rays through the middles of pixels."""
-    return placed.live
-
-
-def wanted_small(placed: Placed) -> Bool[Array, " particles"]:
-    """Particles that pixels get shares of."""
-    return placed.live & placed.small
-
-
-def wanted_large(placed: Placed) -> Bool[Array, " particles"]:
-    """Particles that are met by several rays a pixel."""
-    return placed.live & placed.large
-
-
-WANTED: dict[int, Callable[[Placed], Array]] = {1: wanted_all, SHARES: wanted_small, SUBRAYS: wanted_large}
+WANTED: dict[int, Callable[[Placed], Array]] = {
+    1: lambda placed: placed.live,
+    SHARES: lambda placed: placed.live & placed.small,
+    SUBRAYS: lambda placed: placed.live & placed.large,
+}
+"""Which particles follow each rule."""
 BESIDE_FACES = 1e-4  # of the shortest side of a period, that images may be away from it to be counted: rounding may take them in
 DOUBT = 2  # so that what is counted is never less than what a program finds that rounds in another way
 placed_by = jax.jit(functools.partial(place, doubt=DOUBT))

@@ -95,31 +95,22 @@ def project(
     traced, planned = is_traced(particles, camera, held.amounts), plan is None
     digits = 0 if traced else digits_to_scale(particles, camera)
     given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
-    plan = plan or _planned(given[0], given[2], pixel, traced)
-    plan.check(particles, camera, pixel)
-    sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
-    image, told = _image(sums, held, given[2], digits), _described(particles, camera, pixel, traced)
-    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
-    return dataclasses.replace(image, faults=word, metadata=told, **named)
-
-
-def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock: Clock | None) -> tuple[Any, Any]:
-    """Sums by programs that are kept, and no fault that was left unsaid."""
-    sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
-    _raise_for(int(word), planned)
-    return sums, word
-
-
-def _described(particles: Particles, camera: Camera, pixel: str, traced: bool) -> tuple[tuple[str, Any], ...]:
-    """Metadata of an image."""
-    told = ("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel)
-    return told if traced else (*told, ("jaxsph.camera", camera.describe()))
-
-
-def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
-    if traced:
+    if traced and plan is None:
         raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
-    return plan_projection(particles, camera, pixel=pixel)
+    plan = plan or plan_projection(given[0], given[2], pixel=pixel)
+    plan.check(particles, camera, pixel)
+    told: Any = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
+    if traced:
+        sums, word = _sums(*given, plan=plan)
+    else:
+        sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
+        if int(word) & faults.OVERFLOWS and not planned:
+            raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
+        if int(word):
+            raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
+        told = (*told, ("jaxsph.camera", camera.describe()))
+    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
+    return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=told, **named)
 
 
 def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -> Camera:
@@ -131,13 +122,6 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:
         raise ValueError(f"`depth_range` must begin in front of the eye of a perspective camera, at > 0, got {near}")
     return dataclasses.replace(camera, near=jnp.asarray(near, camera.dtype), far=jnp.asarray(far, camera.dtype))
-
-
-def _raise_for(word: int, planned: bool) -> None:
-    if word & faults.OVERFLOWS and not planned:
-        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
-    if word:
-        raise ValueError(f"these particles cannot be projected: {faults.describe(word)}")
 
 
 def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera, digits: int) -> Projection:
@@ -211,25 +195,18 @@ def _sums(
 _sums_at_once = functools.partial(jax.jit, static_argnames="plan")(_sums)
 
 
-class _Shown(NamedTuple):
-    """Of a periodic set what its box holds, and what share of each pixel that is; else all there is."""
-
-    particles: Particles
-    amounts: Float[Array, "particles channels"]
-    camera: Camera
-    pixels: Float[Array, "height width"] | None
-    faults: Int[Array, ""]
-
-
-def _shown(particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan) -> _Shown:
+def _shown(
+    particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan
+) -> tuple[Particles, Array, Camera, Float[Array, "height width"] | None, Int[Array, ""]]:
+    """Of a periodic set what its box holds, what share of each pixel that is, and faults; else all there is."""
     if plan.images is None or particles.box is None:
-        return _Shown(particles.wrapped(), amounts, camera, None, jnp.int32(faults.NONE))
+        return particles.wrapped(), amounts, camera, None, jnp.int32(faults.NONE)
     seen, pixels = between_faces(camera, particles.box, plan.pixel)
     found, source, word = with_sources(particles, plan.images, through=plan.through)
     if plan.through is not None:
         word |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, particles.box, plan.through))
         seen = past_faces(camera, particles.box)
-    return _Shown(found, amounts[source], seen, pixels, word)
+    return found, amounts[source], seen, pixels, word
 
 
 def _in_bands(rules: list[_Rule], camera: Camera, plan: ProjectionPlan, channels: int) -> tuple[Array, Array]:

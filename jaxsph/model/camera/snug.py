@@ -42,7 +42,8 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
             "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
         )
     found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *getattr(shown, "parts", (shown,)))
-    near, far = (jnp.asarray(own if given is None else given, camera.dtype) for given, own in _ends(camera, found))
+    ends = (camera.near, found.near), (camera.far, found.far)
+    near, far = (jnp.asarray(own if given is None else given, camera.dtype) for given, own in ends)
     if not near < far:
         raise ValueError(
             f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
@@ -59,10 +60,6 @@ def snug(camera: Camera, *parts: Any) -> Camera:
 def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
     """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
     return _between(camera, *_span_of_box(camera, lower, upper))
-
-
-def _ends(camera: Camera, found: Camera) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    return (camera.near, found.near), (camera.far, found.far)
 
 
 def _span(camera: Camera, part: Any) -> tuple[float, float] | None:

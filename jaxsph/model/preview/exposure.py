@@ -28,7 +28,7 @@ def exposure(seen: Glimpse) -> float:
     brightest = float(np.percentile(depth, BRIGHT)) or float(depth.max())
     scale = -np.log1p(-ALPHA) / brightest
     limit = scale * MOST
-    while scale < limit and _lit(seen, scale)[meets].mean() < LEAST_LIT:
+    while scale < limit and (seen.picture(scale).max(-1) > LIT)[meets].mean() < LEAST_LIT:
         scale *= 2**0.25
     return float(scale)
 
@@ -41,8 +41,3 @@ def typical_exposure(seen: Glimpse) -> float:
     depth = seen.optical_depth
     total = float(depth.sum())
     return float(-np.log1p(-ALPHA) * total / (depth**2).sum()) if total > 0 else 1.0
-
-
-def _lit(seen: Glimpse, scale: float) -> np.ndarray:
-    lit: np.ndarray = seen.picture(scale).max(-1) > LIT
-    return lit

@@ -17,7 +17,6 @@ import scipy.ndimage
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
@@ -94,7 +93,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     for volume, look in scene.volumes:
         _add(extinction, color, *_volume(volume, look, place))
     if scene.within is not None:
-        extinction *= _contained(scene.within, place)
+        extinction *= np.asarray(scene.within.contains(tuple(np.moveaxis(place, -1, 0))))
     return Glimpse(u, v, depth, step * np.sqrt(slant), extinction, color)
 
 
@@ -202,10 +201,6 @@ def _add(extinction: np.ndarray, color: np.ndarray, more: np.ndarray, of_more: n
     share = np.where(total > 0, more / np.where(total > 0, total, 1), 0)[..., None]
     color += share * (of_more - color)
     extinction += more
-
-
-def _contained(within: Clip, place: np.ndarray) -> np.ndarray:
-    return np.asarray(within.contains(tuple(np.moveaxis(place, -1, 0))))
 
 
 def _pairs(first: np.ndarray, past: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
