@@ -42,7 +42,7 @@ def test_place_light_and_shares_are_those_of_the_picture():
 def test_where_there_is_none_it_says_what_coverages_the_ray_meets():
     made = js.explain(surfaced(), camera(), SETTINGS, pixel=(0, 0))
     assert np.isinf(made.surface_depth) and not len(made.particles) and not made.normal.any()
-    assert "none: the ray meets coverages" in str(made) and "the level is 5" in str(made)
+    assert "none: the ray meets a coverage of 0" in str(made) and "the level is 5" in str(made)
 
 
 def test_clips_hide_what_they_hide_and_points_in_front_are_of_the_colour_alone():
