@@ -79,7 +79,9 @@ def image_figure(
         size, given = f"{image.shape[1]} x {image.shape[0]}", f"{camera.width} x {camera.height}"
         raise ValueError(f"`camera` must be the one of the image, of {size} pixels, got one of {given}")
     labels, bounds = Labels.of(labels), None if scene is None or not scene.parts else scene.bounds()
-    bars = [] if scene is None else _bars(scene, labels)
+    looks = () if scene is None else scene.looks
+    bars = [Axis(look, labels.quantity, labels.unit, labels.factor) for look in looks[:1]]
+    bars += [Axis(one, f"volume {k}" if len(looks) > 2 else "volume", CODE_UNITS) for k, one in enumerate(looks[1:], 1)]
     page = _Page(image)
     if camera is not None and bounds is not None and outline:
         page.draw_outline(camera, *bounds)
@@ -91,13 +93,6 @@ def image_figure(
     for bar in bars:
         page.draw_bar(bar)
     return page.figure
-
-
-def _bars(scene: Scene, labels: Labels) -> list[Axis]:
-    looks = scene.looks
-    names = [f"volume {number}" if len(looks) > 2 else "volume" for number in range(1, len(looks))]
-    first = [Axis(look, labels.quantity, labels.unit, labels.factor) for look in looks[:1]]
-    return first + [Axis(look, name, CODE_UNITS) for look, name in zip(looks[1:], names, strict=True)]
 
 
 def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:

@@ -18,7 +18,6 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
-from jaxsph.model.transfer import looks as appearance
 from jaxsph.model.transfer.looks import (
     default_transfer,
     default_volume_transfer,
@@ -37,7 +36,6 @@ from jaxsph.scenes.radial import radial
 from jaxsph.scenes.simulated import dam_break, mixer
 
 __all__ = [
-    "appearance",
     "checker_board",
     "colormap",
     "cosmos",

@@ -142,14 +142,10 @@ def fallen(
     place = start.copy()
     place[:, 1] = np.where(since > 0, height, start[:, 1] - GRAVITY / 2 * now**2)
     for axis, direction in ((0, np.cos(outward)), (2, np.sin(outward))):
-        place[:, axis] = _reflected(start[:, axis] + sideways * direction, BASIN[0][axis], BASIN[1][axis])
+        low, there_and_back = BASIN[0][axis], 2 * (BASIN[1][axis] - BASIN[0][axis])
+        turn = np.mod(start[:, axis] + sideways * direction - low, there_and_back)
+        place[:, axis] = low + np.minimum(turn, there_and_back - turn)  # folded back between the walls
     return place
-
-
-def _reflected(x: Float[np.ndarray, " count"], low: float, high: float) -> Float[np.ndarray, " count"]:
-    """Fold a coordinate back between two walls."""
-    turn = np.mod(x - low, 2 * (high - low))
-    return low + np.minimum(turn, 2 * (high - low) - turn)
 
 
 def swell(water: Float[np.ndarray, "points 3"], middle: float, since: float) -> Float[np.ndarray, " points"]:

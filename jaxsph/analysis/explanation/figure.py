@@ -26,7 +26,10 @@ def figure_of(made: Any, quantity: str, title: str) -> Any:
     _draw_ray(made, halves[0].subplots(3, 1, sharex=True), quantity)
     upper, lower = halves[1].subplots(2, 1, height_ratios=(1, 2))
     _draw_budget(made, upper)
-    _draw_particles(made, lower)
+    most = np.argsort(-made.added, kind="stable")[:PARTICLES]
+    shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
+    told = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
+    _draw_bars(lower, told, shares, PARTICLES)
     return figure
 
 
@@ -102,14 +105,6 @@ def _draw_budget(made: Any, axes: Any) -> None:
     if made.note:
         note = textwrap.fill(made.note, LETTERS)
         axes.text(0.02, 0.04, note, fontsize="x-small", color=GRAY, va="bottom", transform=axes.transAxes)
-
-
-def _draw_particles(made: Any, axes: Any) -> None:
-    """A bar for each of those that add most."""
-    most = np.argsort(-made.added, kind="stable")[:PARTICLES]
-    shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
-    title = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
-    _draw_bars(axes, title, shares, PARTICLES)
 
 
 def _draw_bars(axes: Any, title: str, bars: list[tuple[str, float]], room: int) -> None:

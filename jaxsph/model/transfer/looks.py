@@ -1,6 +1,6 @@
 r"""Looks: transfer functions that show particles or a volume, by default or by kind of data, opaque enough to read.
 
-Flow: Particles or Volume, colour map or kind of data -> [appearance] -> TransferFunction.
+Flow: Particles or Volume, colour map or kind of data -> [looks] -> TransferFunction.
 
 | preset | colours | domain | extinction over the map | for |
 |---|---|---|---|---|
