@@ -95,22 +95,29 @@ def project(
     traced, planned = is_traced(particles, camera, held.amounts), plan is None
     digits = 0 if traced else digits_to_scale(particles, camera)
     given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
-    if traced and plan is None:
-        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
-    plan = plan or plan_projection(given[0], given[2], pixel=pixel)
+    plan = plan or _planned(given[0], given[2], pixel, traced)
     plan.check(particles, camera, pixel)
+    sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
     told: Any = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    if traced:
-        sums, word = _sums(*given, plan=plan)
-    else:
-        sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
-        if int(word) & faults.OVERFLOWS and not planned:
-            raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
-        if int(word):
-            raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
-        told = (*told, ("jaxsph.camera", camera.describe()))
+    told += () if traced else (("jaxsph.camera", camera.describe()),)
     named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
     return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=told, **named)
+
+
+def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock: Clock | None) -> tuple[Any, Any]:
+    """Sums by programs that are kept, and no fault that was left unsaid."""
+    sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
+    if int(word) & faults.OVERFLOWS and not planned:
+        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
+    if int(word):
+        raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
+    return sums, word
+
+
+def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
+    if traced:
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
+    return plan_projection(particles, camera, pixel=pixel)
 
 
 def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -> Camera:
