@@ -9,11 +9,10 @@ import dataclasses
 import itertools
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced
 
 NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
 ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
@@ -42,8 +41,9 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
             "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
         )
     found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *getattr(shown, "parts", (shown,)))
-    near, far = (jnp.asarray(own if given is None else given, camera.dtype) for given, own in _ends(camera, found))
-    if not near < far:
+    ends = (camera.near, found.near), (camera.far, found.far)
+    near, far = (array_of(own if given is None else given, camera.dtype) for given, own in ends)
+    if not float(near) < float(far):
         raise ValueError(
             f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
         )
@@ -59,10 +59,6 @@ def snug(camera: Camera, *parts: Any) -> Camera:
 def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
     """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
     return _between(camera, *_span_of_box(camera, lower, upper))
-
-
-def _ends(camera: Camera, found: Camera) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    return (camera.near, found.near), (camera.far, found.far)
 
 
 def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
@@ -99,4 +95,4 @@ def _between(camera: Camera, near: float, far: float) -> Camera:
     margin = ROUNDING * max(abs(near), abs(far))
     near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
     dtype = camera.dtype
-    return dataclasses.replace(camera, near=jnp.asarray(near, dtype), far=jnp.asarray(far + margin, dtype))
+    return dataclasses.replace(camera, near=array_of(near, dtype), far=array_of(far + margin, dtype))
