@@ -121,8 +121,7 @@ class Points:
         given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit))
         _require_usable(columns)
-        center = columns["position"]
-        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(center.dtype), jnp.float32)
+        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype((center := columns["position"]).dtype), jnp.float32)
         room, shape = room_for("point", center.shape[0], capacity), profile_of(profile, dtype)
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
@@ -131,9 +130,9 @@ class Points:
         entries: dict[str, Any] = {name: array_of(value) for name, value in rounded.items()}
         main = {name: entries.pop(name) for name in MAIN}
         valid = array_of(module_for(columns).arange(room) < center.shape[0])
-        splats_beyond = _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
-        more: dict[str, Any] = {"splats_beyond": splats_beyond, "spread": spread, "length_unit": name_of(unit)}
-        return cls(**main, valid=valid, attributes=entries, profile=shape, position_rest=rest, **more)
+        beyond = _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
+        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit), "position_rest": rest}
+        return cls(**main, valid=valid, attributes=entries, profile=shape, **more)
 
     @property
     def capacity(self) -> int:
