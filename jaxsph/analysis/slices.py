@@ -13,7 +13,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -29,7 +28,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import require_shape
+from jaxsph.numerics.checks import array_of, require_shape
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.version import __version__
@@ -166,7 +165,7 @@ def _field(particles: Particles, camera: Camera, within: Clip | None, deep: floa
     low, high = (float(quantity.min()), float(quantity.max())) if quantity.size else (0.0, 1.0)
     low, high = (low, high) if low < high else (low - max(abs(low), 1), high + max(abs(high), 1))
     points = [low, high], [[0, 0, 0], [1, 1, 1]], [OPAQUE / deep] * 2
-    line = TransferFunction(*(jnp.asarray(part, particles.dtype) for part in points))
+    line = TransferFunction(*(array_of(part, particles.dtype) for part in points))
     image = render(Scene(particles=particles, transfer=line, within=within), camera, Settings(samples=1, integrator="samples"))
     share, alpha = np.asarray(image.color)[..., 0].astype(np.float64), np.asarray(image.alpha)
     return np.where(alpha > 0.5, low + share * (high - low), np.nan).astype(np.asarray(image.color).dtype)

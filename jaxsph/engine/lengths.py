@@ -24,6 +24,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import product
 from jaxsph.numerics.trees import unchecked_of
 
 COMFORTABLE = 0.75
@@ -93,7 +94,7 @@ def scaled_camera(camera: Camera, digits: int) -> Camera:
 def times(value: Any, digits: int) -> Any:
     """A number or numbers times `2 ** digits`, which alone may be beyond what their dtype holds; None stays."""
     half = digits // 2
-    return value if value is None or digits == 0 else value * 2.0**half * 2.0 ** (digits - half)
+    return value if value is None or digits == 0 else product(product(value, 2.0**half), 2.0 ** (digits - half))
 
 
 def _fields(part: Any) -> dict[str, Any]:

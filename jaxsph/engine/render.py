@@ -10,6 +10,7 @@ import warnings
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxsph.engine.asked import require_asked
 from jaxsph.engine.frame.bands import Progress, Work
@@ -102,7 +103,7 @@ def render(
 def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
     """Warn where no ray meets the surface, with the range of what its level is a level of, which is the coverage by `makers`."""
     surface = scene.surface
-    if surface is None or bool((image.transmittance < 1).any()):
+    if surface is None or bool((np.asarray(image.transmittance) < 1).any()):
         return
     of = "the coverage by particles" if surface.of == "coverage" else f"the particles' {surface.of}, smoothed by their kernels,"
     found = coverage_at_centers(makers)

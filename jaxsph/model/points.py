@@ -16,7 +16,7 @@ from jaxsph.model.particles.packing import columns_of, packed, rest_of
 from jaxsph.model.particles.particles import Particles, room_for
 from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
 from jaxsph.numerics.trees import tree
 
@@ -121,18 +121,18 @@ class Points:
         given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit))
         _require_usable(columns)
-        center = columns["position"]
-        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(center.dtype), jnp.float32)
+        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype((center := columns["position"]).dtype), jnp.float32)
         room, shape = room_for("point", center.shape[0], capacity), profile_of(profile, dtype)
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         rounded = {name: packed(name, value, room, dtype, float(name == "radius")) for name, value in columns.items()}
         rest = rest_of(center, rounded["position"], rounded["radius"])
-        entries: dict[str, Any] = {name: jnp.asarray(value) for name, value in rounded.items()}
+        entries: dict[str, Any] = {name: array_of(value) for name, value in rounded.items()}
         main = {name: entries.pop(name) for name in MAIN}
-        valid, beyond = jnp.arange(room) < center.shape[0], _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
-        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit)}
-        return cls(**main, valid=valid, attributes=entries, profile=shape, position_rest=rest, **more)
+        valid = array_of(module_for(columns).arange(room) < center.shape[0])
+        beyond = _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
+        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit), "position_rest": rest}
+        return cls(**main, valid=valid, attributes=entries, profile=shape, **more)
 
     @property
     def capacity(self) -> int:
@@ -151,15 +151,16 @@ class Points:
 
     def usable(self) -> Bool[Array, " points"]:
         """Points that exist, with numbers that mean something."""
-        finite = jnp.isfinite(self.position).all(1) & jnp.isfinite(self.radius) & jnp.isfinite(self.extinction)
-        for value in self.attributes.values():
-            finite &= jnp.isfinite(value)
-        shown = ((self.color >= 0) & (self.color <= 1)).all(1)
-        return self.valid & finite & shown & (self.radius > 0) & (self.extinction >= 0)
+        xp, own = at_hand(self)
+        finite = xp.isfinite(own.position).all(1) & xp.isfinite(own.radius) & xp.isfinite(own.extinction)
+        for value in own.attributes.values():
+            finite &= xp.isfinite(value)
+        shown = ((own.color >= 0) & (own.color <= 1)).all(1)
+        return array_of(own.valid & finite & shown & (own.radius > 0) & (own.extinction >= 0))
 
     def spheres(self) -> Particles:
         """What they can be met in, as particles that carry nothing."""
-        nothing = jnp.zeros_like(self.radius)
+        nothing = array_of(module_for(self.radius).zeros(self.radius.shape, self.radius.dtype))
         return Particles(self.position, self.radius, nothing, nothing, self.usable(), position_rest=self.position_rest)
 
     def exact_position(self) -> np.ndarray:
@@ -218,4 +219,4 @@ def _distance(value: Any, dtype: Any) -> Array | None:
         return None
     if not is_traced(value) and not float(value) >= 0:
         raise ValueError(f"`splats_beyond` must be >= 0 or None, got {value!r}; it is a distance from the eye")
-    return jnp.asarray(value, dtype)
+    return array_of(value, dtype)

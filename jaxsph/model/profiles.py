@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real, require_shape
 from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.trees import tree
@@ -188,7 +188,7 @@ def profile_of(given: Any, dtype: Any) -> Profile:
         with np.errstate(over="ignore"):
             values = np.asarray(values).astype(dtype)
         require_finite("profile", values, f"it overflows {values.dtype}: give shares of the extinction, such as 0 to 1")
-    return Table(jnp.asarray(values, dtype))
+    return Table(array_of(values, dtype))
 
 
 def _quadrature(value: Callable[[Array], Array], start: Array, end: Array) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -25,6 +26,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import short
+from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.trees import tree
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
@@ -168,8 +170,8 @@ class Scene:
         """The particles; where there are none, a set of no particles in arrays of one entry."""
         if self.particles is not None:
             return self.particles
-        entry: dict[str, Any] = {name: jnp.full(1, value, self.dtype) for name, value in NOTHING.items()}
-        return Particles(**entry | {"position": jnp.zeros((1, 3), self.dtype)}, valid=jnp.zeros(1, bool))
+        entry: dict[str, Any] = {name: array_of([value], self.dtype) for name, value in NOTHING.items()}
+        return Particles(**entry | {"position": array_of([[0, 0, 0]], self.dtype)}, valid=array_of([False], bool))
 
 
 def spheres_of(scene: Scene) -> Particles:
@@ -182,16 +184,17 @@ def spheres_of(scene: Scene) -> Particles:
     sets = points if scene.particles is None and points else [scene.particle_set, *points]
     if len(sets) == 1:
         return sets[0]
-    dtype = scene.dtype
+    (xp, sets), dtype = at_hand(sets), scene.dtype
     columns: dict[str, Any] = {
-        name: jnp.concatenate([one.columns.get(name, one.quantity).astype(dtype) for one in sets]) for name in sets[0].columns
+        name: xp.concatenate([one.columns.get(name, one.quantity).astype(dtype) for one in sets]) for name in sets[0].columns
     }
     rest = None
     if any(one.position_rest is not None for one in sets):
-        rests = [jnp.zeros_like(one.position) if one.position_rest is None else one.position_rest for one in sets]
-        rest = jnp.concatenate([one.astype(dtype) for one in rests])
-    valid = jnp.concatenate([one.valid for one in sets])
-    return Particles(**columns, valid=valid, kernel=scene.formulas.kernel, position_rest=rest)
+        rests = [xp.zeros_like(one.position) if one.position_rest is None else one.position_rest for one in sets]
+        rest = xp.concatenate([one.astype(dtype) for one in rests])
+    valid = xp.concatenate([one.valid for one in sets])
+    made = Particles(**columns, valid=valid, kernel=scene.formulas.kernel, position_rest=rest)
+    return jax.tree.map(array_of, made)  # type: ignore[no-any-return]
 
 
 def widened(scene: Scene) -> Scene:
@@ -201,12 +204,10 @@ def widened(scene: Scene) -> Scene:
     surface, particles = scene.surface, scene.particles
     if surface is None or particles is None:
         return scene
-    given: dict[str, Any] = {
-        name: jnp.asarray(getattr(surface, name), scene.dtype) for name in ("level", "smoothing", "color", "ambient")
-    }
-    optional = {name: getattr(surface, name) for name in ("opacity", "light")}
-    given |= {name: jnp.asarray(value, scene.dtype) for name, value in optional.items() if value is not None}
-    packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": jnp.ones_like(given["smoothing"])})
+    names = "level", "smoothing", "color", "ambient", "opacity", "light"
+    values = {name: value for name in names if (value := getattr(surface, name)) is not None}
+    given: dict[str, Any] = {name: array_of(value, scene.dtype) for name, value in values.items()}
+    packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": array_of(1, scene.dtype)})
     return dataclasses.replace(scene, particles=surface.makers(particles, given["smoothing"]), surface=packed)
 
 

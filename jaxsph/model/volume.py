@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.trees import tree
 
@@ -87,7 +87,7 @@ class Volume:
         with np.errstate(over="ignore"):  # what overflows is refused by name
             wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
             wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
-            packed = jnp.asarray(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
+            packed = array_of(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
             _require_finite_values(packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
@@ -97,8 +97,8 @@ class Volume:
             require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
             require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
         near = exact.astype(dtype)
-        rest = jnp.asarray(exact - near, dtype)
-        return cls(packed, jnp.asarray(near), jnp.asarray(steps, dtype), rest, name_of(unit))
+        rest = array_of(exact - near, dtype)
+        return cls(packed, array_of(near), array_of(steps, dtype), rest, name_of(unit))
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -1,7 +1,8 @@
-"""Host-side checks of user input: name the argument, the offending value and the remedy.
+"""Host-side checks of user input: name the argument, the offending value and the remedy; and arrays of what was checked.
 
 Flow: user arrays -> [checks] -> model. Under a trace the values are unknown; then only shapes and dtypes are checked,
-and bad data becomes a fault bit (`jaxsph.numerics.faults`).
+and bad data becomes a fault bit (`jaxsph.numerics.faults`). Values that are known are computed by NumPy, as of JAX's operations
+on them each would be a program to compile for every shape; code that serves traces, too, is written for a module, either one.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
 
@@ -32,6 +35,41 @@ def record_of(kind: type[Record], given: dict[str, Any], of: str) -> Record:
 def is_traced(*values: Any) -> bool:
     """Whether any leaf of `values` is an abstract tracer, so that its numbers cannot be looked at."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
+
+
+def module_for(*values: Any) -> Any:
+    """NumPy, where all is known and at hand in this machine's memory; else `jax.numpy`, also where a device was chosen."""
+    arrays = [leaf for leaf in jax.tree.leaves(values) if isinstance(leaf, Array)]
+    elsewhere = (is_traced(one) or one.committed or any(device.platform != "cpu" for device in one.devices()) for one in arrays)
+    return jnp if any(elsewhere) else np
+
+
+def at_hand(value: Any) -> tuple[Any, Any]:
+    """`module_for` a value, and the value with arrays of that module."""
+    xp = module_for(value)
+    return xp, jax.tree.map(xp.asarray, value)
+
+
+def array_of(value: Any, dtype: Any = None) -> Array:
+    """`jnp.asarray`, but without a program where that would have one compiled; never in memory that a caller may write to."""
+    if isinstance(value, Array) or is_traced(value):
+        return jnp.asarray(value, dtype)
+    kind = jax.dtypes.canonicalize_dtype(np.asarray(value).dtype if dtype is None else dtype)
+    return jnp.asarray(np.array(value, kind), kind)
+
+
+def product(one: Array, other: Any) -> Array:
+    """`one * other`; numbers too small to be normal are 0, as XLA has them on CPUs."""
+    xp = module_for(one, other)
+    if xp is jnp:
+        return one * other
+    with np.errstate(all="ignore"):
+        first, second = (part if isinstance(part, float) else _normal(np.asarray(part)) for part in (one, other))
+        return array_of(_normal(first * second))
+
+
+def _normal(number: Any) -> Any:
+    return number * (abs(number) >= np.finfo(number.dtype).tiny)
 
 
 def require_sizes(plan: Any, zero: tuple[str, ...] = ()) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.engine.access.lists import BUNDLE, TILE
@@ -30,7 +29,7 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced
 from jaxsph.numerics.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
@@ -232,9 +231,9 @@ def of_columns(image: Image, left: int, right: int) -> Image:
 
 def joined(parts: list[Image], axis: int = 0) -> Image:
     """The image of rows that follow on one another, or of columns."""
-    whole = {name: jnp.asarray(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
+    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = jnp.asarray(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
+    levels = array_of(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

@@ -22,7 +22,7 @@ from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.particles.surface import Surface
-from jaxsph.numerics.checks import Progress, record_of
+from jaxsph.numerics.checks import Progress, array_of, record_of
 from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
 
 ROUNDING = 1e-9
@@ -205,7 +205,7 @@ class Snapshots:
             others["quantity"] = others["quantity"], others.pop("extinction_quantity")
         made = Particles.from_arrays(position, **others, kernel=kernel, capacity=self.capacity, box=self.survey.box)
         if wide and made.dtype == jnp.float32 and made.position_rest is None:
-            made = dataclasses.replace(made, position_rest=jnp.asarray(np.zeros(made.position.shape, np.float32)))
+            made = dataclasses.replace(made, position_rest=array_of(np.zeros(made.position.shape, np.float32)))
         return made if self.center is None else made.centered(self.center)
 
     @property

@@ -13,13 +13,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import DOMAINS, Scale, control_values
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import POINTS, colormap
+from jaxsph.numerics.checks import array_of
 
 ROOMS = (8, 16, 32, 64, 128, 256)
 SPARE = 3
@@ -69,7 +69,7 @@ class ControlPoints:
     def of(cls, transfer: TransferFunction, *, flat: bool = False, quantity: Callable[[], Any] = lambda: None) -> ControlPoints:
         """That of a function; where it is to be `flat`, of its colours."""
         if flat:
-            transfer = dataclasses.replace(transfer, extinction=jnp.ones_like(transfer.values), extinction_values=None)
+            transfer = dataclasses.replace(transfer, extinction=array_of(np.ones_like(transfer.values)), extinction_values=None)
         room = room_for(len(transfer.extinction) + SPARE)
         return cls(transfer, _scale_of(transfer), None, room, flat, quantity=quantity)
 
@@ -173,7 +173,7 @@ class ControlPoints:
             own = np.asarray(getattr(self.first, name))
             rows = np.asarray(given.get(name, own), own.dtype)
             spare = np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)
-            padded[name] = jnp.asarray(np.concatenate([rows, spare]))
+            padded[name] = array_of(np.concatenate([rows, spare]))
         return dataclasses.replace(self.first, **padded)
 
     def told(self) -> dict[str, Any]:
@@ -264,7 +264,7 @@ def everywhere(scene: Scene) -> Scene:
 
     def seen(transfer: TransferFunction) -> TransferFunction:
         least = 1e-3 * float(np.max(np.asarray(transfer.extinction), initial=0)) or 1e-3
-        return dataclasses.replace(transfer, extinction=jnp.maximum(transfer.extinction, least))
+        return dataclasses.replace(transfer, extinction=array_of(np.maximum(transfer.extinction, least)))
 
     look = first_look(scene)
     return scene if look is None else looking(scene, seen(look))

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model.particles.particles import Particles
+from jaxsph.numerics.checks import product
 from jaxsph.numerics.extremes import lesser
 
 MOST = 40_000
@@ -28,7 +28,7 @@ def fewer(particles: Particles) -> Particles:
         return particles
     ratio = len(entries) / MOST
     kept = particles.at(np.sort(np.random.default_rng(0).permutation(entries)[:MOST]))
-    support = kept.support * ratio ** (1 / 3)
+    support = product(kept.support, ratio ** (1 / 3))
     if particles.box is not None:
         support = lesser(particles.support.max(), support)
-    return dataclasses.replace(kept, support=support, volume=kept.volume * jnp.asarray(ratio, kept.volume.dtype))
+    return dataclasses.replace(kept, support=support, volume=product(kept.volume, np.asarray(ratio, kept.volume.dtype)))

@@ -35,7 +35,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced, module_for
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.given import in_unit
@@ -128,12 +128,12 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -
         raise ValueError(f"`depth_range` must be two finite depths that ascend, got ({near}, {far})")
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:
         raise ValueError(f"`depth_range` must begin in front of the eye of a perspective camera, at > 0, got {near}")
-    return dataclasses.replace(camera, near=jnp.asarray(near, camera.dtype), far=jnp.asarray(far, camera.dtype))
+    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype))
 
 
 def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera, digits: int) -> Projection:
     """Amounts, or means of values, where lengths of the camera are in a unit that is `2 ** -digits` of what is meant."""
-    area: Any = (2 * camera.half_height / camera.height) ** 2
+    area: Any = array_of((2 * module_for(camera).asarray(camera.half_height) / camera.height) ** 2)
     if digits and not camera.is_perspective:
         area = np.float64(area) * 4.0**-digits  # float32 may not hold it
     values, weight = sums[..., 0], None

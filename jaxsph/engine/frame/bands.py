@@ -33,7 +33,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import Progress
+from jaxsph.numerics.checks import Progress, array_of
 
 MANY = 4  # bands for each device, of which one more or less does not matter
 
@@ -87,7 +87,7 @@ class Work:
         """Bands of those numbers."""
         frame, found = self.begun(shards, run), []
         for number in numbers:
-            found.append(frame.band(jnp.int32(self.first_row + number * self.plan.band_height), run))
+            found.append(frame.band(array_of(self.first_row + number * self.plan.band_height, jnp.int32), run))
             if told is not None:
                 told.one_more()
         return found

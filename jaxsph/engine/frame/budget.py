@@ -30,6 +30,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import array_of
 
 LEVELS, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
 SCREEN, ENDED = "screen", "ended rays"
@@ -75,7 +76,7 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
     image = asked.in_given_unit(image)
     color, left, depth = (np.asarray(layer)[row, column] for layer in (image.color, image.transmittance, image.depth))
     levels = None if image.levels is None else np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
-    total = float(image.error_bound[row, column])
+    total = float(np.asarray(image.error_bound)[row, column])
     return Budget(color, float(left), float(depth), total, bool(image.certified), _apart(total, shares), levels)
 
 
@@ -114,7 +115,7 @@ def _of_leaves(work: Work, clock: Clock, image: Image, row: int, column: int) ->
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
         frame = work.begun(plan.shards, clock)
-        decided, _ = frame.decide(frame.grid(jnp.int32(first), clock).of(frame.ordered), clock)
+        decided, _ = frame.decide(frame.grid(array_of(first, jnp.int32), clock).of(frame.ordered), clock)
         bound = plan.lists.over_pixels(unshard(tuple(one.verdict.bound for one in decided)))
         shares[INTERPOLATION] = float(bound[row - first, column])
     if ends(work.settings):

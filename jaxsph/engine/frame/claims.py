@@ -21,7 +21,7 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.model.image import Image
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import at_hand, is_traced
 
 
 def certified(plan: Plan, settings: Settings) -> Bool[Array, ""] | bool:
@@ -80,12 +80,12 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
     return dataclasses.replace(image, error_bound=image.error_bound + left_out)
 
 
-def missed(image: Image, settings: Settings) -> Int[Array, ""]:
+def missed(image: Image, settings: Settings) -> Int[Array, ""] | int:
     """Fault bit of a tolerance that segments were refined for, and that the estimate is above somewhere."""
     if not settings.is_refined:
-        return jnp.int32(faults.NONE)
-    above = lax.stop_gradient(image.error_bound) > settings.tolerance
-    return faults.raised(faults.TOLERANCE_MISSED, above.any())
+        return faults.NONE
+    xp, bound = at_hand(lax.stop_gradient(image.error_bound))
+    return xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
 
 
 def tell(word: int, image: Image, settings: Settings) -> None:

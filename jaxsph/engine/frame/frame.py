@@ -52,6 +52,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import array_of, product
 
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
 
@@ -86,11 +87,11 @@ class Frame:
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, seen.order), **static)
         limits, dtype = limits_of(settings, seen.viewed.x.dtype), seen.viewed.x.dtype
         allowed = None if limits is None else limits.tolerance
-        least = jnp.asarray(least_transmittance(settings), dtype) if ends(settings) else None
+        least = array_of(least_transmittance(settings), dtype) if ends(settings) else None
         if least is None and any(medium.stops_rays for medium in seen.media):  # what lets nothing through hides all behind it
-            least = jnp.asarray(jnp.finfo(dtype).tiny, dtype)
+            least = array_of(jnp.finfo(dtype).tiny, dtype)
         if limits is not None and plan.quadtree is not None:
-            limits = limits._replace(tolerance=RAY_SHARE * limits.tolerance)
+            limits = limits._replace(tolerance=product(limits.tolerance, RAY_SHARE))
         return cls(ordered, camera, seen.transfer, seen.media, limits, plan, formulas, shards, allowed, least, seen.within)
 
     def band(self, first_row: Int[Array, ""], run: Executor) -> Band:
@@ -142,7 +143,7 @@ class Frame:
         return rays
 
     def _each(self, run: Executor) -> list[Int[Array, ""]]:
-        return run.own([jnp.int32(nth) for nth in range(self.shards)])
+        return run.own([array_of(nth, jnp.int32) for nth in range(self.shards)])
 
     @property
     def shown(self) -> Shown:

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.frame.frame import Frame
@@ -26,7 +27,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced
 
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 Bands = tuple[Decisions, ...]
@@ -125,7 +126,7 @@ class Progressive:
         number, canvas, grids, bands, queues, _ = stage
         if not bands:
             for row in _first_rows(frame):
-                canvas, decisions, grid = opened(canvas, frame, jnp.int32(row), run)
+                canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), run)
                 grids, bands = (*grids, grid), (*bands, decisions)
             queues, _ = self._marked(canvas, bands, frame, run)
         for decisions, wanted in zip(bands, queues, strict=True):
@@ -135,7 +136,7 @@ class Progressive:
     def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Executor) -> tuple[Queues, Quality]:
         """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
         tolerance, plan = tolerance_of(frame), frame.plan
-        inputs = canvas, tolerance, jnp.asarray(self._share, tolerance.dtype)
+        inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
         static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst, "tuning": plan.cast.tuning}
         return run.one("adapt", mark, inputs, first_rows=_first_rows(frame) if bands else (), **static)  # type: ignore[no-any-return]
 
@@ -145,7 +146,7 @@ class Progressive:
         drawn = Drawn.of(layers, stage.grids, self._seen.viewed.faults)
         told: dict[str, Any] = {
             "stage": stage.number,
-            "rays_left": int((~stage.canvas.known).sum()),
+            "rays_left": int((~np.asarray(stage.canvas.known)).sum()),
             "l2_error": float(stage.quality.l2),
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),

@@ -24,6 +24,7 @@ from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.packets import Queue, packets_of
 from jaxsph.engine.screen.quadtree import QuadtreePlan
 from jaxsph.model import registry
+from jaxsph.numerics.checks import array_of
 
 MAX_SHOTS = 8  # painted together
 
@@ -34,7 +35,7 @@ def refined(frame: Frame, run: Executor, faults: Int[Array, ""], progress: Calla
     canvas, coarse = begun(frame, run)
     bands = [coarse]
     for nth in range(plan.bands):
-        row = jnp.int32(nth * plan.band_height)
+        row = array_of(nth * plan.band_height, jnp.int32)
         canvas, decisions, band = opened(canvas, frame, row, run)
         bands.append(band)
         for side in sizes.sides:
@@ -54,14 +55,14 @@ def sizes_of(frame: Frame) -> QuadtreePlan:
 
 def tolerance_of(frame: Frame) -> Float[Array, ""]:
     """What a pixel may be wrong by; without a tolerance less than nothing, so that every leaf is over it."""
-    return jnp.asarray(-1, frame.ordered.x.dtype) if frame.allowed is None else frame.allowed
+    return array_of(-1, frame.ordered.x.dtype) if frame.allowed is None else frame.allowed
 
 
 def begun(frame: Frame, run: Executor) -> tuple[Canvas, Band]:
     """The canvas with the first lattice cast, and what is known of its grid."""
     sizes = sizes_of(frame)
     camera = frame.camera.strided(sizes.stride)
-    made = frame.grid(jnp.int32(0), run, camera, sizes.lists)
+    made = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
     grid = made.of(frame.ordered)
     decided = frame.leave(grid, run, with_levels=False, camera=camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
@@ -105,7 +106,7 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
         for first in range(0, turns, together):
             some = shots[first : first + together]
             room = some[-1:] * (together - len(some))
-            canvas = run.one("adapt", paint, (canvas, (*some, *room), jnp.int32(len(some))), tuning=tuning)
+            canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)), tuning=tuning)
     return canvas
 
 

@@ -43,7 +43,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced
 from jaxsph.numerics.fusion import barriers
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
@@ -81,7 +81,7 @@ def limits_of(settings: Settings, dtype: Any) -> Limits | None:
     if not is_traced(tolerance) and not isinstance(tolerance, jax.Array):
         rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
         tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
-    return Limits(jnp.asarray(tolerance, dtype), jnp.asarray(settings.relax, dtype))
+    return Limits(array_of(tolerance, dtype), array_of(settings.relax, dtype))
 
 
 def ends(settings: Settings) -> bool:

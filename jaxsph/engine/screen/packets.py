@@ -17,6 +17,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.trees import tree
 
 SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
@@ -64,7 +65,7 @@ class Queue:
 
     def turn(self, nth: int, packets: int) -> Queue:
         """The same, with the `nth` so many packets to be cast."""
-        return dataclasses.replace(self, first=jnp.int32(nth * packets), packets=packets)
+        return dataclasses.replace(self, first=array_of(nth * packets, jnp.int32), packets=packets)
 
     def chosen(self) -> Chosen:
         """The packets to be cast."""

@@ -25,7 +25,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
@@ -33,6 +32,7 @@ from jaxsph.io.images.scene_linear import COLOR_KEY, color_of, header_of, is_lig
 from jaxsph.io.libraries import hushed, require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
+from jaxsph.numerics.checks import array_of
 
 SOURCE = "OpenEXR"
 VERSION_KEY = "jaxsph.version"
@@ -88,16 +88,16 @@ def read(path: Path) -> Image:
         metadata = {name: _value(value) for name, value in stored.items()}
         color = np.stack([layers[name] for name in "RGB"], axis=-1)
         return Image(
-            color=jnp.asarray(color_of(color) if is_light(header) else color),
-            transmittance=jnp.asarray(1 - layers.get("A", unknown)),
-            depth=jnp.asarray(layers.get("Z", unknown)),
-            error_bound=jnp.asarray(layers.get("error.bound", unknown)),
-            evaluations=jnp.asarray(layers.get("work.evaluations", unknown)),
+            color=array_of(color_of(color) if is_light(header) else color),
+            transmittance=array_of(1 - layers.get("A", unknown)),
+            depth=array_of(layers.get("Z", unknown)),
+            error_bound=array_of(layers.get("error.bound", unknown)),
+            evaluations=array_of(layers.get("work.evaluations", unknown)),
             certified=metadata.get("certified") is True,
             faults=int(metadata.get("faults") or 0),
             stats={},
             metadata=tuple(metadata.items()),
-            normal=jnp.stack([jnp.asarray(layers[name]) for name in NORMAL], -1) if set(NORMAL) <= set(layers) else None,
+            normal=array_of(np.stack([layers[name] for name in NORMAL], -1)) if set(NORMAL) <= set(layers) else None,
         )
 
 

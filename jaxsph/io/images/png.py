@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.io.damage import explained
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
+from jaxsph.numerics.checks import array_of
 
 SOURCE = "PNG"
 
@@ -75,5 +75,5 @@ def read(path: Path) -> Image:
         with pillow.open(path, formats=["PNG"]) as opened:
             color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
             metadata = tuple(getattr(opened, "text", {}).items())
-        unknown = jnp.full(color.shape[:2], jnp.nan, jnp.float32)
-        return Image(jnp.asarray(color), unknown, unknown, unknown, unknown, False, 0, {}, metadata)
+        unknown = array_of(np.full(color.shape[:2], np.nan, np.float32))
+        return Image(array_of(color), unknown, unknown, unknown, unknown, False, 0, {}, metadata)

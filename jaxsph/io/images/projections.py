@@ -27,6 +27,7 @@ from jaxsph.io.images.exr import read_layers, write_layers
 from jaxsph.io.images.png import write_pixels
 from jaxsph.io.replace import written_whole
 from jaxsph.model.projection import Projection
+from jaxsph.numerics.checks import array_of
 
 SUFFIXES = (".exr", ".npy", ".fits", ".png")
 WEIGHT = "weight"
@@ -76,8 +77,8 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
         more = tuple((name, value) for name, value in header.items() if name.startswith("jaxsph.") and name not in known)
         weight = layers.get(WEIGHT)
         return Projection(
-            jnp.asarray(layers[_channel(header[NAME])]),
-            None if weight is None else jnp.asarray(weight),
+            array_of(layers[_channel(header[NAME])]),
+            None if weight is None else array_of(weight),
             np.float64(header[AREA]) if isinstance(header[AREA], str) else jnp.float32(header[AREA]),
             header[PERSPECTIVE] == "true",
             name=header[NAME],

@@ -19,7 +19,6 @@ import dataclasses
 import os
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.io.opening.options import Look
@@ -37,6 +36,7 @@ from jaxsph.model.transfer.looks import (
     preset,
 )
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import array_of
 
 KINDS = {
     "temperature": (*ROLES["temperature"], *ROLES["internal_energy"], "entropy", "energy"),
@@ -78,7 +78,7 @@ def by_logarithm(particles: Particles, opacity_by: str | None) -> tuple[Particle
     if not high > DECADE * low:
         return particles, opacity_by
     least = float(real[real > 0].min())
-    logarithm = jnp.asarray(np.log10(np.maximum(values, least)), second.dtype)
+    logarithm = array_of(np.log10(np.maximum(values, least)), second.dtype)
     return dataclasses.replace(particles, extinction_quantity=logarithm), LOG_PREFIX + opacity_by
 
 

@@ -34,6 +34,7 @@ from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import product
 
 NEEDS_ROWS = ("face-on", "edge-on")
 
@@ -154,8 +155,8 @@ def staged(
     else:
         scene = dataclasses.replace(scene, surface=surface)
         said = [("surface", told_of_surface(surface, look)), *said]
-    transfer = scene.looks[0]
-    span = f"{float(transfer.values[0]):.6g} .. {float(transfer.values[-1]):.6g}"
+    values = np.asarray(scene.looks[0].values)
+    span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or _labels(loaded), tuple(said))
 
@@ -173,7 +174,7 @@ def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
 
 
 def _scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
-    return dataclasses.replace(transfer, extinction=transfer.extinction * np.asarray(factor, transfer.extinction.dtype))
+    return dataclasses.replace(transfer, extinction=product(transfer.extinction, np.asarray(factor, transfer.extinction.dtype)))
 
 
 def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 
@@ -23,6 +22,7 @@ from jaxsph.io.settle.supports import even_spacing
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import array_of
 
 OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY"
 """Formats that liquids are kept in, by tools that draw their surface: points that lie evenly are one, without supports, too."""
@@ -87,7 +87,7 @@ def within_surface(shown: Particles, surface: Surface) -> Particles:
     if surface.of == "coverage":
         return shown
     high = np.asarray(shown.valid) & (np.asarray(getattr(shown, surface.of)) >= float(surface.level))
-    return dataclasses.replace(shown, valid=jnp.asarray(high)) if high.any() else shown
+    return dataclasses.replace(shown, valid=array_of(high)) if high.any() else shown
 
 
 def _require_particles(shown: Particles | Volume) -> Particles:

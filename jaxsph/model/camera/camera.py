@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced, require_finite
+from jaxsph.numerics.checks import array_of, is_traced, require_finite
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
@@ -371,9 +371,9 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
     forward = forward / xp.sqrt((forward * forward).sum())
     axes = _axes(forward, up.astype(forward.dtype), xp)
     dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
-    rest = jnp.asarray(eye - eye.astype(dtype), dtype)
-    eye, axes, half = (jnp.asarray(v, dtype) for v in (eye, axes, half))
-    near, far = (end if end is None else jnp.asarray(end, dtype) for end in (near, far))
+    rest = array_of(eye - eye.astype(dtype), dtype)
+    eye, axes, half = (array_of(v, dtype) for v in (eye, axes, half))
+    near, far = (end if end is None else array_of(end, dtype) for end in (near, far))
     return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)
 
 

@@ -9,11 +9,10 @@ import dataclasses
 import itertools
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced
 
 NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
 ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
@@ -43,8 +42,8 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
         )
     found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *getattr(shown, "parts", (shown,)))
     ends = (camera.near, found.near), (camera.far, found.far)
-    near, far = (jnp.asarray(own if given is None else given, camera.dtype) for given, own in ends)
-    if not near < far:
+    near, far = (array_of(own if given is None else given, camera.dtype) for given, own in ends)
+    if not float(near) < float(far):
         raise ValueError(
             f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
         )
@@ -96,4 +95,4 @@ def _between(camera: Camera, near: float, far: float) -> Camera:
     margin = ROUNDING * max(abs(near), abs(far))
     near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
     dtype = camera.dtype
-    return dataclasses.replace(camera, near=jnp.asarray(near, dtype), far=jnp.asarray(far + margin, dtype))
+    return dataclasses.replace(camera, near=array_of(near, dtype), far=array_of(far + margin, dtype))

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.trees import fill, tree, unchecked_of
@@ -57,7 +57,7 @@ class Plane(Clip):
                 raise ValueError("`normal` must not be (0, 0, 0): it tells which side of the plane is shown; give a direction")
             along = along / np.abs(along).max()
             along = along / np.linalg.norm(along)
-        fill(self, point=near, normal=jnp.asarray(along, near.dtype), rest=rest)
+        fill(self, point=near, normal=array_of(along, near.dtype), rest=rest)
 
     def seen_by(self, camera: Camera) -> Plane:
         """See `Clip`."""
@@ -138,13 +138,15 @@ class Box(_Boxed):
             ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
             if not (ends[0] < ends[1]).all():
                 raise ValueError(f"`lower` must be below `upper` along each axis, got {ends[0].tolist()} and {ends[1].tolist()}")
-        rest = jnp.stack([low_rest.astype(dtype), high_rest.astype(dtype)])
+        xp, rests = at_hand((low_rest, high_rest))
+        rest = array_of(xp.stack(rests).astype(dtype))
         fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=rest)
 
     @property
     def sides(self) -> Float[Array, "3"]:
         """Lengths along x, y and z."""
-        return (self.upper - self.lower) + (self.rest[1] - self.rest[0])
+        own: Box = at_hand(self)[1]
+        return array_of((own.upper - own.lower) + (own.rest[1] - own.rest[0]))
 
     def seen_by(self, camera: Camera) -> _TurnedBox:
         """See `Clip`."""
@@ -215,7 +217,7 @@ class Sphere(Clip):
             require_shape("radius", radius, (), "give one number")
             require_finite("radius", radius, "give a length")
             require_positive("radius", radius, "give a length")
-        fill(self, center=near, radius=jnp.asarray(radius, near.dtype), rest=rest)
+        fill(self, center=near, radius=array_of(radius, near.dtype), rest=rest)
 
     def seen_by(self, camera: Camera) -> Sphere:
         """See `Clip`."""
@@ -275,7 +277,7 @@ def _vector(name: str, value: Any) -> tuple[Array, Array]:
         return given, jnp.zeros_like(given)
     exact, dtype = _exact(name, value)
     near = exact.astype(dtype)
-    return jnp.asarray(near), jnp.asarray(exact - near, dtype)
+    return array_of(near), array_of(exact - near, dtype)
 
 
 def _along(axis: Array, place: Place, origin: Array) -> Array:

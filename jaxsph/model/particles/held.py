@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import NO_UNITS, own, plain, unit_of
 
 COLUMNS = ("volume", "quantity")
@@ -119,4 +119,4 @@ def _scaled(particles: Particles, channels: list[Any]) -> tuple[Any, tuple[int, 
     largest = [float(np.abs(one).max(initial=0)) for one in known]
     exponents = tuple(math.frexp(one)[1] if math.isfinite(one) else 0 for one in largest)
     columns = [np.ldexp(one, -exponent).astype(dtype) for one, exponent in zip(known, exponents, strict=True)]
-    return jnp.asarray(np.stack(columns, 1)), exponents
+    return array_of(np.stack(columns, 1)), exponents

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_real, require_shape
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real, require_shape
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 
@@ -70,4 +70,4 @@ def rest_of(given: Any, rounded: Any, reach: Any) -> Array | None:
     rest = padded_to(exact - near[: len(exact)], len(near), 0.0, np)
     if not (np.abs(rest).max(1) > NEGLIGIBLE * np.asarray(reach, np.float64)).any():
         return None
-    return jnp.asarray(rest, rounded.dtype)
+    return array_of(rest, rounded.dtype)

@@ -20,7 +20,7 @@ from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
@@ -148,9 +148,9 @@ class Particles:
         if known:
             _require_volumes(arrays["volume"], columns["volume"])
         rest = rest_of(arrays["position"], columns["position"], columns["support"]) if known else None
-        entries = {name: jnp.asarray(value) for name, value in columns.items()}
-        valid, period, called = jnp.arange(room) < count, _period(box, arrays["support"], dtype), name_of(unit)
-        return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=called)
+        entries = {name: array_of(value) for name, value in columns.items()}
+        valid, period = array_of((np if known else jnp).arange(room) < count), _period(box, arrays["support"], dtype)
+        return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=name_of(unit))
 
     @classmethod
     def from_columns(
@@ -268,17 +268,18 @@ class Particles:
         """
         if self.box is None:
             return self
-        turns = jnp.floor((lax.stop_gradient(self.position) - self.box.lower) / sides_of(self.box)[0])
-        return self.moved(jnp.where(jnp.isfinite(turns), -turns, 0), self.box)
+        xp, (position, box) = at_hand((lax.stop_gradient(self.position), self.box))
+        with np.errstate(all="ignore"):
+            turns = xp.floor((position - box.lower) / sides_of(box)[0])
+        return self.moved(xp.where(xp.isfinite(turns), -turns, 0), self.box)
 
     def moved(self, turns: Float[Array, "particles 3"], box: Box) -> Particles:
         """The same particles so many sides of a box further; with what that rounds off, where what rounding has left is kept."""
+        _, (position, rest, turns, box) = at_hand((self.position, self.position_rest, turns, box))
         sides, left_of_sides = sides_of(box)
-        position, left = two_sum(self.position, turns * sides)
-        if self.position_rest is None:
-            return dataclasses.replace(self, position=position)
-        rest = self.position_rest + (left + turns * left_of_sides)
-        return dataclasses.replace(self, position=position, position_rest=rest)
+        position, left = two_sum(position, turns * sides)
+        rest = None if rest is None else array_of(rest + (left + turns * left_of_sides))
+        return dataclasses.replace(self, position=array_of(position), position_rest=rest)
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """The particles that exist, without padding (host side): all `columns`."""
@@ -392,6 +393,7 @@ def sides_of(box: Box) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
 def two_sum(first: Array, second: Array) -> tuple[Array, Array]:
     """A sum, and what rounding it has left (Knuth 1969, section 4.2.2)."""
     total = first + second
-    part = lax.stop_gradient(total - first)
-    left = (lax.stop_gradient(first) - (lax.stop_gradient(total) - part)) + (lax.stop_gradient(second) - part)
+    held: Any = lax.stop_gradient if isinstance(total, jax.Array) else lambda one: one  # NumPy's have no derivative
+    part = held(total - first)
+    left = (held(first) - (held(total) - part)) + (held(second) - part)
     return total, left

@@ -31,6 +31,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
+from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.extremes import clamped, greater, lesser
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
@@ -99,7 +100,7 @@ def with_sources(
 
 def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = None) -> int:
     """How many ghosts particles have, or a few more (host side); 0 without a box."""
-    return 0 if particles.box is None else int(_counted(particles, jnp.asarray(margin, particles.dtype), through=through))
+    return 0 if particles.box is None else int(_counted(particles, array_of(margin, particles.dtype), through=through))
 
 
 def with_ghosts(particles: Particles) -> Particles:

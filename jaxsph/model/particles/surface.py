@@ -16,7 +16,7 @@ import scipy.spatial
 
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import is_traced, product, require_finite, require_positive, require_shape
 from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage", "quantity", "extinction_quantity")
@@ -126,8 +126,8 @@ class Surface:
 
     def makers(self, particles: Particles, smoothing: Any) -> Particles:
         """Particles whose coverage is the field: with supports that `smoothing` widens, and the quantity in their volumes."""
-        support = particles.support * smoothing.astype(particles.support.dtype)
-        volume = particles.volume if self.of == "coverage" else particles.volume * getattr(particles, self.of)
+        support = product(particles.support, smoothing.astype(particles.support.dtype))
+        volume = particles.volume if self.of == "coverage" else product(particles.volume, getattr(particles, self.of))
         return dataclasses.replace(particles, support=support, volume=volume)
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -22,6 +21,7 @@ from jaxsph.model.preview.exposure import typical_exposure
 from jaxsph.model.preview.glimpse import glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import array_of
 
 CENTRAL = 0.99
 FILLED = 0.88
@@ -164,7 +164,7 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
     far += WIDENED * (far - near)
     if not near < far:
         return camera
-    return dataclasses.replace(camera, near=jnp.asarray(near, camera.dtype), far=jnp.asarray(far, camera.dtype))
+    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype))
 
 
 def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tuple[np.ndarray, float, float]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
@@ -95,7 +95,7 @@ class TransferFunction:
             for name in control:
                 _require_ascending(name, given[name])
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
-        packed = {name: jnp.asarray(value, dtype) for name, value in given.items()}
+        packed = {name: array_of(value, dtype) for name, value in given.items()}
         if not is_traced(*given.values()):
             for name, value in packed.items():
                 require_finite(name, value, f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")

@@ -29,6 +29,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import product
 
 __all__ = ["COLORMAPS", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
@@ -239,7 +240,7 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
     _require_depth(optical_depth)
     depth = _typical_depth(shown, np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64))
     scale = np.asarray(optical_depth / depth, transfer.extinction.dtype)
-    return dataclasses.replace(transfer, extinction=transfer.extinction * scale)
+    return dataclasses.replace(transfer, extinction=product(transfer.extinction, scale))
 
 
 def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_depth: float) -> np.ndarray:
