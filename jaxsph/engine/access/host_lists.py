@@ -102,6 +102,7 @@ def find_sides(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, l
     return Sides(left, right, top, bottom, tuple(functools.reduce(jnp.bitwise_or, word) for word in words), spheres)
 
 
+@compiled_quickly
 @jax.jit
 def find_touched(
     spheres: Float[Array, "particles 4"],

@@ -170,6 +170,10 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
+    def blocks(self, block: int) -> Int[Array, " tasks"]:
+        """How many blocks of `block` spheres the windows of each slab hold."""
+        return (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
+
     def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[Turns]:
         """All blocks of `block` spheres of all slabs, in order for each slab; of `parts` 4 is the first quarter of the slabs.
 
@@ -177,7 +181,7 @@ class SlabTask:
         times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
         only a part of them has anything left, then that part alone, and so on. Out of order it takes longer.
         """
-        blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
+        blocks = self.blocks(block)
         tasks = blocks.shape[0]
         numbers = [tasks, *(tasks // part for part in parts if tasks >= FEWEST), 0]
         begin = jnp.int32(0)

@@ -26,7 +26,7 @@ from jaxsph.model.camera.camera import Camera
 Found = Int[Array, " particles"] | None
 
 
-@stage("lists", "samples", "beside")
+@stage("lists", "samples", "beside", quickly=True)
 def find_windows(
     ordered: Ordered,
     made: BundleLists,

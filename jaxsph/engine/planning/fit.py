@@ -25,7 +25,6 @@ from jaxsph.engine.planning.plan import FrameShape, Plan, choose, fitted, fittin
 from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene
 from jaxsph.engine.request import Request, first_samples
 from jaxsph.engine.runtime.executors import Clock, Executor
-from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
@@ -103,7 +102,7 @@ def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -
     """Have the scene viewed, with its particles padded to the capacity of a frame."""
     capacity = sizes.num_particles
     if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
-        scene = dataclasses.replace(scene, particles=run.one("grid", pad, (scene.particle_set,), capacity=capacity))
+        scene = dataclasses.replace(scene, particles=scene.particle_set.padded(capacity))
     between = _between(scene, sizes.integrator)
     static = {"samples": sizes.samples, "num_classes": sizes.num_classes, "between_samples": between}
     seen: Seen = run.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
@@ -124,13 +123,6 @@ def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
     return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
-
-
-@compiled_quickly
-@functools.partial(jax.jit, static_argnames="capacity")
-def pad(particles: Particles, *, capacity: int) -> Particles:
-    """`Particles.padded` as a stage."""
-    return particles.padded(capacity)
 
 
 def measured(seen: Seen, asked: Request, shape: FrameShape) -> Measures:
@@ -158,16 +150,16 @@ class Plans:
     def for_frame(self, asked: Request, run: Clock) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings, own = asked.along, shape_of(asked)
-        limit = settings.memory_limit or own.memory
-        for shape in dict.fromkeys((self._similar(own), own)):  # the room of a kept plan may be more than there is memory for
+        limit, common = settings.memory_limit or own.memory, own.in_common()
+        for shape in dict.fromkeys((common, self._similar(own), own)):  # some may be more than there is memory for
             run.mark("plan")
             seen, measures = sorted_and_measured(see(asked.scene, asked.camera, shape, run), asked, shape)
-            choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0)
-            needed = fitting(measures, tight, settings, choices, limit)
-            if needed is not None:
+            choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0, common=False)
+            needed, made = (fitting(measures, one, settings, choices, limit) for one in (tight, shape))
+            if needed is not None and (made is not None and made.bands == needed.bands or not shape.common):
                 break
         needed = needed or fitted(measures, tight, settings, choices)  # which says how much memory would do
-        made = self._recalled(needed, shape, settings) or fitting(measures, shape, settings, choices, limit) or needed
+        made = self._recalled(needed, shape, settings) or made or needed
         self._keep(made)
         run.mark("plan")
         return made, seen
@@ -229,7 +221,7 @@ def shape_of(asked: Request) -> FrameShape:
     classes = _num_classes(np.asarray(spheres.support)[valid])
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
-        margin = longest_interval(camera, samples) if _between(scene, settings.integrator) else 0.0
+        margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator) else 0.0
         capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
     size = camera.width, camera.height, samples
     opaque = scene.surface is not None

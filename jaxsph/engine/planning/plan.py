@@ -38,6 +38,7 @@ MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
+COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 
@@ -216,6 +217,7 @@ class FrameShape:
         opaque: whether rays end at a surface: the light of so many slabs is held that few behind it are marched.
         tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
         bands: that there are to be, or more where memory needs it.
+        common: whether rooms are those of few classes, see `in_common`.
     """
 
     width: int
@@ -230,6 +232,28 @@ class FrameShape:
     integrator: str = "samples"
     opaque: bool = False
     bands: int = 1
+    common: bool = False
+
+    def in_common(self) -> FrameShape:
+        """With rooms that frames of most files share, and so their programs, where room that is not filled costs nothing.
+
+        Room changes no bit of an image.
+        """
+        if not self.tuning.common_particles:
+            return self
+        particles = common_class(self.num_particles, self.tuning.common_particles)
+        classes = next(number for number in COMMON_CLASSES if number >= self.num_classes)
+        return dataclasses.replace(self, num_particles=particles, num_classes=classes, common=True)
+
+    def room_for(self, pairs: int) -> int:
+        """Entries for pairs of particles and tiles or bundles."""
+        pairs = max(int(self.headroom * pairs), pairs, 1)
+        return common_class(pairs, self.tuning.common_pairs) if self.common else capacity_class(pairs)
+
+
+def common_class(count: int, sizes: tuple[int, ...]) -> int:
+    """The least of some sizes that holds `count`; of more, its own class."""
+    return next((size for size in sizes if size >= count), capacity_class(count))
 
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
@@ -305,7 +329,7 @@ def in_bands(
     rows = -(-tile_rows // bands)
     bands = -(-tile_rows // rows)
     pairs = [fullest_band(counts, rows) for counts in (measures.tile_pairs, measures.bundle_pairs)]
-    tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in pairs)
+    tiled, listed = map(shape.room_for, pairs)
     lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
     batch = cast.batch_slabs // OPAQUE_BATCHES if batch is None and shape.opaque else batch
@@ -329,7 +353,7 @@ def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, li
     """Sizes of the first lattice, and of what is cast after that at a time."""
     stride = settings.leaf_pixels // 2
     rows, columns = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
-    tiled, listed = (capacity_class(max(int(shape.headroom * count), count, 1)) for count in measures.of_lattice)
+    tiled, listed = map(shape.room_for, measures.of_lattice)
     coarse = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
     packets = max(lists.num_bundles // shape.tuning.turns, min(lists.num_bundles, MIN_PACKETS))
     return QuadtreePlan(settings.leaf_pixels, coarse, packets)

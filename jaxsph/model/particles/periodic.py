@@ -17,7 +17,6 @@ particle is taken once, with all of its support.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from typing import Any, NamedTuple
 
@@ -78,7 +77,7 @@ def with_sources(
     usable = (sides > 0).all() & jnp.isfinite(sides).all()
     fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= sides.min()
     word = faults.raised(faults.BAD_BOX, ~(usable & fits))
-    near, gaps = _near(home, margin, ROUNDING, through)
+    near, gaps = _near(home, margin, through)
     capacity = particles.capacity
     own = jnp.arange(capacity, dtype=jnp.int32)
     if room == 0:
@@ -100,7 +99,21 @@ def with_sources(
 
 def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = None) -> int:
     """How many ghosts particles have, or a few more (host side); 0 without a box."""
-    return 0 if particles.box is None else int(_counted(particles, array_of(margin, particles.dtype), through=through))
+    if particles.box is None:
+        return 0
+    box, valid, eps = particles.box, np.asarray(particles.valid), COUNTED * float(jnp.finfo(particles.dtype).eps)
+    lower, upper = (np.asarray(corner, np.float64) for corner in (box.lower, box.upper))
+    position, support = (np.asarray(value, np.float64)[valid] for value in (particles.position, particles.support))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        below = (position - lower) % (upper - lower)
+        above = upper - lower - below
+        if through is not None:
+            below[:, through] = above[:, through] = np.inf
+        size = np.maximum(np.abs(lower), np.abs(upper)).max() + np.abs(position).max(1, initial=0)
+        reach = (support + margin) * (1 + eps) + eps * (size + margin)
+        near = np.minimum(below, above).min(1) < reach
+        gaps = Gaps(below[near], above[near], reach[near])
+        return sum(int(np.count_nonzero(_reaches(gaps, image))) for image in IMAGES)
 
 
 def with_ghosts(particles: Particles) -> Particles:
@@ -120,17 +133,11 @@ def with_ghosts(particles: Particles) -> Particles:
 _unfolded = jax.jit(unfolded, static_argnames="room")
 
 
-@functools.partial(jax.jit, static_argnames="through")
-def _counted(particles: Particles, margin: Float[Array, ""], *, through: int | None) -> Int[Array, ""]:
-    near, gaps = _near(particles.wrapped(), margin, COUNTED, through)
-    return sum(((near & _reaches(gaps, image)).sum(dtype=jnp.int32) for image in IMAGES), jnp.int32(0))
-
-
-def _near(particles: Particles, margin: Any, rounding: int, through: int | None) -> tuple[Array, Gaps]:
+def _near(particles: Particles, margin: Any, through: int | None) -> tuple[Array, Gaps]:
     """Particles that reach over a face or so near to it, and how far all are from faces: infinitely from those not asked for."""
     assert particles.box is not None
     particles = lax.stop_gradient(particles)
-    box, eps = particles.box, rounding * jnp.finfo(particles.dtype).eps
+    box, eps = particles.box, ROUNDING * jnp.finfo(particles.dtype).eps
     assert box is not None
     size = jnp.maximum(jnp.abs(box.lower), jnp.abs(box.upper)).max() + margin
     asked = jnp.arange(3) != (-1 if through is None else through)
@@ -140,10 +147,10 @@ def _near(particles: Particles, margin: Any, rounding: int, through: int | None)
     return near, Gaps(below, above, reach)
 
 
-def _reaches(gaps: Gaps, image: np.ndarray) -> Array:
+def _reaches(gaps: Gaps, image: np.ndarray) -> Any:
     """Whether an image reaches into the box; one a period further up is as far above the box as the particle is within."""
     away = [(gaps.below if step > 0 else gaps.above)[:, k] for k, step in enumerate(image) if step]
-    return jnp.sum(jnp.maximum(jnp.stack(away), 0) ** 2, 0) < gaps.reach * gaps.reach
+    return sum(gap.clip(0) ** 2 for gap in away) < gaps.reach * gaps.reach  # type: ignore[no-any-return]
 
 
 def sees_images(particles: Particles, camera: Camera) -> bool:
