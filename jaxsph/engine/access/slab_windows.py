@@ -39,7 +39,16 @@ def find_slab_windows(ordered: Ordered, lists: BundleLists, beside: bool = False
     `beside`: of slabs with all that lies between their samples and those of the next, for samples of any spacing.
     """
     first, last = (ordered.first_beside, ordered.last_beside) if beside else (ordered.first_rank, ordered.last_rank)
-    begin, end = _bisect(lists.rank, jnp.stack([first, last]), lists.start, lists.end)
+    wanted = jnp.stack([first, last])
+
+    def of_class(nth: Array, found: Array) -> Array:
+        return found.at[:, nth].set(_bisect(lists.rank, wanted[:, nth], lists.start, lists.end))
+
+    if (classes := first.shape[0]) == 1:
+        begin, end = _bisect(lists.rank, wanted, lists.start, lists.end)
+    else:  # classes that nobody is in cost nothing
+        used = jnp.max(jnp.where((first < last).any(1), jnp.arange(1, classes + 1, dtype=jnp.int32), 0))
+        begin, end = lax.fori_loop(0, used, of_class, jnp.zeros((*wanted.shape, lists.start.shape[0]), jnp.int32))
     length = jnp.maximum(end - begin, 0)
     return SlabWindows(begin, length, length.sum(0, dtype=jnp.int32))
 

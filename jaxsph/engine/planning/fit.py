@@ -10,13 +10,11 @@ depend on what was rendered before it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxsph.engine.access.host_sorting import depth_order
@@ -28,7 +26,7 @@ from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.particles.periodic import num_ghosts
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings
@@ -156,7 +154,7 @@ class Plans:
             seen, measures = sorted_and_measured(see(asked.scene, asked.camera, shape, run), asked, shape)
             choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0, common=False)
             needed, made = (fitting(measures, one, settings, choices, limit) for one in (tight, shape))
-            if needed is not None and (made is not None and made.bands == needed.bands or not shape.common):
+            if needed is not None and ((made is not None and made.bands == needed.bands) or not shape.common):
                 break
         needed = needed or fitted(measures, tight, settings, choices)  # which says how much memory would do
         made = self._recalled(needed, shape, settings) or made or needed
