@@ -20,7 +20,7 @@ from jaxsph.model.clips.shapes import Box
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.packing import columns_of, packed, padded_to, rest_of
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
@@ -204,9 +204,14 @@ class Particles:
         """
         if capacity < self.capacity:
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
-        columns = {name: padded_to(column, capacity, xp=jnp, **_padding(name)) for name, column in self.columns.items()}
-        valid = jnp.pad(self.valid, (0, capacity - self.capacity))
-        rest = None if self.position_rest is None else padded_to(self.position_rest, capacity, 0.0, jnp)
+        xp = module_for(self)
+
+        def longer(column: Any, **how: Any) -> Array:
+            return jnp.asarray(padded_to(xp.asarray(column), capacity, xp=xp, **how))
+
+        columns: dict[str, Any] = {name: longer(column, **_padding(name)) for name, column in self.columns.items()}
+        valid = longer(self.valid, nothing=False, repeat=False)
+        rest = None if self.position_rest is None else longer(self.position_rest, nothing=0.0)
         return dataclasses.replace(self, **columns, valid=valid, position_rest=rest)
 
     def at(self, entries: Any) -> Particles:
