@@ -62,9 +62,6 @@ class Counted(AllShards):
     def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         return self.one(stage, made.function, arguments, **static)
 
-    def may_hold(self, flag: jax.Array) -> bool:
-        return bool(flag)
-
 
 def traced(run: Callable[[], Any], instructions: set[str]) -> tuple[Any, collections.Counter[str]]:
     """A program's result, and how often it executed each of its instructions, on whatever threads."""

@@ -169,19 +169,11 @@ def _let_go_of_programs() -> None:
         jax.clear_caches()
 
 
-@pytest.fixture(scope="module")
-def own_programs() -> Iterator[None]:
-    """No program from another test file, and none for the next."""
-    programs.PROGRAMS.clear()
-    yield
-    programs.PROGRAMS.clear()
-
-
 @pytest.fixture
-def quick_programs(own_programs: None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def quick_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Programs of eager images compiled in less than half the time, and slower: those of slow tests are as everyone has them."""
     if request.node.get_closest_marker("slow") is None:
-        monkeypatch.setattr(programs, "_compile", lambda lowered, _: lowered.compile(compiler_options=QUICKLY))
+        monkeypatch.setattr(programs, "OF_ALL", QUICKLY)
 
 
 @pytest.fixture

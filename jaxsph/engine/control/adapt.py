@@ -104,12 +104,6 @@ def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bu
     return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
 
 
-def untouched(cells: SlabWindows, slab_samples: int) -> Int[Array, "cells bundles"]:
-    """Levels of cells that are all left at full rate."""
-    empty = _nowhere(cells, -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES), slab_samples)
-    return jnp.where(empty, jnp.int32(EMPTY), 0)
-
-
 def _nowhere(cells: SlabWindows, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
     """Cells that no particle can touch."""
     count = jnp.pad(cells.count, ((0, num_cells * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))

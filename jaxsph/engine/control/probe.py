@@ -10,9 +10,6 @@ it says, what is analysed is bounded with care.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -23,31 +20,9 @@ from jaxsph.engine.access.slab_windows import CELL_SAMPLES
 from jaxsph.engine.control.ranges import RangeTables, ranges_of_parts
 from jaxsph.engine.field.fetch import position
 from jaxsph.numerics.fusion import fusion_barrier
-from jaxsph.numerics.trees import tree
 
 PROBES = 8  # particles of each slab, from the middle half of its window
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
-
-
-@tree()
-class Probe:
-    """What a look at the bundles of a band, or of a shard of it, has found.
-
-    Attributes:
-        promising: cells that are to be analysed, if that is `worthwhile`.
-        held: how much of the work they hold.
-        all_held: the work of all cells.
-    """
-
-    promising: Bool[Array, "cells bundles"]
-    held: Float[Array, ""]
-    all_held: Float[Array, ""]
-
-
-def worthwhile(shares: Sequence[tuple[Array, Array]]) -> Bool[Array, ""]:
-    """Whether promising cells hold enough of a band's work to be analysed, by `held` and `all_held` of all of its shards."""
-    held, all_held = (functools.reduce(jnp.add, works) for works in zip(*shares, strict=True))
-    return held >= MIN_PROMISING_SHARE * all_held
 
 
 def probe(
@@ -56,11 +31,11 @@ def probe(
     tolerance: Float[Array, ""],
     slab_samples: int,
     cells_at_once: int,
-) -> Probe:
+) -> Bool[Array, "cells bundles"]:
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
-    What is promising grows with `tolerance`.
+    What is promising grows with `tolerance`. Where such cells hold too little of the work to be analysed, there are none.
 
     Args:
         tables: of the parts of the transfer function.
@@ -94,7 +69,7 @@ def probe(
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
     found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
     held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
-    return Probe(found, held, all_held)
+    return found & (held >= MIN_PROMISING_SHARE * all_held)
 
 
 def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -66,7 +66,7 @@ class Work:
             bands = _side_by_side(work, dealt, clock, told)
             return work.developed(clock, bands)
         draw = functools.partial(work.in_order, dealt.shards)
-        clock.foresee(lambda known: draw(clock.forecast(known), None))
+        clock.foresee(lambda run: draw(run, None))
         return draw(clock, told)
 
     def image(self, clock: Clock, progress: Progress | None = None, *, planned: bool = True) -> Image:
@@ -145,7 +145,7 @@ def _side_by_side(work: Work, dealt: Dealing, clock: Clock, told: _Told) -> list
 
     def draw(run: OnDevices, numbers: tuple[int, ...]) -> list[Band]:
         with jax.enable_x64(wide):  # which a thread does not inherit
-            run.foresee(lambda known: work.bands(dealt.shards, run.forecast(known), numbers, None))
+            run.foresee(lambda forecast: work.bands(dealt.shards, forecast, numbers, None))
             return work.bands(dealt.shards, run, numbers, told)
 
     with ThreadPoolExecutor(len(runs)) as threads:

@@ -83,7 +83,7 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
 def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, Image]:
     """A band, and the image of it alone."""
     shards, plan = work.plan.shards, work.plan
-    clock.foresee(lambda known: work.bands(shards, clock.forecast(known), [number], None))
+    clock.foresee(lambda run: work.bands(shards, run, [number], None))
     (band,) = work.bands(shards, clock, [number], None)
     return band, image_of(work.developed(clock, [band]), work.camera, work.settings, plan, clock, planned=planned)
 

@@ -36,9 +36,7 @@ from jaxsph.engine.frame.stages import (
     ends,
     least_transmittance,
     limits_of,
-    probe_shard,
     sum_shard,
-    wanted_cells,
 )
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
@@ -168,14 +166,13 @@ class Frame:
         if isinstance(self.plan.control, PilotPlan):
             return self._ask_pilot(grid, self.plan.control, run)
         controlled = self.limits is not None and self.plan.control is not None
-        return (self._bound(grid, run) if controlled else self.leave(grid, run, with_levels=False)), None
+        return (self._bound(grid, run) if controlled else self.leave(grid, run)), None
 
-    def leave(self, grid: Grid, run: Executor, *, with_levels: bool, camera: Camera | None = None) -> list[Decided]:
+    def leave(self, grid: Grid, run: Executor, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
         shown = self.shown._replace(camera=camera or self.camera)
         inputs = [(grid, shown, nth) for nth in self._each(run)]
-        static = {"shards": self.shards, "halo": self._halo, "with_levels": with_levels, **self._cast}
-        return run.each("adapt", decide_full_rate, inputs, **static)
+        return run.each("adapt", decide_full_rate, inputs, shards=self.shards, halo=self._halo, **self._cast)
 
     def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
         view = (grid, self.camera, self.transfer)
@@ -194,14 +191,9 @@ class Frame:
         return [run.one("adapt", decide_by_pilot, (grid, self.shown, self.limits, lattice), **self._cast)], lattice
 
     def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
-        static, each = {"shards": self.shards, **self._cast}, self._each(run)
-        probes = run.each("adapt", probe_shard, [(grid, self.transfer, self.limits, nth) for nth in each], **static)
-        pays, wanted = run.one("adapt", wanted_cells, (tuple(run.pooled(probes)),), tuning=self.plan.cast.tuning)
-        if not run.may_hold(pays):
-            return self.leave(grid, run, with_levels=True)
-        view = (grid, self.shown, self.limits)
-        inputs = [(*view, of_shard, nth) for of_shard, nth in zip(run.own(wanted), each, strict=True)]
-        return run.each("adapt", decide_by_bounds, inputs, control=self.plan.control, **static)
+        inputs = [(grid, self.shown, self.limits, nth) for nth in self._each(run)]
+        static = {"shards": self.shards, "control": self.plan.control, **self._cast}
+        return run.each("adapt", decide_by_bounds, inputs, **static)
 
 
 def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:

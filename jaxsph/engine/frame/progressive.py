@@ -19,7 +19,7 @@ from jaxsph.engine.frame.refinement import begun, finished, opened, shot, sizes_
 from jaxsph.engine.frame.refinement_stages import Decisions, mark
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Clock, Executor, Forecast
+from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.marking import Quality
 from jaxsph.engine.screen.packets import Queue
@@ -108,8 +108,7 @@ class Progressive:
         plan, self._seen = PLANS.for_frame(asked, self._clock)
         work = Work(self._seen, asked.camera, self._settings, plan, asked.scene.formulas)
 
-        def rehearse(known: list[bool]) -> None:
-            run = Forecast(known)
+        def rehearse(run: Executor) -> None:
             frame = work.begun(plan.shards, run)
             finished(self._refined(self._coarse(frame, run), frame, run).canvas, frame, run)
 

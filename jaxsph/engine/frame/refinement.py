@@ -64,7 +64,7 @@ def begun(frame: Frame, run: Executor) -> tuple[Canvas, Band]:
     camera = frame.camera.strided(sizes.stride)
     made = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
     grid = made.of(frame.ordered)
-    decided = frame.leave(grid, run, with_levels=False, camera=camera)
+    decided = frame.leave(grid, run, camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
     filled = tuple(one.schedule.filled for one in decided)
     canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists, tuning=frame.plan.cast.tuning)
@@ -84,7 +84,7 @@ def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Executo
     of_bundles = of_rays = joined(decided)
     of_nodes = None
     if lattice is not None:
-        of_rays, of_nodes = joined(frame.leave(grid, run, with_levels=False)), lattice.evaluations
+        of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
     told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists, tuning=tuning)
     return told, Decisions(grid, of_bundles, of_rays, lattice), _counted(made)
 

@@ -1,6 +1,6 @@
 """The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
 
-Flow: viewing -> order -> make_grid -> (sum_shard or probe_shard) -> decide_... -> cast_shard -> layers.
+Flow: viewing -> order -> make_grid -> (sum_shard) -> decide_... -> cast_shard -> layers.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.cast.march import RayResult
-from jaxsph.engine.control.adapt import ControlPlan, adapt, untouched
+from jaxsph.engine.control.adapt import ControlPlan, adapt
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
-from jaxsph.engine.control.probe import Probe, probe, worthwhile
+from jaxsph.engine.control.probe import probe
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.engine.field.nodes import sum_at_nodes
@@ -207,34 +207,7 @@ def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
     return sum_shards(lattices)
 
 
-@stage("shards", "cast", quickly=True)
-def probe_shard(
-    grid: Grid,
-    transfer: TransferFunction,
-    limits: Limits,
-    nth: Int[Array, ""],
-    *,
-    shards: int,
-    cast: CastPlan,
-    tuning: Tuning,
-) -> Probe:
-    """What may be worth bounding, in the `nth` of `shards` of a band."""
-    grid, transfer, limits = jax.tree.map(lax.stop_gradient, (grid, transfer, limits))
-    transfer = jax.tree.map(lambda leaf: leaf.astype(grid.half_steps.dtype), transfer)
-    tables, own = tables_of_parts(transfer), shard_of_grid(grid, nth, shards)
-    return probe(own, tables, limits.tolerance, cast.slab_samples, tuning.cells_probed)
-
-
-@stage(quickly=True)
-def wanted_cells(
-    probes: tuple[Probe, ...], *, tuning: Tuning
-) -> tuple[Bool[Array, ""], tuple[Bool[Array, "cells bundles"], ...]]:
-    """Whether any cell is to be analysed; and which, of each shard."""
-    pays = worthwhile([(one.held, one.all_held) for one in probes])
-    return pays & jnp.stack([one.promising.any() for one in probes]).any(), tuple(one.promising & pays for one in probes)
-
-
-@stage("shards", "cast", "halo", "with_levels", quickly=True)
+@stage("shards", "cast", "halo", quickly=True)
 def decide_full_rate(
     grid: Grid,
     shown: Shown,
@@ -243,18 +216,16 @@ def decide_full_rate(
     shards: int,
     cast: CastPlan,
     halo: int,
-    with_levels: bool,
     tuning: Tuning,
 ) -> Decided:
-    """Every cell of the `nth` of `shards` of a band at full rate: without error control, or where none of it would pay."""
+    """Every cell of the `nth` of `shards` of a band at full rate."""
     grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
     camera, transfer, media, within = shown
     schedule, full = _at_full_rate(grid, transfer, cast, halo, _overlap(grid, camera, within, cast))
     extents = slab_extents(grid, camera, cast.slab_samples) if media else None
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
-    levels = untouched(grid.windows, cast.slab_samples) if with_levels else None
     nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
-    return Decided(dataclasses.replace(schedule, filled=filled), Verdict(nothing, full, levels))
+    return Decided(dataclasses.replace(schedule, filled=filled), Verdict(nothing, full, None))
 
 
 @stage("cast", quickly=True)
@@ -287,7 +258,6 @@ def decide_by_bounds(
     grid: Grid,
     shown: Shown,
     limits: Limits,
-    wanted: Bool[Array, "cells bundles"],
     nth: Int[Array, ""],
     *,
     shards: int,
@@ -295,17 +265,18 @@ def decide_by_bounds(
     control: ControlPlan,
     tuning: Tuning,
 ) -> Decided:
-    """How each cell of the `nth` of `shards` of a band is sampled, if it is `wanted`. Decisions carry no gradient.
+    """How each cell of the `nth` of `shards` of a band is sampled. Decisions carry no gradient.
 
     Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
     """
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
-    grid = shard_of_grid(grid, nth, shards)
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
+    promising = probe(grid, tables_of_parts(transfer), limits.tolerance, cast.slab_samples, tuning.cells_probed)
+    wanted, grid = shard(promising, nth, shards), shard_of_grid(grid, nth, shards)
     lies = _overlap(grid, shown.camera, shown.within, cast)
     schedule, full = _at_full_rate(grid, shown.transfer, cast, 0, lies)
     wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
-    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
-    assert transfer is not None  # error control is of particles
     references = schedule.references
     decided = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
     schedule, bound, painted, levels = decided

@@ -45,9 +45,8 @@ class OnDevices(Clock):
         """As given."""
         return self._devices
 
-    def forecast(self, known: Sequence[bool]) -> Forecast:
-        """Of the same devices."""
-        return ForecastOnDevices(self.devices, known, self._programs)
+    def _forecast(self) -> Forecast:
+        return ForecastOnDevices(self.devices, self._programs)
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """Each on its device, side by side."""
@@ -80,8 +79,8 @@ class OnDevices(Clock):
 class ForecastOnDevices(Forecast):
     """Has the programs of each device compiled that a frame will need."""
 
-    def __init__(self, devices: Devices, known: Sequence[bool] = (), programs: Programs = PROGRAMS) -> None:
-        super().__init__(known, programs)
+    def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
+        super().__init__(programs)
         self.devices = devices
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:

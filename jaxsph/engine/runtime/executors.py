@@ -1,19 +1,17 @@
 """Ways to run the stages of a frame: for real and timed, as a forecast of what will be compiled, or as part of a trace.
 
-A frame is written once, as calls `run.one(stage, function, arguments, **static)` of jitted functions. What is decided on the
-host between them asks `run.may_hold`.
+A frame is written once, as calls `run.one(stage, function, arguments, **static)` of jitted functions.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import jax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from jaxsph.engine.runtime.programs import PROGRAMS, Programs
 from jaxsph.engine.runtime.tuning import Tuning
@@ -48,10 +46,6 @@ class Executor(Protocol):
         """A stage that the host may do part of."""
         ...
 
-    def may_hold(self, flag: Bool[Array, ""]) -> bool:
-        """Whether what depends on a flag is to be run."""
-        ...
-
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """In how many turns `number` of at most `most` things are done, if so many are done together; and how many then are."""
         ...
@@ -84,24 +78,19 @@ class Clock(AllShards):
         self.seconds = {"plan": 0.0, "compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0, "image": 0.0}
         self._programs = programs
         self._last = time.perf_counter()
-        self._known: list[bool] = []
-        self._foresee: Callable[[list[bool]], Any] | None = None
 
     @property
     def devices(self) -> tuple[jax.Device, ...]:
         """That are chosen; none where all is done wherever arrays are."""
         return ()
 
-    def forecast(self, known: Sequence[bool]) -> Forecast:
-        """What has programs compiled for this executor, given flags that are known."""
-        return Forecast(known, self._programs)
-
-    def foresee(self, draw: Callable[[list[bool]], Any]) -> None:
-        """Have all that is to follow compiled side by side, by `draw`, given the flags that are known; anew with each flag."""
-        self._foresee = draw
-        with contextlib.suppress(Unforeseen):
-            draw(list(self._known))
+    def foresee(self, draw: Callable[[Forecast], Any]) -> None:
+        """Have all that `draw` runs compiled side by side."""
+        draw(self._forecast())
         self.mark("compile")
+
+    def _forecast(self) -> Forecast:
+        return Forecast(self._programs)
 
     def mark(self, stage: str) -> None:
         """Book the time since the last mark."""
@@ -142,13 +131,6 @@ class Clock(AllShards):
         self.mark("compile")
         return program
 
-    def may_hold(self, flag: Bool[Array, ""]) -> bool:
-        """The flag's value."""
-        self._known.append(bool(flag))
-        if self._foresee is not None:
-            self.foresee(self._foresee)
-        return self._known[-1]
-
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """As many as there are things for."""
         return -(-int(number) // together), together
@@ -166,19 +148,10 @@ def side_by_side(programs: Sequence[Callable[..., Any]], inputs: Sequence[tuple[
         return list(threads.map(done, programs, inputs))
 
 
-class Unforeseen(Exception):
-    """What follows depends on a flag that is not known yet."""
-
-
 class Forecast(AllShards):
-    """Has programs compiled side by side that a frame will need, without running any: results are shapes.
+    """Has programs compiled side by side that a frame will need, without running any: results are shapes."""
 
-    Args:
-        known: flags in the order in which they will be asked for, as far as they are known.
-    """
-
-    def __init__(self, known: Sequence[bool] = (), programs: Programs = PROGRAMS) -> None:
-        self._known = iter(known)
+    def __init__(self, programs: Programs = PROGRAMS) -> None:
         self._programs = programs
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
@@ -194,12 +167,6 @@ class Forecast(AllShards):
         if not tuning.sorts_on_host:
             return self.one(stage, made.function, arguments, tuning=tuning, **static)
         return made.foreseen(self, stage, *arguments, tuning=tuning, **static)
-
-    def may_hold(self, flag: Bool[Array, ""]) -> bool:
-        """The flag's value where it is known; else what follows cannot be foreseen."""
-        for value in self._known:
-            return value
-        raise Unforeseen
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, as all are runs of the same program."""
@@ -223,10 +190,6 @@ class Traced(AllShards):
     def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """All of it by XLA, as a trace holds no values for the host."""
         return self.one(stage, made.function, arguments, **static)
-
-    def may_hold(self, flag: Bool[Array, ""]) -> bool:
-        """A trace knows no values, and has to be ready for either."""
-        return True
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, with room for all."""

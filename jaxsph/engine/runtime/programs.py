@@ -25,6 +25,8 @@ from jaxsph.engine.runtime.tuning import cores_at_hand
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
 of its two emitters. Of the stages so compiled none runs for longer; the march would take four times as long."""
+OF_ALL: dict[str, Any] = {}
+"""Options that all programs are compiled with, part of what they are kept by: none but where somebody sets them."""
 MAX_PROGRAMS = 128  # those of about fourteen frames of different shapes: some 20,000 memory maps of 65,530, and 600 MB
 
 FLAGS = (
@@ -84,6 +86,7 @@ class Programs:
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         key, shapes = _key(function, arguments, static)
+        options = _options_of(function)
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -94,7 +97,7 @@ class Programs:
             self.make_room()
             if self._told is not None:
                 self._told()
-            program = self._kept[key] = _made(function, shapes, static)
+            program = self._kept[key] = _made(function, shapes, static, options)
             with self._counting:
                 self._compiling += 1
         program.compiled.add_done_callback(functools.partial(self._compiled, key))
@@ -159,10 +162,18 @@ def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable])
     shapes = shapes_of(arguments)
     leaves, structure = jax.tree.flatten(shapes)
     flags = tuple(getattr(jax.config, name) for name in FLAGS)
-    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags), shapes
+    options = tuple(sorted(_options_of(function).items()))
+    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags, options), shapes
 
 
-def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+def _options_of(function: Any) -> dict[str, Any]:
+    """What XLA is told when it compiles a function; nothing but on CPUs."""
+    if jax.default_backend() != "cpu":
+        return {}
+    return (QUICKLY if function in _QUICKLY else {}) | OF_ALL
+
+
+def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable], options: dict[str, Any]) -> Program:
     def program(*arguments: Any) -> Any:
         return function.__wrapped__(*arguments, **static)
 
@@ -171,7 +182,7 @@ def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -
     places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
     place = places.pop() if len(places) == 1 else None
     result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
-    return Program(result, _threads().submit(_compile, traced.lower(), function in _QUICKLY))
+    return Program(result, _threads().submit(_compile, traced.lower(), options))
 
 
 _QUICKLY: set[Any] = set()
@@ -190,11 +201,9 @@ def compiled_quickly(function: Function) -> Function:
     return function
 
 
-def _compile(lowered: jax.stages.Lowered, quickly: bool) -> Callable[..., Any]:
-    if not quickly or jax.default_backend() != "cpu":
-        return lowered.compile()
+def _compile(lowered: jax.stages.Lowered, options: dict[str, Any]) -> Callable[..., Any]:
     try:
-        return lowered.compile(compiler_options=QUICKLY)
+        return lowered.compile(compiler_options=options)
     except jax.errors.JaxRuntimeError:  # options are XLA's own affair, and come and go with its versions
         return lowered.compile()
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxsph.engine.runtime import memory_maps
-from jaxsph.engine.runtime.executors import Clock, Forecast, Unforeseen
+from jaxsph.engine.runtime.executors import Clock, Forecast
 from jaxsph.engine.runtime.programs import Programs, compiled_quickly, shapes_of
 
 traces = []
@@ -95,27 +95,11 @@ def test_results_come_in_the_order_of_inputs(number):
 def test_what_was_foreseen_is_not_compiled_again():
     programs = Programs()
     value = jnp.ones(6)
-    shape = Forecast((), programs).one("cast", double, (Forecast((), programs).one("cast", double, shapes_of((value,))),))
+    shape = Forecast(programs).one("cast", double, (Forecast(programs).one("cast", double, shapes_of((value,))),))
     assert shape.shape == (6,) and len(traces) == 1
     clock = Clock(programs)
     assert float(clock.one("cast", double, (clock.one("cast", double, (value,)),)).sum()) == 24
     assert len(traces) == 1
-
-
-def test_a_flag_that_is_not_known_ends_a_forecast_until_it_is():
-    seen = []
-
-    def draw(known):
-        run = Forecast(known, Programs())
-        seen.append("begun")
-        seen.append(run.may_hold(jnp.bool_(True)))
-
-    clock = Clock(Programs())
-    clock.foresee(draw)
-    assert clock.may_hold(jnp.bool_(False)) is False
-    assert seen == ["begun", "begun", False]
-    with pytest.raises(Unforeseen):
-        Forecast().may_hold(jnp.bool_(True))
 
 
 def test_a_program_that_cannot_be_compiled_is_tried_again():
