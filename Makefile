@@ -5,7 +5,7 @@
 SHELL := /bin/bash
 VENV := .venv
 PYTHON ?=
-# Processes that share the suite, what is left going to whichever is idle; 0 runs all in one.
+# Processes that share the suite, file by file, those that take longest first; 0 runs all in one.
 JOBS ?= 2
 PYTEST_ARGS ?=
 # With this JAX compiles once what several tests or benchmarks compile, in any process, as long as the folder is there: single
@@ -45,15 +45,19 @@ $(VENV)/.installed-docs: pyproject.toml | $(VENV)/.python
 # What the tests compile is kept for the next run: `make clean` or another COMPILED begins anew.
 COMPILED ?= $(VENV)/compiled-tests
 SUITE = compiled=$$($(VENV)/bin/python tests/shared/kept_programs.py $(COMPILED) $(JOBS)) && $(SHARE_COMPILED)=$$compiled \
-	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist worksteal
-# Programs that the whole suite may compile: new tests use the shapes of others. Other numbers of processes share fewer or more.
-MOST_PROGRAMS ?= 2200
-ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--most-programs=$(MOST_PROGRAMS)))
+	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
+# The whole suite is held to what it may compile (tests/programs.json); other numbers of processes share fewer programs or more.
+ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--hold-programs=tests/programs.json))
 
-check: lint
+# Linters run beside the tests.
+check test: $(VENV)/.installed-test
+	@$(MAKE) --no-print-directory -j2 lint suite-of-$@
+
+.PHONY: suite-of-check suite-of-test
+suite-of-check:
 	@$(SUITE) -m core $(PYTEST_ARGS)
 
-test: lint
+suite-of-test:
 	@$(SUITE) $(ALL_OF_IT) $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test

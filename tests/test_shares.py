@@ -2,6 +2,7 @@
 
 import argparse
 import itertools
+import json
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import hypothesis
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from compiled import Counter
 from core import BEYOND, TESTS
@@ -72,24 +74,28 @@ def test_a_share_that_is_none_is_refused(text):
         share_of(text)
 
 
-def test_programs_are_counted_for_the_file_that_needed_them_and_operations_are_not():
+def test_programs_and_operations_are_counted_for_the_file_that_needed_them():
     counter = Counter()
-    counter.file = "tests/test_x.py"
+    counter.begin("tests/test_x.py")
     jax.monitoring.register_event_duration_secs_listener(counter.listen)
     try:
         twice = jax.jit(lambda x: jnp.sin(x) * 2)
         for size in (3, 4, 3):
-            twice(jnp.zeros(size))
+            twice(np.zeros(size, np.float32))
+        jnp.arcsinh(jnp.float32(2))
     finally:
         jax.monitoring.unregister_event_duration_listener(counter.listen)
-    assert counter.found == {"tests/test_x.py": 2}
+    (programs, operations, _) = counter.table()["tests/test_x.py"]
+    assert programs == 2 and operations in (0, 1, 2)  # others may have needed them before
 
 
 def test_a_run_that_needs_more_programs_than_it_may_fails(tmp_path):
     (tmp_path / "test_it.py").write_text("import jax\ndef test_it(): jax.jit(lambda x: x)(1.0), jax.jit(lambda x: -x)(1.0)\n")
-    more, enough = (pytest_on(tmp_path, f"--most-programs={most}", plugin="compiled") for most in (1, 2))
-    assert more.returncode == 1 and "2 programs were compiled or loaded, more than the 1" in more.stdout
-    assert enough.returncode == 0 and "2 programs" in enough.stdout
+    table = tmp_path / "table.json"
+    for most, code in ((1, 1), (2, 0)):
+        table.write_text(json.dumps({"in all": [most, 10]}))
+        ran = pytest_on(tmp_path, f"--hold-programs={table}", plugin="compiled")
+        assert ran.returncode == code and ("2 programs in all, of 1" in ran.stdout) == bool(code) and "2 programs and" in ran.stdout
 
 
 def test_what_is_beyond_the_core_is_there():
