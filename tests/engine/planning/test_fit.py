@@ -9,7 +9,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.planning.fit import PLANS, Plans, shape_of
-from jaxsph.engine.planning.plan import next_class
+from jaxsph.engine.planning.plan import FrameShape, next_class
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.engine.runtime.programs import PROGRAMS
@@ -79,7 +79,14 @@ def test_an_image_does_not_depend_on_what_was_rendered_before(plans):
     assert {**after.stats, "seconds": 0} == {**fresh.stats, "seconds": 0}
 
 
-def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans):
+def test_sets_of_any_usual_size_share_a_plan_where_the_host_makes_lists(plans):
+    for count in (1, 700, 3000):
+        js.render(*snapshot(count, seed=count), SETTINGS)
+    assert len(plans._kept) == 1
+
+
+def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans, monkeypatch):
+    monkeypatch.setattr(FrameShape, "in_common", lambda shape: shape)
     scene, camera = snapshot(1000)
     js.render(scene, camera, SETTINGS)
     (kept,) = plans._kept
