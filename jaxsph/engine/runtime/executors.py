@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 from jaxtyping import Array, Int
@@ -29,34 +29,6 @@ class HostStage(NamedTuple):
     function: Any
     on_host: Callable[..., Any]
     foreseen: Callable[..., Any]
-
-
-class Executor(Protocol):
-    """What a frame needs to be run."""
-
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """`function(*arguments, **static)`, booked under a stage."""
-        ...
-
-    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes, side by side where that pays."""
-        ...
-
-    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
-        """A stage that the host may do part of."""
-        ...
-
-    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """In how many turns `number` of at most `most` things are done, if so many are done together; and how many then are."""
-        ...
-
-    def own(self, of_shards: Sequence[Any]) -> list[Any]:
-        """Of what there is for every shard of a band, what this executor is to run."""
-        ...
-
-    def pooled(self, of_shards: Sequence[Any]) -> list[Any]:
-        """What was found for every shard, given what was found for the own."""
-        ...
 
 
 class AllShards:
@@ -194,3 +166,7 @@ class Traced(AllShards):
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, with room for all."""
         return 1, most
+
+
+Executor = Clock | Forecast | Traced
+"""What a frame needs to be run."""
