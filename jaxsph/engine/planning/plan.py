@@ -38,7 +38,7 @@ MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
-COMMON_CLASSES = (1, 4, 8, 16)  # of support, of frames that share programs
+COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
 

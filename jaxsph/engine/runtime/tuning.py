@@ -79,7 +79,7 @@ CPU = Tuning(
     sorts_on_host=True,  # 1 M particles in 20 ms instead of 45, their lists in 0.2 s of one core instead of 0.4
     fusion_barriers=True,  # without them shading was computed six times, and every weight once for each sum
     common_particles=(1 << 16, 1 << 18, 1 << 20),  # a particle that is not there takes 0.1 us
-    common_pairs=(1 << 20, 1 << 22, 1 << 24),  # of lists that the host makes, room that is not filled is never touched
+    common_pairs=(1 << 22, 1 << 24),  # of lists that the host makes, room that is not filled is never touched
 )
 ACCELERATOR = Tuning(
     samples_at_once=1 << 20,  # some 60 M samples a kernel: 2,400 launches for a frame of 1 M particles, of 694,000
