@@ -57,16 +57,16 @@ def fusion_barrier(witness: Bool[Array, ""], function: Callable[..., Any], *argu
 
 
 def side_by_side(rows: Sequence[Array], axis: int) -> Array:
-    """`jnp.stack`, of what is found in the same kernel.
+    """`jnp.stack`, of what is found in the same XLA kernel.
 
-    On CPUs that of `jnp.stack` has a loop for each row, with all that rows share in each: it takes as long to compile as so many
-    kernels. Here each element chooses.
+    On CPUs `jnp.stack` is a loop for each row, with all that rows share in each, and compiles as slowly as so many kernels of
+    XLA's would. Here each element chooses.
     """
     if not barriers_kept():
         return jnp.stack(rows, axis)
     shape = [1] * (rows[0].ndim + 1)
     shape[axis] = len(rows)
-    row, found = np.arange(len(rows)).reshape(shape), jnp.expand_dims(rows[-1], axis)  # known now: no kernel
+    row, found = np.arange(len(rows)).reshape(shape), jnp.expand_dims(rows[-1], axis)  # known when compiling
     for k, value in enumerate(rows[:-1]):
         found = jnp.where(row == k, jnp.expand_dims(value, axis), found)
     return found

@@ -62,7 +62,7 @@ def _emitted(medium: Medium, samples: Any, task: SlabTask, left: Array, *, chann
 def transmitted(thickness: Float[Array, "slabs samples rays"]) -> Float[Array, "slabs samples rays"]:
     """What is left behind each sample of slabs of what enters them."""
     behind, through = jnp.arange(thickness.shape[1])[:, None], thickness[:, :1]
-    for k in range(1, thickness.shape[1]):  # one exponential in the kernel, other than of sums that are stacked
+    for k in range(1, thickness.shape[1]):  # one exponential, where sums that are stacked have one each
         through = jnp.where(behind >= k, through + thickness[:, k : k + 1], through)
     return jnp.exp(-through)
 

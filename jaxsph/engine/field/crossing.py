@@ -38,9 +38,7 @@ ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step
 CLOSE = 2.0**7  # eps of the level that the field is off at a root: some times what sums over particles are rounded by
 NOWHERE = -1.0  # number of no interval
 DONE = 2.0  # in place of a side
-
-
-Points = Sequence[Float[Array, "..."]]
+ByPoint = Sequence[Float[Array, "..."]]
 
 
 @tree()
@@ -48,7 +46,7 @@ class Bracket:
     """Depths before and behind the first crossing of rays, relative to the middle of a slab, and the field less the level there.
 
     Attributes:
-        rows: one array, such that XLA makes one kernel of them.
+        rows: what follows, one array such that it is one XLA kernel.
         interval: which of the slab's it is in, as floating numbers; `NOWHERE` where a ray does not cross.
         low, high, at_low, at_high: those depths, and the field there.
     """
@@ -57,12 +55,12 @@ class Bracket:
     interval, low, high, at_low, at_high = map(nth_row, range(5))
 
     @classmethod
-    def between(cls, interval: Array, nth: Array, places: Points, values: Points) -> Bracket:
+    def between(cls, interval: Array, nth: Array, places: ByPoint, values: ByPoint) -> Bracket:
         """From the `nth` to the next of some points (each "... rays") of rays, with the field less the level there.
 
-        Chosen point by point: of rows put side by side each would have a loop of its own in the kernel.
+        Chosen point by point: of rows put side by side each would have a loop of its own in the XLA kernel.
         """
-        row, dtype = np.arange(5)[:, None], values[0].dtype  # rows are known now, and take no kernel
+        row, dtype = np.arange(5)[:, None], values[0].dtype  # rows are known when compiling
         point, rows = nth[..., None, :] + (row + 1) % 2, jnp.zeros((), dtype)
         for k, (place, value) in enumerate(zip(places, values, strict=True)):
             rows = jnp.where(point == k, jnp.where(row < 3, place[..., None, :], value[..., None, :]), rows)
@@ -245,7 +243,7 @@ def _asked(
 
     def of_ray(of_intervals: Array) -> Array:
         found = of_intervals[:, 0]
-        for k in range(1, of_intervals.shape[1]):  # one kernel with what it is asked for, other than a gather
+        for k in range(1, of_intervals.shape[1]):  # one XLA kernel with what it is asked for, other than a gather
             found = jnp.where(nth == k, of_intervals[:, k], found)
         return found
 
@@ -295,7 +293,7 @@ def at_crossings(
     step from their secant is then to some roundings of a root. Most rays take two steps; slabs with one that takes more are taken
     again, then all are looked at. Rays that graze the surface are not at a root by that: where the field has hardly a slope,
     Newton's step leads away. For them all is done once more, until the secant is the root, `CLOSE`. It is one loop of six turns,
-    for which slabs are asked for anew: each is compiled.
+    each for slabs chosen anew: six loops would be compiled six times.
 
     Args:
         look: `look(bracket, rays, again)`: rows, the last of which says how far the field is off the level there; `again` where

@@ -31,7 +31,7 @@ class Block:
 
 
 def known_at(rows: Array, index: Int[Array, "..."]) -> Array:
-    """`rows[index]` where that is known to be one of them: what else an index may be costs a gather half of its instructions."""
+    """`rows[index]` where that is known to be one of them: a gather is not compiled for what else it might be."""
     return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 

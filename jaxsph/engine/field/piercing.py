@@ -45,7 +45,7 @@ class SlabRays:
     """Rays of slabs.
 
     Attributes:
-        rows: one array such that XLA makes one kernel of them.
+        rows: what follows but for `middle`, one array such that it is one XLA kernel.
         u, v: lateral coordinates at the middle of the slab; `slope_u`, `slope_v`: a unit of depth.
         square: of their length a unit of depth.
         middle: its depth.

@@ -103,13 +103,13 @@ def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root
     def find(nth: Array, root: Root) -> Root:
         slope = lax.stop_gradient(slope_along(root.found, rays.ray()))  # 0 before anything is found
         place = given + jnp.where(slope != 0, (level - root.found.weight) / jnp.where(slope != 0, slope, 1), 0)
-        place = place + lax.stop_gradient(
-            jnp.where(is_root | (nth == 0), given, clamped(place, bracket.low, bracket.high)) - place
-        )
+        taken = jnp.where(is_root | (nth == 0), given, clamped(place, bracket.low, bracket.high))
+        place = place + lax.stop_gradient(taken - place)
         return Root(place, rays.found(place))
 
-    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(rays.found, given))
-    return lax.fori_loop(0, 2, find, Root(given, nothing))
+    zero = jnp.zeros_like(given)
+    nothing = Found(zero, (zero,) * 3, (zero,) * len(rays.task.entry.references))
+    return lax.fori_loop(0, 2, find, Root(given, nothing))  # at the secant, and at the root
 
 
 def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
