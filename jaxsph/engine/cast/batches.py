@@ -144,12 +144,12 @@ class Batches:
             return None
         return (transmittance.max(1) < self.min_transmittance)[self.compacted.bundle_rank]
 
-    def left_out(self, batch: Batch, of_slabs: Float[Array, "slabs packets"]) -> Float[Array, " packets"]:
-        """Of what is spent on each slab, what a batch leaves out, by packet."""
-        dummy = of_slabs.size
-        out = (batch.items < dummy) & (batch.slot == self.num_slots)
-        spent = jnp.where(out, of_slabs.ravel()[jnp.minimum(batch.items, dummy - 1)], 0)
-        return jnp.zeros(self.num_packets, spent.dtype).at[batch.items % self.num_packets].add(spent)
+    def left_out(self, batch: Batch, spent: Float[Array, "slabs packets"]) -> Float[Array, "packets 2"]:
+        """Of what is spent on each slab, what a batch leaves out, and how many slabs that is, by packet."""
+        out = (batch.items < spent.size) & (batch.slot == self.num_slots)
+        each = spent.ravel()[jnp.minimum(batch.items, spent.size - 1)]
+        both = jnp.where(out[:, None], jnp.stack([each, jnp.ones_like(each)], 1), 0)
+        return jnp.zeros((self.num_packets, 2), both.dtype).at[batch.items % self.num_packets].add(both)
 
     def _slots(self, method: Int[Array, " batch"] | None, real: Bool[Array, " batch"], number: Array) -> tuple[Array, Array]:
         """Where the slabs are marched, method after method, each from the beginning of a chunk on; and where that ends."""

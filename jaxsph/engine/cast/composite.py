@@ -13,15 +13,14 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.cast.batches import Batch
 from jaxsph.engine.cast.integrator import Segment
 from jaxsph.engine.cast.samples import transmitted
-from jaxsph.engine.media.mixture import first_stops
 from jaxsph.engine.runtime.tuning import Tuning
-from jaxsph.model.medium import Stops
 from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
@@ -62,24 +61,24 @@ class RayState:
         stop: where they first end at something opaque, see `Medium.stops`; None where nothing is.
     """
 
-    color: tuple[Float[Array, "packets rays"], ...]
+    color: Float[Array, "3 packets rays"]
     transmittance: Float[Array, "packets rays"]
     depth: Float[Array, "packets rays"]
     square: Float[Array, "packets rays"] | None = None
-    stop: Stops | None = None
+    stop: Float[Array, "4 packets rays"] | None = None
 
 
 def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False, stopping: bool = False) -> Segment:
     """Slabs with nothing in them; `estimated`: and with no error; `stopping`: and where nothing ends rays."""
     red, green, blue, error = (jnp.zeros((slots, rays), dtype) for _ in range(4))
     through, thickness = jnp.ones((slots, rays), dtype), jnp.zeros((slots, samples, rays), dtype)
-    stop = no_stops((slots, rays), dtype) if stopping else None
+    stop = jnp.moveaxis(no_stops((slots, rays), dtype), 0, 1) if stopping else None
     return Segment((red, green, blue), through, thickness, error if estimated else None, stop)
 
 
-def no_stops(shape: tuple[int, ...], dtype: Any) -> Stops:
+def no_stops(shape: tuple[int, ...], dtype: Any) -> Float[Array, "4 ..."]:
     """Of rays that nothing ends."""
-    return jnp.full(shape, jnp.inf, dtype), *(jnp.zeros(shape, dtype) for _ in range(3))  # type: ignore[return-value]
+    return jnp.broadcast_to(np.reshape([np.inf, 0, 0, 0], (4, *[1] * len(shape))).astype(dtype), (4, *shape))
 
 
 def fresh_rays(
@@ -87,9 +86,9 @@ def fresh_rays(
 ) -> RayState:
     """Rays that have met nothing; of `estimated` and `stopping` see `empty_segments`."""
     room = packets + together.packets, rays
-    red, green, blue, square, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 0, 0, 0, 1, jnp.inf))
+    square, transmittance, depth = (jnp.full(room, value, dtype) for value in (0, 1, jnp.inf))
     stop = no_stops(room, dtype) if stopping else None
-    return RayState((red, green, blue), transmittance, depth, square if estimated else None, stop)
+    return RayState(jnp.zeros((3, *room), dtype), transmittance, depth, square if estimated else None, stop)
 
 
 def over_layers(
@@ -148,7 +147,7 @@ def composite(
         # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
         rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
         rays = _behind(rays, light, slot, borders(place), together.half_depths)
-        return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, 0), state, rays)
+        return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, old.ndim - 2), state, rays)
 
     return over_layers(put, state, starts, batch, together)
 
@@ -160,17 +159,18 @@ def rows(state: Any, first: Array, number: int) -> Any:
 
 def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_depths: int) -> RayState:
     """Rays behind one more slab each."""
-    emitted, left = [channel[slot] for channel in light.color], light.transmittance[slot]
+    emitted, left = jnp.stack([channel[slot] for channel in light.color]), light.transmittance[slot]
     behind = rays.transmittance * left
     crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
     depth = _with_half_depth(rays, crossed, light, slot, border, half_depths)
-    color = tuple(color + rays.transmittance * added for color, added in zip(rays.color, emitted, strict=True))
+    color = rays.color + rays.transmittance * emitted
     square = rays.square
     if square is not None and light.error is not None:
         square = square + (rays.transmittance * light.error[slot]) ** 2
     stop = rays.stop
     if stop is not None and light.stop is not None:
-        stop = first_stops(stop, tuple(of_slabs[slot] for of_slabs in light.stop))  # type: ignore[arg-type]
+        behind_it = jnp.moveaxis(light.stop[slot], 1, 0)
+        stop = jnp.where(stop[0] <= behind_it[0], stop, behind_it)
     return RayState(color, behind, depth, square, stop)
 
 
@@ -184,14 +184,18 @@ def _with_half_depth(
     some = crossed.any(1)
     packets = lax.sort(jnp.where(some, jnp.arange(number, dtype=jnp.int32), number))
 
-    def find_some(nth: Array, depth: Array) -> Array:
-        packet = lax.dynamic_slice_in_dim(packets, nth * together, together)
+    def find_some(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        first, depth = state
+        packet = lax.dynamic_slice_in_dim(packets, first, together)
         here = jnp.minimum(packet, number - 1)
         of_rays = [value[here] for value in (depth, crossed, rays.transmittance)]
-        found = fusion_barrier(nth >= 0, _half_depth, *of_rays, light, slot[here], border[here])
-        return depth.at[packet].set(found, mode="drop")
+        found = fusion_barrier(first >= 0, _half_depth, *of_rays, light, slot[here], border[here])
+        return first + together, depth.at[packet].set(found, mode="drop")
 
-    return lax.fori_loop(0, (some.sum(dtype=jnp.int32) + together - 1) // together, find_some, rays.depth)
+    def more(state: tuple[Array, Array]) -> Array:
+        return (state[0] < number) & (packets[jnp.minimum(state[0], number - 1)] < number)
+
+    return lax.while_loop(more, find_some, (jnp.int32(0), rays.depth))[1]
 
 
 def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segment, slot: Array, border: Array) -> Array:
@@ -200,18 +204,19 @@ def _half_depth(depth: Array, crossed: Array, transmittance: Array, light: Segme
     In a sample in which something ends them, that is where. Whatever the products of the samples round to here, one that has
     crossed does so at the last sample if not before.
     """
-    thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[0][slot]
+    thickness, stop = light.thickness[slot], None if light.stop is None else light.stop[slot, 0]
     left, reached = transmitted(thickness), transmittance
+    here = [jnp.zeros_like(depth)] * 4  # of the sample: what enters it, its thickness, and its borders
+    found = ~crossed
     for k in range(thickness.shape[1]):
         behind = transmittance * left[:, k]
-        start, end = border[:, k, None], border[:, k + 1, None]
-        filled = thickness[:, k] > 0
-        share = jnp.where(filled, jnp.log(2 * reached) / jnp.where(filled, thickness[:, k], 1), 1)
-        here = crossed & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
-        place = start + lesser(1, share) * (end - start)
-        if stop is not None:
-            place = jnp.where((stop >= start) & (stop <= end), stop, place)
-        depth = jnp.where(here, place, depth)
-        crossed = crossed & ~here
-        reached = behind
-    return depth
+        at = ~found & ((behind <= 0.5) | (k == thickness.shape[1] - 1))
+        of_sample = reached, thickness[:, k], border[:, k, None], border[:, k + 1, None]
+        here = [jnp.where(at, new, old) for new, old in zip(of_sample, here, strict=True)]
+        found, reached = found | at, behind
+    entering, thick, start, end = here
+    share = jnp.where(thick > 0, jnp.log(2 * entering) / jnp.where(thick > 0, thick, 1), 1)
+    place = start + lesser(1, share) * (end - start)
+    if stop is not None:
+        place = jnp.where((stop >= start) & (stop <= end), stop, place)
+    return jnp.where(crossed, place, depth)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model.medium import Medium, Stops
+from jaxsph.model.medium import Medium
 from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length
@@ -33,7 +33,7 @@ class Segment:
     transmittance: Float[Array, "slabs rays"]
     thickness: Float[Array, "slabs samples rays"]
     error: Float[Array, "slabs rays"] | None = None
-    stop: Stops | None = None
+    stop: Float[Array, "slabs 4 rays"] | None = None
 
 
 class Integrator:

@@ -60,7 +60,7 @@ class Marched(NamedTuple):
 
     rays: RayState
     light: Segment
-    left_out: tuple[Array, Array] | None
+    left_out: Float[Array, "packets 2"] | None
     refined: Array | None
 
 
@@ -95,7 +95,7 @@ def march(
         rays, light, left_out, refined = state
         batch = batches.batch(nth, batches.ended(rays.transmittance))
         if spent is not None and left_out is not None:
-            left_out = left_out[0] + batches.left_out(batch, spent), left_out[1] + batches.left_out(batch, jnp.ones_like(spent))
+            left_out = left_out + batches.left_out(batch, spent)
 
         def march_chunk(chunk: Array, light: Segment) -> Segment:
             items, begin = batches.chunk(batch, chunk)
@@ -115,9 +115,9 @@ def march(
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
     rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
     light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
-    start = Marched(rays, light, (nothing, nothing) if ending else None, nothing if refining else None)
+    start = Marched(rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None)
     found = lax.fori_loop(0, batches.number, march_batch, start)
-    left_out, cut = (None, None) if found.left_out is None else found.left_out
+    left_out, cut = (None, None) if found.left_out is None else found.left_out.T
     return dataclasses.replace(result_of(found.rays, batches), left_out=left_out, refined=found.refined, cut=cut)
 
 
@@ -131,7 +131,7 @@ def segments_of(
     gathered = medium.gather(task)
     if not compared:
         light = integrator(medium, gathered, task)
-        return dataclasses.replace(light, stop=medium.stops(gathered, task)) if medium.stops_rays else light
+        return dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1)) if medium.stops_rays else light
     light = integrator.compared(medium, gathered, task)
     tasks, samples, rays = light.thickness.shape
     return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))
@@ -140,7 +140,9 @@ def segments_of(
 def result_of(rays: RayState, batches: Batches) -> RayResult:
     """Rays in the order of packets, as rows and columns."""
     rank, shape = batches.compacted.bundle_rank, batches.packets.shape
-    *color, transmittance, depth = (field[rank].reshape(-1, *shape) for field in (*rays.color, rays.transmittance, rays.depth))
+    color, transmittance, depth = (
+        field[..., rank, :].reshape(*field.shape[:-2], -1, *shape) for field in (rays.color, rays.transmittance, rays.depth)
+    )
     error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
-    stop = None if rays.stop is None else jnp.stack([field[rank].reshape(-1, *shape) for field in rays.stop])
-    return RayResult(jnp.stack(color), transmittance, depth, error=error, stop=stop)
+    stop = None if rays.stop is None else rays.stop[:, rank].reshape(4, -1, *shape)
+    return RayResult(color, transmittance, depth, error=error, stop=stop)

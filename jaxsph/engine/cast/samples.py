@@ -61,10 +61,10 @@ def _emitted(medium: Medium, samples: Any, task: SlabTask, left: Array, *, chann
 
 def transmitted(thickness: Float[Array, "slabs samples rays"]) -> Float[Array, "slabs samples rays"]:
     """What is left behind each sample of slabs of what enters them."""
-    through = [thickness[:, 0]]
-    for k in range(1, thickness.shape[1]):
-        through.append(through[-1] + thickness[:, k])
-    return jnp.exp(-jnp.stack(through, 1))
+    behind, through = jnp.arange(thickness.shape[1])[:, None], thickness[:, :1]
+    for k in range(1, thickness.shape[1]):  # one exponential, where sums that are stacked have one each
+        through = jnp.where(behind >= k, through + thickness[:, k : k + 1], through)
+    return jnp.exp(-through)
 
 
 def emitted(colors: Optics, left_behind: Float[Array, "slabs samples rays"]) -> list[Float[Array, "slabs rays"]]:

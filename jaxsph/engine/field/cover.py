@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import Block, fetch, particle_at, quantities_of
+from jaxsph.engine.field.fetch import Block, fetch, known_at, particle_at, quantities_of
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
@@ -175,28 +175,26 @@ def over_groups(
         function: `function(items, some, carry)`: numbers of slabs, one past the last for none, and those slabs.
     """
     outer = ~inside if task.part is None else ~inside & task.looked_at()
-    has_outer = outer.any((1, 2)) & (task.entry.count > 0)
-    tasks = has_outer.shape[0]
-    group = min(GROUP, tasks)
-    place = jnp.where(has_outer, jnp.cumsum(has_outer, dtype=jnp.int32) - 1, tasks + group)
-    order = jnp.full(tasks + group, tasks, jnp.int32).at[place].set(jnp.arange(tasks, dtype=jnp.int32), mode="drop")
+    tasks, group = outer.shape[0], min(GROUP, outer.shape[0])
+    place = jnp.where(outer.any((1, 2)) & (task.entry.count > 0), jnp.arange(tasks, dtype=jnp.int32), tasks)
+    order = jnp.concatenate([lax.sort(place), jnp.full(group, tasks, jnp.int32)])
 
-    def some(nth: Array, carry: Carry) -> Carry:
-        items = lax.dynamic_slice(order, (nth * group,), (group,))
-        return function(items, taken(task, jnp.minimum(items, tasks - 1), items < tasks), carry)
+    def some(state: tuple[Array, Carry]) -> tuple[Array, Carry]:
+        first, carry = state
+        items = lax.dynamic_slice(order, (first,), (group,))
+        return first + group, function(items, taken(task, jnp.minimum(items, tasks - 1), items < tasks), carry)
 
-    number = (has_outer.sum(dtype=jnp.int32) + group - 1) // group
-    return lax.fori_loop(0, number, some, carry)
+    return lax.while_loop(lambda state: order[state[0]] < tasks, some, (jnp.int32(0), carry))[1]
 
 
 def rows_of(rows: Carry, items: Int[Array, " some"]) -> Carry:
     """What is known of some slabs: arrays whose first axis is slabs; of numbers past the last, anything."""
-    return jax.tree.map(lambda of: of[jnp.minimum(items, of.shape[0] - 1)], rows)  # type: ignore[no-any-return]
+    return jax.tree.map(lambda of: known_at(of, jnp.minimum(items, of.shape[0] - 1)), rows)  # type: ignore[no-any-return]
 
 
 def with_rows(rows: Carry, items: Int[Array, " some"], new: Carry) -> Carry:
     """The same with what became known of some slabs."""
-    return jax.tree.map(lambda old, of: old.at[items].set(of, mode="drop"), rows, new)  # type: ignore[no-any-return]
+    return jax.tree.map(lambda old, of: old.at[items].set(of, mode="drop", wrap_negative_indices=False), rows, new)  # type: ignore[no-any-return]
 
 
 def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]) -> SlabTask:

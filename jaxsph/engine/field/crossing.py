@@ -1,6 +1,6 @@
 r"""Where rays cross a level of the field, first or each time: between which two depths, and then to some roundings.
 
-Flow: sums on borders -> [crossing: slabs -> intervals -> places -> bracket -> narrowed] -> particle_surface.
+Flow: sums on borders -> [crossing: slabs -> intervals -> places -> bracket -> root] -> particle_surface.
 
 The field is known at the borders of what samples stand for. A change of sign between two of them is a crossing. Where it is below
 the level at both, particles' largest weights bound it in between (`field.piercing`): a slab in which even their sum is below the
@@ -17,26 +17,28 @@ Each of these looks at those slabs alone that the one before could not settle: o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
-from jaxsph.engine.field.piercing import Piercing
+from jaxsph.engine.field.piercing import Piercing, nth_row
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.clips.clips import Clip
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well
-STEPS, FIRST = 64, 2  # of false position, at most, and those after which most rays are done
+TURNS = 2, 62, 0  # steps of false position: those after which most rays are done, then as many as there may be; and the look
 ENOUGH = 0.5  # power of eps, as a share of the level, at which they end: a step of Newton's squares that
 CLOSE = 2.0**7  # eps of the level that the field is off at a root: some times what sums over particles are rounded by
 NOWHERE = -1.0  # number of no interval
+DONE = 2.0  # in place of a side
+ByPoint = Sequence[Float[Array, "..."]]
 
 
 @tree()
@@ -44,14 +46,25 @@ class Bracket:
     """Depths before and behind the first crossing of rays, relative to the middle of a slab, and the field less the level there.
 
     Attributes:
+        rows: what follows, one array such that it is one XLA kernel.
         interval: which of the slab's it is in, as floating numbers; `NOWHERE` where a ray does not cross.
+        low, high, at_low, at_high: those depths, and the field there.
     """
 
-    interval: Float[Array, "tasks rays"]
-    low: Float[Array, "tasks rays"]
-    high: Float[Array, "tasks rays"]
-    at_low: Float[Array, "tasks rays"]
-    at_high: Float[Array, "tasks rays"]
+    rows: Float[Array, "tasks 5 rays"]
+    interval, low, high, at_low, at_high = map(nth_row, range(5))
+
+    @classmethod
+    def between(cls, interval: Array, nth: Array, places: ByPoint, values: ByPoint) -> Bracket:
+        """From the `nth` to the next of some points (each "... rays") of rays, with the field less the level there.
+
+        Chosen point by point: of rows put side by side each would have a loop of its own in the XLA kernel.
+        """
+        row, dtype = np.arange(5)[:, None], values[0].dtype  # rows are known when compiling
+        point, rows = nth[..., None, :] + (row + 1) % 2, jnp.zeros((), dtype)
+        for k, (place, value) in enumerate(zip(places, values, strict=True)):
+            rows = jnp.where(point == k, jnp.where(row < 3, place[..., None, :], value[..., None, :]), rows)
+        return cls(jnp.where(row == 0, interval[..., None, :].astype(dtype), rows))
 
     @property
     def met(self) -> Bool[Array, "tasks rays"]:
@@ -73,12 +86,10 @@ class Cut(NamedTuple):
 
 
 @tree()
-class _Search:
-    """Brackets of all rays, which end of each moved last, and rays whose brackets still shrink."""
+class _Search(Bracket):
+    """Brackets and a row more: which end of each moved last, -1 or 1, 0 at first, and `DONE` where it shrinks no more."""
 
-    ends: Bracket
-    side: Int[Array, "tasks rays"]
-    active: Bool[Array, "tasks rays"]
+    side = nth_row(5)
 
 
 class _Wanted(NamedTuple):
@@ -98,7 +109,7 @@ def first_crossings(
 ) -> Bracket:
     """Between which two depths rays first cross the level in slabs with samples on borders, given the field there."""
     inside = weight >= level
-    found = _at_first(inside[:, 1:] != inside[:, :-1], (*_ends_of(task, weight), weight[:, :-1] - level, weight[:, 1:] - level))
+    found = _at_first(inside[:, 1:] != inside[:, :-1], _relative(task), weight - level)
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
         inner, crossing = rows_of((weight, so_far), items)
@@ -126,19 +137,15 @@ def all_crossings(
 
     place, value = over_groups(look, asked, task, ~_looked_at(rays_of, task, weight >= level, level, cut)[:, None])
     begin, end = _ends_of(task, weight)
-    parts = []
-    for low, high, at_low, at_high in ((begin, place, weight[:, :-1], value), (place, end, value, weight[:, 1:])):
-        crossed = (at_low >= level) != (at_high >= level)
+    places, values, parts = (begin, place, end), (weight[:, :-1], value, weight[:, 1:]), []
+    for k in (0, 1):
+        crossed = (values[k] >= level) != (values[k + 1] >= level)
         if cut is not None:
-            crossed &= cut.clip.contains(rays_of(task).lines.at(0.5 * (low + high)))
-        number = jnp.where(crossed, jnp.arange(low.shape[1], dtype=low.dtype)[:, None], NOWHERE)
-        parts.append(Bracket(number, low, high, at_low - level, at_high - level))
-
-    def in_order(*both: Array) -> Array:
-        tasks, _, rays = both[0].shape
-        return jnp.stack(both, 2).transpose(1, 2, 0, 3).reshape(-1, tasks, rays)
-
-    return jax.tree.map(in_order, *parts)  # type: ignore[no-any-return]
+            crossed &= cut.clip.contains(rays_of(task).lines.at(0.5 * (places[k] + places[k + 1])))
+        number = jnp.where(crossed, jnp.arange(begin.shape[1])[:, None], NOWHERE)
+        parts.append(Bracket.between(number, jnp.full_like(crossed, k, int), places, [of - level for of in values]).rows)
+    rows = jnp.stack(parts, 2)
+    return Bracket(jnp.moveaxis(rows.reshape(rows.shape[0], -1, *rows.shape[3:]), 1, 0))
 
 
 def _looked_at(
@@ -167,9 +174,8 @@ def _slab_bounds(rays_of: Callable[[SlabTask], Piercing]) -> Callable[[Array, Sl
     """Of the field in whole slabs."""
 
     def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
-        border = _relative(some)
-        upper = rays_of(some).upper(jnp.stack([border[:, 0], border[:, -1]], 1))[:, 0]
-        return with_rows(so_far, items, upper)
+        whole = _relative(some)[:, :: some.border.shape[1] - 1]
+        return with_rows(so_far, items, rays_of(some).upper(whole)[:, 0])
 
     return bound
 
@@ -181,10 +187,10 @@ def _within(
     border = _relative(rays.task)
     wanted = _wanted(rays, border, weight, level, cut)
     if cut is not None:  # what a clip has cut is looked into piece by piece
-        whole = _ends_of(rays.task, weight)
+        begin, end = _ends_of(rays.task, weight)
         crossed = ((weight[:, 1:] >= level) != (weight[:, :-1] >= level)) & ~wanted.cut
-        crossed &= cut.clip.contains(rays.lines.at(0.5 * (whole[0] + whole[1])))
-        found = _at_first(crossed, (*whole, weight[:, :-1] - level, weight[:, 1:] - level))
+        crossed &= cut.clip.contains(rays.lines.at(0.5 * (begin + end)))
+        found = _at_first(crossed, border, weight - level)
     number = wanted.place.shape[1]
 
     def next_of(carry: tuple[Array, Bracket]) -> tuple[Array, Array]:
@@ -198,14 +204,13 @@ def _within(
         left, so_far = carry
         nth, there = next_of(carry)
         places, values = _asked(rays, weight, level, wanted, nth, there)
-        crossed = ((values[:, 1:] >= level) != (values[:, :-1] >= level)) & there[:, None]
+        halves = [((values[k] >= level) != (values[k + 1] >= level)) & there for k in (0, 1)]
         if cut is not None:
-            crossed &= cut.clip.contains(rays.lines.at(0.5 * (places[:, 1:] + places[:, :-1])))
-        here = _at_first(crossed, (places[:, :-1], places[:, 1:], values[:, :-1] - level, values[:, 1:] - level))
-        here = Bracket(nth.astype(values.dtype), here.low, here.high, here.at_low, here.at_high)
-        met = crossed.any(1)
+            middles = [rays.lines.at(0.5 * (places[k] + places[k + 1])[:, None]) for k in (0, 1)]
+            halves = [half & cut.clip.contains(middle)[:, 0] for half, middle in zip(halves, middles, strict=True)]
+        here = Bracket.between(nth, jnp.where(halves[0], 0, 1), places, [of - level for of in values])
         left &= jnp.arange(number)[:, None] != nth[:, None]
-        return left, jax.tree.map(lambda new, old: jnp.where(met, new, old), here, so_far)
+        return left, Bracket(jnp.where((halves[0] | halves[1])[:, None], here.rows, so_far.rows))
 
     return lax.while_loop(lambda carry: next_of(carry)[1].any(), look, (wanted.intervals, found))[1]
 
@@ -225,7 +230,7 @@ def _each_asked(
         nth, there = jnp.argmax(left, 1), left.any(1)
         places, values = _asked(rays, weight, level, wanted, nth, there)
         here = (jnp.arange(left.shape[1])[:, None] == nth[:, None]) & there[:, None]
-        found = tuple(jnp.where(here, of[:, 1:2], old) for of, old in zip((places, values), known, strict=True))
+        found = tuple(jnp.where(here, of[1][:, None], old) for of, old in zip((places, values), known, strict=True))
         return left & ~here, found  # type: ignore[return-value]
 
     return lax.while_loop(lambda carry: carry[0].any(), look, (wanted.intervals, known))[1]
@@ -233,22 +238,31 @@ def _each_asked(
 
 def _asked(
     rays: Piercing, weight: Float[Array, "tasks borders rays"], level: Float[Array, ""], wanted: _Wanted, nth: Array, there: Array
-) -> tuple[Float[Array, "tasks three rays"], Float[Array, "tasks three rays"]]:
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """The ends of the `nth` interval of each ray and a place in between, and the field there; for rays where one is `there`."""
 
     def of_ray(of_intervals: Array) -> Array:
-        return jnp.take_along_axis(of_intervals, nth[:, None], 1)[:, 0]
+        found = of_intervals[:, 0]
+        for k in range(1, of_intervals.shape[1]):  # one XLA kernel with what it is asked for, other than a gather
+            found = jnp.where(nth == k, of_intervals[:, k], found)
+        return found
 
-    border = _relative(rays.task)
-    at = tuple(jnp.take_along_axis(border, nth + k, 1) for k in (0, 1))
+    border = _relative(rays.task)[..., None]
+    at = of_ray(border[:, :-1]), of_ray(border[:, 1:])
     ends = of_ray(weight[:, :-1]), of_ray(weight[:, 1:])
-    place, is_cut = of_ray(wanted.place), of_ray(wanted.cut)
-    value = rays.weights(place)
-    vertex, peak = _vertex((at[0], place, at[1]), (ends[0], value, ends[1]))
-    near = there & ~is_cut & (value < level) & (vertex != place) & (peak >= NEAR * level)
-    again = lax.cond(near.any(), lambda: rays.weights(vertex), lambda: value)
-    place, value = jnp.where(near, vertex, place), jnp.where(near, again, value)
-    return jnp.stack([at[0], place, at[1]], 1), jnp.stack([ends[0], value, ends[1]], 1)
+    uncut = there & ~of_ray(wanted.cut)
+
+    def ask(carry: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
+        at_first, asked, new, place, value = carry
+        place, value = jnp.where(asked, new, place), jnp.where(asked, rays.weights(new), value)
+        vertex, peak = _vertex((at[0], place, at[1]), (ends[0], value, ends[1]))
+        near = at_first & uncut & (value < level) & (vertex != place) & (peak >= NEAR * level)
+        return jnp.zeros((), bool), near, vertex, place, value
+
+    nothing = jnp.zeros_like(ends[0])
+    start = jnp.ones((), bool), there, of_ray(wanted.place), nothing, nothing
+    *_, place, value = lax.while_loop(lambda carry: carry[1].any(), ask, start)
+    return (at[0], place, at[1]), (ends[0], value, ends[1])
 
 
 def _wanted(rays: Piercing, border: Array, weight: Array, level: Array, cut: Cut | None) -> _Wanted:
@@ -265,62 +279,70 @@ def _wanted(rays: Piercing, border: Array, weight: Array, level: Array, cut: Cut
     return _Wanted(intervals | enters | leaves, place, enters | leaves)
 
 
-def narrowed(
+def at_crossings(
     rays_of: Callable[[SlabTask], Piercing],
     task: SlabTask,
     bracket: Bracket,
     level: Float[Array, ""],
-    active: Bool[Array, "tasks rays"] | None = None,
-) -> Bracket:
-    """Brackets of the rays that cross by false position: Newton's step from their secant is to some roundings of a root.
+    look: Callable[[Bracket, Piercing, Array], Float[Array, "tasks rows rays"]],
+    num_rows: int,
+) -> Float[Array, "tasks rows rays"]:
+    """What a look finds where rays cross, once their brackets are narrowed; 0 for those that do not.
 
-    It is the Illinois form (Dahlquist & Bjoerck 1974, section 6.2): an end that stays twice weighs half. Most rays take two
-    steps; slabs with one that takes more are looked at again.
+    By false position, in the Illinois form (Dahlquist & Bjoerck 1974, section 6.2): an end that stays twice weighs half. Newton's
+    step from their secant is then to some roundings of a root. Most rays take two steps; slabs with one that takes more are taken
+    again, then all are looked at. Rays that graze the surface are not at a root by that: where the field has hardly a slope,
+    Newton's step leads away. For them all is done once more, until the secant is the root, `CLOSE`. It is one loop of six turns,
+    each for slabs chosen anew: six loops would be compiled six times.
 
     Args:
-        active: rays that go on until the secant is the root, `CLOSE`, as those do that graze the surface: where the field has
-            hardly a slope, Newton's step leads away. None is all, for that step.
+        look: `look(bracket, rays, again)`: rows, the last of which says how far the field is off the level there; `again` where
+            the secant is the root.
     """
     eps = float(jnp.finfo(level.dtype).eps)
-    enough = level * (eps**ENOUGH if active is None else CLOSE * eps)
 
-    def narrow(search: _Search, most: int) -> _Search:
-        def of_some(items: Array, some: SlabTask, all_rays: _Search) -> _Search:
-            rays = rays_of(some)
+    def off(found: Array) -> Array:
+        return jnp.abs(lax.stop_gradient(found[:, -1])) > CLOSE * eps * level
 
-            def step(carry: tuple[_Search, Array]) -> tuple[_Search, Array]:
-                of, number = carry
-                return _stepped(rays, of, level, enough), number + 1
+    def turn(nth: Array, carry: tuple[_Search, Array]) -> tuple[_Search, Array]:
+        again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS)[nth]
+        looks, enough = steps == 0, level * jnp.where(again, CLOSE * eps, eps**ENOUGH)
 
-            start = rows_of(all_rays, items), jnp.int32(0)
-            here = lax.while_loop(lambda carry: (carry[1] < most) & carry[0].active.any(), step, start)[0]
-            return with_rows(all_rays, items, here)
+        def asked(search: _Search, found: Array) -> Array:
+            return jnp.where(looks, jnp.where(again, off(found), search.met), search.side < DONE)
 
-        return over_groups(of_some, search, task, ~search.active[:, None])
+        def of_some(items: Array, some: SlabTask, carry: tuple[_Search, Array]) -> tuple[_Search, Array]:
+            (here, found), rays = rows_of(carry, items), rays_of(some)
+            still = lax.stop_gradient(rays)
 
-    found = _Search(bracket, jnp.zeros(bracket.low.shape, jnp.int32), bracket.met if active is None else active)
-    for most in (FIRST, STEPS - FIRST):
-        found = narrow(found, most)
-    return found.ends
+            def step(state: tuple[_Search, Array]) -> tuple[_Search, Array]:
+                return _stepped(still, state[0], level, enough), state[1] + 1
+
+            here = lax.while_loop(lambda state: (state[1] < steps) & (state[0].side < DONE).any(), step, (here, jnp.int32(0)))[0]
+            there = asked(here, found)[:, None]
+            found = lax.cond(looks, lambda: jnp.where(there, look(here, rays, again), found), lambda: found)
+            side = jnp.where(looks, jnp.where(off(found), 0, DONE), here.side)
+            return with_rows(carry, items, (_Search(here.rows.at[:, 5].set(side)), found))
+
+        return over_groups(of_some, carry, task, ~asked(*carry)[:, None])
+
+    tasks, _, rays = bracket.rows.shape
+    start = _Search(jnp.concatenate([bracket.rows, jnp.where(bracket.met, 0, DONE)[:, None]], 1))
+    return lax.fori_loop(0, 2 * len(TURNS), turn, (start, jnp.zeros((tasks, num_rows, rays), level.dtype)))[1]
 
 
-def _stepped(rays: Piercing, search: _Search, level: Array, enough: Array) -> _Search:
+def _stepped(rays: Piercing, ends: _Search, level: Array, enough: Array) -> _Search:
     """With the field asked for where a straight line crosses, of the rays whose brackets still shrink."""
-    ends, active = search.ends, search.active
     place = ends.secant()
     here = rays.weights(place) - level
     behind = (here >= 0) == (ends.at_low >= 0)  # the crossing lies behind
-    side = jnp.where(behind, 1, -1).astype(search.side.dtype)
-    kept = jnp.where(side == search.side, 0.5, 1).astype(here.dtype)
-    moving = Bracket(
-        ends.interval,
-        jnp.where(behind, place, ends.low),
-        jnp.where(behind, ends.high, place),
-        jnp.where(behind, here, kept * ends.at_low),
-        jnp.where(behind, kept * ends.at_high, here),
-    )
-    ends = jax.tree.map(lambda old, new: jnp.where(active, new, old), ends, moving)  # whatever other rays take
-    return _Search(ends, side, active & (jnp.abs(here) > enough))
+    side = jnp.where(behind, 1, -1).astype(here.dtype)
+    kept = jnp.where(side == ends.side, 0.5, 1).astype(here.dtype)
+    row = np.arange(6)[:, None]
+    places, moved = row < 3, (row % 2 == 1) == behind[:, None]
+    rows = jnp.where(moved, jnp.where(places, place[:, None], here[:, None]), jnp.where(places, 1, kept[:, None]) * ends.rows)
+    rows = jnp.where(row == 5, jnp.where(jnp.abs(here) > enough, side, DONE)[:, None], rows)
+    return _Search(jnp.where((ends.side < DONE)[:, None] & (row > 0), rows, ends.rows))  # whatever other rays take
 
 
 def _relative(task: SlabTask) -> Float[Array, "tasks borders"]:
@@ -328,15 +350,15 @@ def _relative(task: SlabTask) -> Float[Array, "tasks borders"]:
     return task.border - 0.5 * (task.border[:, :1] + task.border[:, -1:])
 
 
-def _at_first(crossed: Bool[Array, "tasks intervals rays"], rows: tuple[Array, ...]) -> Bracket:
-    """The first interval that is `crossed`, and of four rows those there; of the last, where none is."""
-    number = crossed.shape[1]
-    first = jnp.full(crossed.shape[::2], NOWHERE, rows[2].dtype)
-    found = [row[:, -1] for row in rows]
+def _at_first(
+    crossed: Bool[Array, "tasks intervals rays"], border: Float[Array, "tasks borders"], value: Float[Array, "tasks borders rays"]
+) -> Bracket:
+    """The first interval that is `crossed`; where none is, at the ends of the last."""
+    number, first = crossed.shape[1], jnp.full(crossed.shape[::2], int(NOWHERE))
     for k in range(number - 1, -1, -1):
         first = jnp.where(crossed[:, k], k, first)
-        found = [jnp.where(crossed[:, k], row[:, k], so_far) for row, so_far in zip(rows, found, strict=True)]
-    return Bracket(first, *found)
+    places, values = ([of[:, k] for k in range(number + 1)] for of in (border[..., None], value))
+    return Bracket.between(first, jnp.where(first >= 0, first, number - 1), places, values)
 
 
 def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Array]) -> tuple[Array, Array]:

@@ -30,6 +30,11 @@ class Block:
     quantities: tuple[Float[Array, "..."], ...]
 
 
+def known_at(rows: Array, index: Int[Array, "..."]) -> Array:
+    """`rows[index]` where that is known to be one of them: a gather is not compiled for what else it might be."""
+    return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
 def position(index: Int[Array, "*some any"], begin: Int[Array, "classes *any"], length: Int[Array, "classes *any"]) -> Array:
     """Where the `index`-th particle of each slab stands in the lists: the slab's windows, one class after the other."""
     place, before = begin[0] + index, length[0]
@@ -44,7 +49,7 @@ def particle_at(
 ) -> tuple[Int[Array, "..."], Bool[Array, "..."]]:
     """The `index`-th particle of windows, and whether there are so many; if not, it is any."""
     place = position(index, begin, length)
-    return rank[jnp.clip(place, 0, rank.shape[0] - 1)], index < length.sum(0)
+    return known_at(rank, jnp.clip(place, 0, rank.shape[0] - 1)), index < length.sum(0)
 
 
 def quantities_of(ordered: Ordered) -> tuple[Float[Array, " particles"], ...]:
@@ -63,7 +68,8 @@ def fetch(
     """The `index`-th particles of windows (`begin`, `length`), by rank and as such; shapes are those that broadcasting gives."""
     particle, inside = particle_at(rank, *windows, index)
     x, y, z, scale, size, *quantities = (
-        column[particle] for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *quantities_of(ordered))
+        known_at(column, particle)
+        for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *quantities_of(ordered))
     )
     relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
     return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)

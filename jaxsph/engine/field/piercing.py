@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,36 +28,41 @@ from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import clamped, greater, lesser
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.fusion import fusion_barrier, side_by_side
+from jaxsph.numerics.trees import tree
 
 Carry = TypeVar("Carry")
 BLOCK = 16  # particles of each slab, unrolled
 
 
-class SlabRays(NamedTuple):
+def nth_row(number: int) -> Any:
+    """A property that is one of `rows` side by side, whose last axis is rays."""
+    return property(lambda self: self.rows[..., number, :])
+
+
+@tree()
+class SlabRays:
     """Rays of slabs.
 
     Attributes:
+        rows: what follows but for `middle`, one array such that it is one XLA kernel.
         u, v: lateral coordinates at the middle of the slab; `slope_u`, `slope_v`: a unit of depth.
         square: of their length a unit of depth.
         middle: its depth.
     """
 
-    u: Float[Array, "tasks rays"]
-    v: Float[Array, "tasks rays"]
-    slope_u: Float[Array, "tasks rays"]
-    slope_v: Float[Array, "tasks rays"]
-    square: Float[Array, "tasks rays"]
+    rows: Float[Array, "tasks 5 rays"]
     middle: Float[Array, "tasks 1"]
+    u, v, slope_u, slope_v, square = map(nth_row, range(5))
 
     @classmethod
     def of(cls, task: SlabTask) -> SlabRays:
         """Of the slabs of a task."""
         u, v = task.ray_coordinates()
         middle = 0.5 * (task.border[:, :1] + task.border[:, -1:])
-        if not task.perspective:
-            return cls(u, v, jnp.zeros_like(u), jnp.zeros_like(v), jnp.ones_like(u), middle)
-        return cls(u * middle, v * middle, u, v, 1 + u * u + v * v, middle)
+        none = jnp.zeros_like(u)
+        rows = [u * middle, v * middle, u, v, 1 + u * u + v * v] if task.perspective else [u, v, none, none, none + 1]
+        return cls(side_by_side(rows, 1), middle)
 
     def at(self, place: Float[Array, "tasks some rays"]) -> tuple[Float[Array, "tasks some rays"], ...]:
         """View coordinates of points of the rays, by depths relative to the middle."""
@@ -94,15 +99,21 @@ class Found(NamedTuple):
     weighted: tuple[Float[Array, "tasks rays"], ...]
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("kernel",))
 class Piercing:
-    """Rays of slabs, and the particles in their windows."""
+    """Rays of slabs, and the particles in their windows: `blocks` of them, in the slab whose windows hold most."""
 
     ordered: Ordered
     rank: Int[Array, " pairs"]
     task: SlabTask
     lines: SlabRays
+    blocks: Int[Array, ""]
     kernel: str
+
+    @classmethod
+    def of(cls, ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Piercing:
+        """Of the slabs of a task."""
+        return cls(ordered, rank, task, SlabRays.of(task), (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK, kernel)
 
     def ray(self) -> list[Float[Array, "tasks rays"]]:
         """View coordinates of a vector along each ray, of a unit of depth."""
@@ -110,11 +121,11 @@ class Piercing:
 
     def bound(self, border: Float[Array, "tasks borders"], level: Float[Array, ""]) -> Bound:
         """Of the field between borders, relative to the middle."""
-        smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
+        smooth = kernels.by_name(self.kernel)
 
         def of_one(block: Block, passed: Passed, k: int) -> tuple[Array, ...]:
             foot = passed.foot[:, k, None]
-            at = clamped(foot, begin, end)
+            at = _within(foot, border)
             rest = (at - foot) ** 2 * passed.rate[:, k, None]
             weight = smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
             return weight, weight * at, jnp.where(weight >= level, at, far)
@@ -130,25 +141,24 @@ class Piercing:
             return both(so_far, lax.reduce(operands, (zero, zero, far), both, (0,)))
 
         zero, far = jnp.zeros((), border.dtype), jnp.asarray(jnp.finfo(border.dtype).max, border.dtype)
-        nothing = jnp.zeros((begin.shape[0], begin.shape[1], self.lines.u.shape[1]), border.dtype)
+        nothing = jnp.zeros((border.shape[0], border.shape[1] - 1, self.lines.u.shape[1]), border.dtype)
         start: tuple[Array, ...] = (nothing, nothing, nothing + far)
         upper, weighed, first = self._over(add, start)
-        mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), begin)
-        return Bound(upper, clamped(jnp.where(first < far, first, mean), begin, end))
+        mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), border[:, :-1, None])
+        return Bound(upper, _within(jnp.where(first < far, first, mean), border))
 
     def upper(self, border: Float[Array, "tasks borders"]) -> Float[Array, "tasks intervals rays"]:
         """The bound alone, `Bound.upper`."""
-        smooth, begin, end = kernels.by_name(self.kernel), border[:, :-1, None], border[:, 1:, None]
+        smooth = kernels.by_name(self.kernel)
 
         def add(block: Block, passed: Passed, total: Array) -> Array:
             for k in range(BLOCK):
                 foot = passed.foot[:, k, None]
-                rest = (clamped(foot, begin, end) - foot) ** 2 * passed.rate[:, k, None]
+                rest = (_within(foot, border) - foot) ** 2 * passed.rate[:, k, None]
                 total = total + smooth.weigh(passed.nearest[:, k, None], rest, block.size[:, k, None, None], jnp)
             return total
 
-        shape = begin.shape[0], begin.shape[1], self.lines.u.shape[1]
-        return self._over(add, jnp.zeros(shape, border.dtype))
+        return self._over(add, jnp.zeros((border.shape[0], border.shape[1] - 1, self.lines.u.shape[1]), border.dtype))
 
     def weights(self, place: Float[Array, "tasks rays"]) -> Float[Array, "tasks rays"]:
         """The field at one depth of each ray, relative to the middle."""
@@ -158,7 +168,7 @@ class Piercing:
                 total = total + self._of_one(one, self.lines, place)[0]
             return total
 
-        return lax.fori_loop(0, self._blocks(), put, jnp.zeros_like(place))
+        return lax.fori_loop(0, self.blocks, put, jnp.zeros_like(place))
 
     def found(self, place: Float[Array, "tasks rays"]) -> Found:
         """Field, gradient and quantities at one depth of each ray."""
@@ -168,7 +178,7 @@ class Piercing:
             return tuple(old + new for old, new in zip(total, of_block, strict=True))
 
         nothing = (jnp.zeros_like(place),) * (4 + len(self.task.entry.references))
-        weight, *rows = lax.fori_loop(0, self._blocks(), put, nothing)
+        weight, *rows = lax.fori_loop(0, self.blocks, put, nothing)
         return Found(weight, tuple(rows[:3]), tuple(rows[3:]))
 
     def pull(
@@ -200,10 +210,10 @@ class Piercing:
 
         def put(nth: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
             particle, block = self._fetched(nth)
-            row, of_factor = fusion_barrier(nth >= 0, pulled, block)
+            row, of_factor = fusion_barrier(self.blocks >= 0, pulled, block)
             return carry[0].at[particle.ravel()].add(row, mode="promise_in_bounds"), carry[1] + of_factor
 
-        return lax.fori_loop(0, self._blocks(), put, (table, jnp.zeros((), place.dtype)))
+        return lax.fori_loop(0, self.blocks, put, (table, jnp.zeros((), place.dtype)))
 
     def _of_one(self, one: Block, lines: SlabRays, place: Float[Array, "tasks rays"]) -> list[Float[Array, "tasks rays"]]:
         """What one particle of each slab adds to what is `found`."""
@@ -220,23 +230,19 @@ class Piercing:
 
         def put(nth: Array, carry: Carry) -> Carry:
             block = self._fetched(nth)[1]
-            return add(block, fusion_barrier(nth >= 0, self._passed, block), carry)
+            return add(block, fusion_barrier(self.blocks >= 0, self._passed, block), carry)
 
-        return lax.fori_loop(0, self._blocks(), put, start)
-
-    def _blocks(self) -> Int[Array, ""]:
-        """Of the slab whose windows hold most."""
-        return (self.task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+        return lax.fori_loop(0, self.blocks, put, start)
 
     def _fetched(self, nth: Array) -> tuple[Int[Array, "tasks block"], Block]:
         """The nth block of each slab, by rank and as such."""
         entry = self.task.entry
         windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
 
-        def fetched(index: Array) -> tuple[Array, Block]:
-            return fetch(self.ordered, self.rank, windows, index, references)
+        def fetched(nth: Array) -> tuple[Array, Block]:
+            return fetch(self.ordered, self.rank, windows, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32), references)
 
-        return fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+        return fusion_barrier(self.blocks >= 0, fetched, nth)
 
     def _passed(self, block: Block) -> Passed:
         """How rays pass a block of particles."""
@@ -248,6 +254,11 @@ class Piercing:
         away = greater(0, (x * x + y * y + z * z) - along * foot)
         nearest = kernels.by_name(self.kernel).prepare(away * scale**2, block.size[..., None])
         return Passed(foot, nearest, scale**2 * lines.square[:, None])
+
+
+def _within(place: Float[Array, "tasks _ rays"], border: Float[Array, "tasks borders"]) -> Float[Array, "tasks intervals rays"]:
+    """The nearest in each interval between borders."""
+    return clamped(place, border[:, :-1, None], border[:, 1:, None])
 
 
 def _each(block: Block) -> list[Block]:

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import FORMS, drawn
 
-from jaxsph.engine.field.crossing import first_crossings, narrowed
-from jaxsph.engine.field.piercing import Piercing, SlabRays
+from jaxsph.engine.field.crossing import at_crossings, first_crossings
+from jaxsph.engine.field.piercing import Piercing
 
 KERNEL = "cubic_spline"
 
@@ -28,10 +28,10 @@ def on_borders(seed, form):
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
 def looked_for(ordered, rank, task, level):
-    """The field on borders, brackets, narrowed ones, and the field at the ends of the first and at the roots of the second."""
+    """The field on borders, brackets, the ends of narrowed ones, and the field at the ends of the first and at the roots."""
 
     def rays_of(some):
-        return Piercing(ordered, rank, some, SlabRays.of(some), KERNEL)
+        return Piercing.of(ordered, rank, some, KERNEL)
 
     rays, shape = rays_of(task), (task.shape[0], task.shape[2])
 
@@ -40,8 +40,12 @@ def looked_for(ordered, rank, task, level):
 
     weight = jnp.moveaxis(jax.lax.map(field, (task.border - rays.lines.middle).T), 0, 1)
     found = first_crossings(rays_of, task, weight, level, None)
-    root = narrowed(rays_of, task, found, level)
-    return weight, found, root, [rays.weights(at) for at in (found.low, found.high, root.secant())]
+
+    def look(bracket, _, again):  # nowhere off the level: it is not asked for again
+        return jnp.stack([bracket.low, bracket.high, bracket.secant(), jnp.where(again, jnp.nan, 0 * bracket.low)], 1)
+
+    low, high, root, _ = jnp.moveaxis(at_crossings(rays_of, task, found, level, look, 4), 1, 0)
+    return weight, found, (low, high), [rays.weights(at) for at in (found.low, found.high, root)]
 
 
 def level_for(given, share):
@@ -57,7 +61,7 @@ def test_brackets_hold_the_first_crossing_of_borders_or_one_in_front_of_it(form,
     with jax.enable_x64(True):
         given = on_borders(seed, form)
         level = level_for(given, share)
-        weight, found, root, (low, high, at_root) = (jax.tree.map(np.asarray, one) for one in looked_for(*given, level))
+        weight, found, ends, (low, high, at_root) = (jax.tree.map(np.asarray, one) for one in looked_for(*given, level))
         inside = weight >= level
         crossed = inside[:, 1:] != inside[:, :-1]
         first = np.where(crossed.any(1), crossed.argmax(1), np.inf)
@@ -66,5 +70,5 @@ def test_brackets_hold_the_first_crossing_of_borders_or_one_in_front_of_it(form,
         np.testing.assert_allclose(low[met] - level, found.at_low[met], atol=1e-10 * level)
         np.testing.assert_allclose(high[met] - level, found.at_high[met], atol=1e-10 * level)
         assert ((low >= level) != (high >= level))[met].all() and (found.low <= found.high)[met].all()
-        assert ((root.low >= found.low - 1e-12) & (root.high <= found.high + 1e-12))[met].all()
+        assert ((ends[0] >= found.low - 1e-12) & (ends[1] <= found.high + 1e-12))[met].all()
         np.testing.assert_allclose(at_root[met], level, rtol=1e-6)  # however far apart borders are

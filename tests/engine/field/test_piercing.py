@@ -25,20 +25,20 @@ AMID = 33  # places in an interval
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def bounded(ordered, rank, task, level, kernel):
-    rays = Piercing(ordered, rank, task, SlabRays.of(task), kernel)
+    rays = Piercing.of(ordered, rank, task, kernel)
     return rays.bound(task.depth - rays.lines.middle, level)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def weighed(ordered, rank, task, depth, kernel):
-    rays = Piercing(ordered, rank, task, SlabRays.of(task), kernel)
+    rays = Piercing.of(ordered, rank, task, kernel)
     place = jnp.moveaxis(depth - rays.lines.middle[..., None], 1, 0)
     return jnp.moveaxis(jax.lax.map(rays.weights, place), 0, 1)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def found_at(ordered, rank, task, depth, kernel):
-    rays = Piercing(ordered, rank, task, SlabRays.of(task), kernel)
+    rays = Piercing.of(ordered, rank, task, kernel)
     return rays.found(depth - rays.lines.middle)
 
 

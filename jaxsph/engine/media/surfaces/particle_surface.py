@@ -17,7 +17,6 @@ A clip's face is such a place, too, in the intervals that it cuts: what is thin 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -28,10 +27,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
-from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
-from jaxsph.engine.field.crossing import CLOSE, Bracket, Cut, first_crossings, narrowed
+from jaxsph.engine.field.cover import over_groups, rows_of
+from jaxsph.engine.field.crossing import Bracket, Cut, at_crossings, first_crossings
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.piercing import Found, Piercing, SlabRays
+from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
@@ -45,6 +44,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
+from jaxsph.numerics.fusion import side_by_side
 from jaxsph.numerics.trees import tree
 
 
@@ -150,22 +150,13 @@ class ParticleSurface(Medium):
 
     def place(self, on_borders: SlabTask, bracket: Bracket) -> Place:
         """Where rays cross, of one bracket each, and how the surface looks there."""
-        still, there = lax.stop_gradient(self), lax.stop_gradient(on_borders)
-        bracket = narrowed(still.rays, there, bracket, still.level)
-        tasks, rays = bracket.low.shape
 
-        def look(between: Bracket, asked: Array, steps: bool, items: Array, some: SlabTask, found: Array) -> Array:
-            (here, there, old), moving = rows_of((between, asked, found), items), self.rays(some)
-            root = root_near(moving, here.secant(), (here.low, here.high), self.level, steps)
-            colors, normal = self.look.shade(root.found, moving.ray(), some.entry.references[0][:, None])
-            rows = jnp.stack([root.place + moving.lines.middle, *colors, *normal, root.found.weight - self.level], 1)
-            return with_rows(found, items, jnp.where(there[:, None], rows, old))
+        def look(between: Bracket, rays: Piercing, again: Array) -> Array:
+            root = root_near(rays, between, self.level, again)
+            colors, normal = self.look.shade(root.found, rays.ray(), rays.task.entry.references[0][:, None])
+            return side_by_side([root.place + rays.lines.middle, *colors, *normal, root.found.weight - self.level], 1)
 
-        nothing = jnp.zeros((tasks, 8, rays), bracket.low.dtype)
-        found = over_groups(functools.partial(look, bracket, bracket.met, True), nothing, on_borders, ~bracket.met[:, None])
-        off = jnp.abs(lax.stop_gradient(found[:, 7])) > CLOSE * float(jnp.finfo(nothing.dtype).eps) * still.level
-        bracket = narrowed(still.rays, there, bracket, still.level, off)
-        found = over_groups(functools.partial(look, bracket, off, False), found, on_borders, ~off[:, None])
+        found = at_crossings(self.rays, on_borders, bracket, lax.stop_gradient(self.level), look, 8)
         return Place(jnp.where(bracket.met, found[:, 0], jnp.inf), found[:, 1:4], found[:, 4:7])
 
     def cut(self) -> Cut | None:
@@ -183,7 +174,7 @@ class ParticleSurface(Medium):
 
     def rays(self, task: SlabTask) -> Piercing:
         """The rays of slabs, and particles in their windows."""
-        return Piercing(*self.lists(), task, SlabRays.of(task), self.kernel)
+        return Piercing.of(*self.lists(), task, self.kernel)
 
     def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
         """Opaque where the surface is."""

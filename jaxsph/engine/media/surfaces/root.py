@@ -17,8 +17,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxsph.engine.field.crossing import Bracket
 from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.media.surfaces.headlight import headlight
 from jaxsph.model.medium import COLORS
@@ -87,25 +88,28 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
     return found.gradient[0] * ray[0] + found.gradient[1] * ray[1] + found.gradient[2] * ray[2]
 
 
-def root_near(
-    rays: Piercing, place: Float[Array, "tasks rays"], between: tuple[Array, Array], level: Float[Array, ""], steps: bool = True
-) -> Root:
-    """The root that a place is near to, by a step of Newton's, which has the derivatives; and what is found there.
+def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root: Bool[Array, ""]) -> Root:
+    """The root in a bracket, by a step of Newton's from its secant, which has the derivatives; and what is found there.
 
     Args:
-        between: where it lies, relative to the middle of the slab as places are.
-        steps: whether the step is made; else the place is the root, and has the derivatives alone.
+        is_root: whether the secant is the root: then it stays, and the step has the derivatives alone.
 
     Differentiation:
-        By the particles, the rays and the level, as of an implicit function; `place` and `between` have none.
+        By the particles, the rays and the level, as of an implicit function; the bracket has none.
     """
-    low, high = lax.stop_gradient(between)
-    given = lax.stop_gradient(place)
-    here = rays.found(given)
-    slope = lax.stop_gradient(slope_along(here, rays.ray()))
-    place = given + jnp.where(slope != 0, (level - here.weight) / jnp.where(slope != 0, slope, 1), 0)
-    place = place + lax.stop_gradient((clamped(place, low, high) if steps else given) - place)
-    return Root(place, rays.found(place))
+    bracket = lax.stop_gradient(bracket)
+    given = bracket.secant()
+
+    def find(nth: Array, root: Root) -> Root:
+        slope = lax.stop_gradient(slope_along(root.found, rays.ray()))  # 0 before anything is found
+        place = given + jnp.where(slope != 0, (level - root.found.weight) / jnp.where(slope != 0, slope, 1), 0)
+        taken = jnp.where(is_root | (nth == 0), given, clamped(place, bracket.low, bracket.high))
+        place = place + lax.stop_gradient(taken - place)
+        return Root(place, rays.found(place))
+
+    zero = jnp.zeros_like(given)
+    nothing = Found(zero, (zero,) * 3, (zero,) * len(rays.task.entry.references))
+    return lax.fori_loop(0, 2, find, Root(given, nothing))  # at the secant, and at the root
 
 
 def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
