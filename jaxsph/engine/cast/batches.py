@@ -157,8 +157,8 @@ class Batches:
         if method is None:
             return nth, number
         slot, past, all_gaps = nth, jnp.int32(0), jnp.int32(0)
-        for k in range(NUM_METHODS - 1):
-            with_method = (real & (method == k)).sum(dtype=jnp.int32)
+        of_methods = real & (method == jnp.arange(NUM_METHODS - 1, dtype=jnp.int32)[:, None])
+        for with_method in of_methods.sum(1, dtype=jnp.int32):
             past, gap = past + with_method, -with_method % self.plan.chunk
             slot, all_gaps = jnp.where(nth >= past, slot + gap, slot), all_gaps + gap  # of all later methods
         return slot, number + all_gaps

@@ -49,7 +49,7 @@ DEVIATIONS_AROUND = 10.0  # of Q, by which quantities between nodes are taken to
 MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
 AXES = 2, 1, 0  # of a lattice: columns, rows, layers
 Combine = Callable[[Array, Array], Array]
-Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; first layer
+Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; nodes
 
 
 @tree()
@@ -89,16 +89,16 @@ def interpolation_error(
 ) -> InterpolationError:
     """Of a band; infinite variance wherever a stencil may leave the lattice, or there is none."""
     region, spacing, dtype = lattice.region, lattice.region.spacing, lattice.weight.dtype
-    shape = grid.windows.count.shape[0], region.rows, region.columns
+    shape = grid.windows.count.shape[0], 3, region.rows, region.columns
 
-    def nothing() -> tuple[Array, Array, Array]:
-        return jnp.full(shape, jnp.inf, dtype), jnp.full(shape, SUBSAMPLED_SHARE, dtype), jnp.zeros(shape, dtype)
+    def nothing() -> Float[Array, "slabs 3 rows columns"]:
+        return jnp.broadcast_to(jnp.asarray([jnp.inf, SUBSAMPLED_SHARE, 0], dtype)[:, None, None], shape)
 
     sweep = functools.partial(_sweep, grid, lattice, camera, transfer, slab_samples)
     found = lax.cond((lattice.evaluations > 0).any(), sweep, nothing)
     row, column, inside = region.place(grid)
     at = jnp.where(inside, row * region.columns + column, 0)
-    variance, share, bend = (value.reshape(shape[0], -1)[:, at] for value in found)
+    variance, share, bend = jnp.moveaxis(found.reshape(*shape[:2], -1)[..., at], 1, 0)
     # cubics of the first and of the last slab take nodes beyond the lattice, and so do those of bundles at its sides
     slab, within = jnp.arange(shape[0], dtype=jnp.int32)[:, None], slab_samples // spacing.samples
     deep = (slab > 0) & ((slab + 1) * within < (grid.samples - 1) // spacing.samples)
@@ -110,7 +110,7 @@ def interpolation_error(
 
 def _sweep(
     grid: Grid, lattice: Lattice, camera: Camera, transfer: TransferFunction, slab_samples: int
-) -> tuple[Float[Array, "slabs rows columns"], ...]:
+) -> Float[Array, "slabs 3 rows columns"]:
     """Variance, share and bend of a region's bundles, slab by slab from front to back: what is at hand stays in the cache."""
     spacing, slabs = lattice.region.spacing, grid.windows.count.shape[0]
     within = slab_samples // spacing.samples  # layers of a slab
@@ -124,8 +124,8 @@ def _sweep(
     edges = grid.half_steps[jnp.minimum(2 * spacing.samples * jnp.arange(slabs * within + 1, dtype=jnp.int32), last)]
     pixel = 2 * camera.half_height.astype(path.dtype) / camera.height
 
-    def judge(carried: Carried, slab: Array) -> tuple[Carried, tuple[Array, ...]]:
-        (tau, light, first), always = carried, slab >= 0
+    def judge(carried: Carried, slab: Array) -> tuple[Carried, Array]:
+        (tau, light, before), always = carried, slab >= 0
         weight, *weighted = (lax.dynamic_slice_in_dim(value, slab * within + 1, within + 2 * REACH) for value in sums)
         edge = lax.dynamic_slice_in_dim(edges, slab * within, within + 1)
         step, depth = edge[1:] - edge[:-1], edge[-1] - edge[0]
@@ -134,7 +134,7 @@ def _sweep(
         at_nodes = functools.partial(_at_nodes, node_samples=spacing.samples)
         looks = zip(weighted, lattice.references, segments, strict=True)
         new = [fusion_barrier(always, at_nodes, weight, *one, correlated) for one in looks]
-        layers: list[NodeValues] = jax.tree.map(lambda front, behind: jnp.concatenate([front[None], behind]), first, new)
+        layers: list[NodeValues] = jax.tree.map(lambda front, behind: jnp.concatenate([front[-1:], behind]), before, new)
         colors, extinction = layers[0].optics[:3], layers[-1].optics[3]
         absorbed = sum(extinction[k] * step[k] for k in range(within)) * path
         judged = [
@@ -145,16 +145,17 @@ def _sweep(
         share = functools.reduce(jnp.maximum, [one for _, one in judged])
         bend, light = fusion_barrier(always, second_differences, colors, extinction, step[:, None, None] * path, tau, light)
         bend = jnp.sqrt(pool(bend[None] ** 2, jnp.add)) / (spacing.across + 1)
-        return (tau + absorbed, light, jax.tree.map(lambda value: value[-1], new)), (variance, share, bend)
+        return (tau + absorbed, light, new), jnp.stack([variance, share, bend])
 
-    def skip(carried: Carried, _: Array) -> tuple[Carried, tuple[Array, ...]]:
+    def skip(carried: Carried, _: Array) -> tuple[Carried, Array]:
         """An empty slab before an empty one."""
-        nothing = jnp.zeros_like(longest)
-        return (carried[0], *jax.tree.map(jnp.zeros_like, carried[1:])), (nothing, nothing + SUBSAMPLED_SHARE, nothing)
+        found = jnp.asarray([0, SUBSAMPLED_SHARE, 0], longest.dtype)[:, None, None]
+        return (carried[0], *jax.tree.map(jnp.zeros_like, carried[1:])), jnp.broadcast_to(found, (3, *longest.shape))
 
     # the first layer counts as empty: its slab is not interpolated anyway
     nothing = jnp.zeros_like(path)
-    empty = [NodeValues(nothing, nothing, nothing, (nothing,) * 4) for _ in parts]
+    layer = jnp.zeros((within, *path.shape), path.dtype)
+    empty = [NodeValues(layer, layer, layer, (layer,) * 4) for _ in parts]
     filled = jnp.append((grid.windows.count > 0).any(1), False)
     each = jnp.arange(slabs, dtype=jnp.int32), filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
     start = nothing, jnp.stack([nothing] * 4), empty

@@ -6,6 +6,7 @@ Flow: interpolation_error -> [knapsack] -> schedule.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -27,20 +28,18 @@ def select_under_budget(
     Returns:
         What is taken, and the sum of its variances, at most the budget.
     """
-    allowed &= variance <= budget
-    price = jnp.where(allowed, jnp.log2(variance) - jnp.log2(gain), jnp.inf)
-    least, most = price.min(0), jnp.where(allowed, price, -jnp.inf).max(0)
-    low, high = (jnp.where(allowed.any(0), end, 0) for end in (least, most))
+    price = jnp.where(allowed & (variance <= budget), jnp.log2(variance) - jnp.log2(gain), jnp.inf)
+    least = price.min(0)
+    span = jnp.where(price < jnp.inf, price, -jnp.inf).max(0) - least
+    shares = jnp.asarray([0, 2, *0.5 ** np.arange(1, HALVINGS + 1)], price.dtype)  # tries the least price, any, then halves
 
-    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        keeps = jnp.where(price <= middle, variance, 0).sum(0) <= budget
-        return jnp.where(keeps, middle, low), jnp.where(keeps, high, middle)
+    def attempt(nth: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        highest, total = found
+        tried = highest + span * shares[nth]  # NaN where nothing is allowed: no price is below that
+        spent = jnp.where(price <= tried, variance, 0).sum(0)
+        keeps = spent <= budget
+        return jnp.where(keeps, tried, highest), jnp.where(keeps, spent, total)
 
-    all_fit = jnp.where(allowed, variance, 0).sum(0) <= budget
-    highest = jnp.where(all_fit, high, lax.fori_loop(0, HALVINGS, halve, (low, high))[0])
-    taken = allowed & (price <= highest)
-    total = jnp.where(taken, variance, 0).sum(0)
-    fits = total <= budget  # the least price alone may be too much
-    return taken & fits, jnp.where(fits, total, 0)
+    # the least price alone may be too much, and then all are
+    highest, total = lax.fori_loop(0, HALVINGS + 2, attempt, (least, jnp.full_like(budget, -1)))
+    return (price <= highest) & (total >= 0), jnp.maximum(total, 0)

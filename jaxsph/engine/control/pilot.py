@@ -86,8 +86,8 @@ def pilot(
 
 def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
     """Whether the lattice resolves enough of a band's work to be sampled at all."""
-    count = grid.windows.count.astype(jnp.float32)
-    return jnp.where(_resolved(grid, camera, slab_samples, nodes), count, 0).sum() > MIN_RESOLVED_SHARE * count.sum()
+    surplus = jnp.where(_resolved(grid, camera, slab_samples, nodes), 1 - MIN_RESOLVED_SHARE, -MIN_RESOLVED_SHARE)
+    return (surplus * grid.windows.count).sum() > 0
 
 
 def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, "slabs bundles"]:

@@ -9,6 +9,7 @@ uniform borders, so a range is read without a search.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -38,15 +39,14 @@ class SquaredSlopes:
 def squared_slopes(transfer: TransferFunction) -> SquaredSlopes:
     """The tables that `mean_square_slope` reads: made once, outside of loops."""
     segments = transfer.segments()
-    run = jnp.append(transfer.values[1:] - transfer.values[:-1], 0)
+    run = jnp.diff(transfer.values, append=transfer.values[-1:])
     change = jnp.where(run > 0, segments.change / jnp.where(run > 0, run, 1), 0) ** 2 * run
-    jumps = ((run <= 0) & (segments.change != 0).any(0)).astype(run.dtype)
-    added = jnp.append(change, jumps[None], 0)
-    cumulative = dataclasses.replace(segments, base=jnp.cumsum(added, 1) - added, change=added.at[-1].set(0))
+    jumps = ((run <= 0) & functools.reduce(jnp.logical_or, segments.change != 0)).astype(run.dtype)
+    added, moved = (jnp.stack([*change, last]) for last in (jumps, jnp.zeros_like(jumps)))
+    cumulative = dataclasses.replace(segments, base=jnp.cumsum(added, 1) - added, change=moved)
     first, last = transfer.values[0], transfer.values[-1]
-    borders = jnp.append(jnp.linspace(first, last, BUCKETS, endpoint=False)[1:], last)
+    borders = jnp.append(jnp.linspace(first, last, BUCKETS, endpoint=False)[1:], jnp.stack([last, last]))
     integral = jnp.pad(jnp.stack(look_up(cumulative, borders)), ((0, 0), (2, 0)))
-    integral = jnp.append(integral, integral[:, -1:], 1)
     width = (last - first) / BUCKETS
     return SquaredSlopes(first, jnp.where(width > 0, 1 / jnp.where(width > 0, width, 1), 0), integral)
 
@@ -63,12 +63,9 @@ def mean_square_slope(squares: SquaredSlopes, low: Array, high: Array) -> list[A
         place = jnp.where(squares.rate > 0, place, BUCKETS)  # of no width: all lies beyond
         return jnp.where(quantity < squares.start, 0, jnp.clip(place, 0, BUCKETS) + 1)  # in range even for NaN
 
-    def between(row: Array, first: Array, past: Array) -> tuple[Array, Array]:
-        upper, lower = (row.at[at].get(mode="promise_in_bounds") for at in (past, first))
-        return upper - lower, upper
-
-    always, lost = squares.rate >= 0, 4 * jnp.finfo(low.dtype).eps
-    first, past = fusion_barrier(always, lambda low, high: (bucket(low), bucket(high) + 1), low, high)
+    lost = 4 * jnp.finfo(low.dtype).eps
+    borders = fusion_barrier(squares.rate >= 0, lambda low, high: (bucket(low), bucket(high) + 1), low, high)
+    lower, upper = (squares.integral.at[:, at].get(mode="promise_in_bounds") for at in borders)
     extent = jnp.maximum(high - low, jnp.where(squares.rate > 0, 1 / squares.rate, 1))
-    *inside, (jumps, _) = (fusion_barrier(always, between, row, first, past) for row in squares.integral)
-    return [jnp.where(jumps > 0, jnp.inf, (sum_of + lost * upper) / extent) for sum_of, upper in inside]
+    *inside, jumps = upper - lower
+    return [jnp.where(jumps > 0, jnp.inf, (sum_of + lost * most) / extent) for sum_of, most in zip(inside, upper, strict=False)]

@@ -68,8 +68,8 @@ class Region:
 
 def region_of(grid: Grid, rows: int, columns: int, spacing: Spacing) -> Region:
     """From the first row and column of bundles on that any particle can touch."""
-    touched = grid.lists.end > grid.lists.start
-    row, column = (jnp.where(touched, side, side.max()).min() for side in (grid.row, grid.column))
+    touched, far = grid.lists.end > grid.lists.start, jnp.iinfo(jnp.int32).max  # none is inside of a region that begins there
+    row, column = jnp.where(touched, jnp.stack([grid.row, grid.column]), far).min(1)
     return Region(row, column, rows, columns, spacing)
 
 

@@ -152,4 +152,4 @@ def gather_subsampled(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTa
     few, entry = np.asarray(SUBSAMPLE), task.entry
     rays = NodeRays(task.u.T[few], task.v.T[few], task.depth.T)
     sums = gather_nodes(ordered, rank, (entry.begin, entry.length), rays, entry.references, task.perspective, kernel)
-    return sums_of(list(spread_subsamples(jnp.stack(sums.all), entry.count[0] >= 0)))
+    return sums_of(list(spread_subsamples(jnp.stack(sums.all))))

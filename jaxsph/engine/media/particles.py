@@ -28,7 +28,6 @@ from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, me
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.nodes import gather_subsampled
 from jaxsph.engine.field.scattered import gather_scattered
-from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
@@ -110,12 +109,10 @@ class ParticleMedium(Medium):
         dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
         if self.lattice is None or task.entry.method is None:
             return dense()
-        # a dummy has any method, and drops what it finds
-        method = jnp.where(task.slab < self.grid.windows.count.shape[0], task.entry.method, 0).max()
         interpolated = functools.partial(interpolate_slabs, self.lattice, self.grid, task)
-        by_level = [functools.partial(interpolated, level=level) for level in range(MAX_SPACING_LEVEL + 1)]
         subsampled = functools.partial(gather_subsampled, *particles, task, kernel=self.kernel)
-        return lax.switch(method, [dense, subsampled, *by_level])  # `schedule.DENSE`, `SUBSAMPLED`, `INTERPOLATED` and on
+        # by the first slab, which is no dummy: `schedule.DENSE`, `SUBSAMPLED`, and `INTERPOLATED` and on
+        return lax.switch(task.entry.method[0], [dense, subsampled, interpolated])
 
     def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
         """Extinction, and places in the transfer function."""
