@@ -6,7 +6,6 @@ import re
 import sys
 import threading
 from collections import OrderedDict
-from pathlib import Path
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 """Counts the programs that tests have JAX compile, or load from where they are kept: they are what takes the suite its time.
 
-The numbers do not depend on how fast the machine is. Single operations on arrays are programs too: each is compiled in a thirtieth
-of a second, and there can be thousands. `programs.json` beside the tests holds how many there may be in all, and for each test
+The numbers do not depend on how fast the machine is. Single operations on arrays are programs too: each is compiled in a
+thirtieth of a second, and there can be thousands. `programs.json` beside the tests holds how many there may be in all, and for each test
 file programs, operations and seconds of a run of the whole suite. `--hold-programs=FILE` fails a run that needs more than such a
 table has, `--programs=FILE` writes one. The files that took longest are run first.
 """
@@ -149,5 +149,5 @@ def pytest_terminal_summary(terminalreporter, config):
         for line in excess:
             terminalreporter.line(line)
         terminalreporter.line(
-            "Let new tests use the shapes of others (tests/conftest.py: Frames), and compute in NumPy; --programs=FILE tells more."
+            "Let new tests use the shapes of others (tests/conftest.py: Frames) and compute in NumPy; --programs=FILE tells more."
         )
