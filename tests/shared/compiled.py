@@ -1,9 +1,9 @@
 """Counts the programs that tests have JAX compile, or load from where they are kept: they are what takes the suite its time.
 
 The numbers do not depend on how fast the machine is. Single operations on arrays are programs too: each is compiled in a
-thirtieth of a second, and there can be thousands. `programs.json` beside the tests holds how many there may be in all, and for each test
-file programs, operations and seconds of a run of the whole suite. `--hold-programs=FILE` fails a run that needs more than such a
-table has, `--programs=FILE` writes one. The files that took longest are run first.
+thirtieth of a second, and there can be thousands. `programs.json` beside the tests holds how many there may be in all, and for
+each test file programs, operations and seconds of a run of the whole suite. `--hold-programs=FILE` fails a run that needs more
+than such a table has, `--programs=FILE` writes one. The files that took longest are run first.
 """
 
 from __future__ import annotations
