@@ -41,8 +41,8 @@ def built(centre, radius, live=None, **how):
     """A deep tree of few spheres, with room for any, such that looking it up is compiled a few times."""
     live = np.ones(len(radius), bool) if live is None else live
     tree = build_octree(centre, radius, live, **({"most": 2, "max_level": 4} | how))
-    node = jnp.pad(tree.node, ((0, NODES - len(tree.node)), (0, 0)))
-    return dataclasses.replace(tree, node=node, entry=jnp.pad(tree.entry, (0, ENTRIES - len(tree.entry))))
+    node = jnp.asarray(np.pad(np.asarray(tree.node), ((0, NODES - len(tree.node)), (0, 0))))
+    return dataclasses.replace(tree, node=node, entry=jnp.asarray(np.pad(np.asarray(tree.entry), (0, ENTRIES - len(tree.entry)))))
 
 
 def members(tree, begin, length):

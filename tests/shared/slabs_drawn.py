@@ -28,9 +28,9 @@ def drawn(rng, form):
     begin = np.stack([np.zeros(TASKS), rng.integers(10, 20, TASKS)]).astype(np.int32)
     length = np.stack([rng.integers(0, 10, TASKS), rng.integers(0, 10, TASKS)]).astype(np.int32)
     reference = rng.uniform(0, 1, TASKS)
-    zero = jnp.zeros(TASKS, jnp.int32)
+    zero = jnp.asarray(np.zeros(TASKS, np.int32))
     given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), (jnp.asarray(reference),)
-    entry = SlabSchedule(zero == 0, zero, *given)
+    entry = SlabSchedule(jnp.asarray(np.ones(TASKS, bool)), zero, *given)
     first = rng.uniform(NEAR, FAR, (TASKS, 1))
     depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
     count = COLUMNS if form != "scattered" else ROWS

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import hypothesis.extra.numpy as hnp
+import jax
 import numpy as np
 from examples import examples
 from hypothesis import given
 
 from jaxsph.engine.access.compaction import compact
 
+compacted_of = jax.jit(compact)
+
 
 @examples(30)
 @given(hnp.arrays(bool, (5, 7)))
 def test_layers_hold_the_nth_filled_item_of_every_bundle_in_order_of_height(filled):
     slabs, bundles = filled.shape
-    compacted = compact(filled)
+    compacted = compacted_of(filled)
     item, start, rank = (np.asarray(value) for value in (compacted.item, compacted.start, compacted.bundle_rank))
     height = filled.sum(0)
     assert sorted(rank) == list(range(bundles))

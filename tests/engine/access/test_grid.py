@@ -1,11 +1,13 @@
 """The promise of the sparse perspective grid: every sample with a positive weight finds its particle in its cell."""
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -20,7 +22,7 @@ def sample_depths(camera, samples, dtype):
     return camera.depth(jnp.arange(samples, dtype=dtype) + 0.5, samples).astype(dtype)
 
 
-@functools.partial(jax.jit, static_argnames="plan")
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
 def grid(particles, camera, plan):
     depths = sample_depths(camera, plan.samples, particles.dtype)
     viewed = view_particles(particles, camera, depths, plan.num_classes)
@@ -31,18 +33,20 @@ def grid(particles, camera, plan):
         lists,
         find_slab_windows(ordered, lists),
         bundle_origins(plan.lists, 0),
-        (ordered.left, ordered.right, ordered.top, ordered.bottom),
+        (
+            camera.to_view(particles.position),
+            depths,
+            camera.column(jnp.arange(camera.width, dtype=depths.dtype) + 0.5),
+            camera.row(jnp.arange(camera.height, dtype=depths.dtype) + 0.5),
+        ),
     )
 
 
-def weights(scene, camera, samples, dtype):
+def weights(particles, camera, seen):
     """Margin of every particle at every sample in the arithmetic of the march: (particles, rows, columns, samples)."""
-    x, y, z = (np.asarray(v) for v in jnp.moveaxis(camera.to_view(scene.particles.position), -1, 0))
-    h = np.asarray(scene.particles.support)
-    s = np.asarray(sample_depths(camera, samples, dtype))
+    position, s, u, v = map(np.asarray, seen)
+    (x, y, z), h = position.T, np.asarray(particles.support)
     spread = s if camera.is_perspective else np.ones_like(s)
-    u = np.asarray(camera.column(jnp.arange(camera.width, dtype=dtype) + 0.5))
-    v = np.asarray(camera.row(jnp.arange(camera.height, dtype=dtype) + 0.5))
     axes = (slice(None), None, None, None)
     dx = (spread * u[:, None] - x[axes]) / h[axes]
     dy = (spread * v[:, None, None] - y[axes]) / h[axes]
@@ -51,15 +55,13 @@ def weights(scene, camera, samples, dtype):
 
 
 def numbered(scene, dtype):
-    import dataclasses
-
     particles = scene.particles
-    return dataclasses.replace(particles, quantity=jnp.arange(particles.capacity, dtype=dtype))
+    return dataclasses.replace(particles, quantity=np.arange(particles.capacity, dtype=dtype))
 
 
 def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
     particles = numbered(scene, dtype)
-    ordered, lists, windows, (row, column), _ = grid(particles, camera, plan)
+    ordered, lists, windows, (row, column), seen = grid(particles, camera, plan)
     assert int(lists.faults) == 0
     number = np.asarray(ordered.quantity).astype(int)[np.asarray(lists.rank)]
     begin, length = np.asarray(windows.begin), np.asarray(windows.length)
@@ -67,7 +69,7 @@ def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
     for c, slab, bundle in np.argwhere(np.moveaxis(length, 0, 0) > 0):
         start = begin[c, slab, bundle]
         members[bundle, slab, number[start : start + length[c, slab, bundle]]] = True
-    positive = weights(scene, camera, plan.samples, dtype) > 0
+    positive = weights(particles, camera, seen) > 0
     positive &= np.asarray(particles.valid)[:, None, None, None]
     corner = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(row, column, strict=True))}
     for particle, r, c, k in np.argwhere(positive):
@@ -128,7 +130,7 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
     if where == "behind":
         position[:, 2] = -support * rng.uniform(0, 1, count)
     position[:, 0] *= -1  # x points left when looking along +z with y up
-    particles = js.Particles.from_arrays(position, support, 0.0)
+    particles = js.Particles.from_arrays(position, support, 0.0, capacity=count)
     transfer = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [1, 1])
     check_every_sample_finds_its_particles(js.Scene(particles=particles, transfer=transfer), camera, frames.plan(), np.float32)
 
@@ -137,10 +139,10 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
 def test_pixel_ranges_hold_every_ray_that_a_sphere_meets(frames, seed, decades, distance, projection):
     rng = np.random.default_rng(seed)
     scene, camera = frames.scene(rng, decades=decades), frames.camera(rng, projection, distance)
-    ordered, *_, ranges = grid(numbered(scene, np.float32), camera, frames.plan())
-    left, right, top, bottom = (np.asarray(end) for end in ranges)
+    ordered, *_, seen = grid(numbered(scene, np.float32), camera, frames.plan())
+    left, right, top, bottom = (np.asarray(getattr(ordered, side)) for side in ("left", "right", "top", "bottom"))
     number = np.asarray(ordered.quantity).astype(int)
-    hit = (weights(scene, camera, frames.samples, np.float32) > 0).any(-1)
+    hit = (weights(scene.particles, camera, seen) > 0).any(-1)
     for rank in np.flatnonzero(np.asarray(ordered.live)):
         rows, columns = np.nonzero(hit[number[rank]])
         assert np.all((columns >= left[rank]) & (columns <= right[rank]) & (rows >= top[rank]) & (rows <= bottom[rank]))
@@ -160,8 +162,6 @@ def test_lists_are_tight_for_particles_smaller_than_a_bundle(frames):
 
 @pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
 def test_a_full_capacity_is_a_fault_and_stays_in_bounds(frames, capacity):
-    import dataclasses
-
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
     small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 5}))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,6 +17,8 @@ from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.engine.runtime.tuning import CPU
+
+pytestmark = pytest.mark.usefixtures("quick_programs")
 
 
 @given(st.lists(st.integers(0, 2**32 - 1) | st.sampled_from([7, 1 << 16, (1 << 16) + 7]), max_size=40), st.integers(1, 3))
@@ -57,7 +58,7 @@ def both(scene, camera, lists, first_row=0, samples=24):
     for tuning in (dataclasses.replace(CPU, sorts_on_host=False), CPU):
         run = Clock()
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), tuning=tuning, **order)
-        found.append((ordered, run.with_host("grid", MAKE_GRID, (ordered, camera, jnp.int32(first_row)), tuning=tuning, **grid)))
+        found.append((ordered, run.with_host("grid", MAKE_GRID, (ordered, camera, np.int32(first_row)), tuning=tuning, **grid)))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ import jaxsph as js
 def mixed_up(particles, seed=0):
     """The same entries in any order, so that padding lies among particles."""
     order = np.random.default_rng(seed).permutation(particles.capacity)
-    return jax.tree.map(lambda column: column[order], particles)
+    return jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[order]), particles)
 
 
 def rows(particles):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from derivatives import QUICKLY
 from hypothesis import given
@@ -21,6 +20,11 @@ def looked_up(tree, x, y, z):
     return tree.leaf_at(coordinates), coordinates
 
 
+@jax.jit
+def any_in(tree, low, high):
+    return tree.occupancy.any_in(low, high)
+
+
 @in_both
 @given(seed=seeds, style=styles)
 @few
@@ -29,7 +33,7 @@ def test_the_leaf_of_a_point_has_every_sphere_that_the_point_is_in(seed, style, 
         centre, radius = spheres(seed, style, dtype)
         tree = built(centre, radius)
         at = probes(np.random.default_rng(seed), centre, radius, tree)
-        leaf, _ = looked_up(tree, *jnp.asarray(at).T)
+        leaf, _ = looked_up(tree, *at.T)
         has = members(tree, leaf.begin, leaf.length)
     exact = at.astype(np.float64)[:, None] - centre.astype(np.float64)
     touched = (exact**2).sum(-1) <= radius.astype(np.float64) ** 2
@@ -60,7 +64,7 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
         close = exact.astype(dtype)
         close = np.where(close.astype(np.float64) < exact, np.nextafter(close, dtype(np.inf)), close)
         tree = built(centre, np.where(kept, dtype(0.01), close))
-        leaf, _ = looked_up(tree, *jnp.asarray(at).T)
+        leaf, _ = looked_up(tree, *at.T)
         has = members(tree, leaf.begin, leaf.length)
     assert has[np.arange(SPHERES), np.arange(SPHERES)][free].all()
 
@@ -103,9 +107,9 @@ def test_cells_that_hold_any_of_a_sphere_are_occupied(seed, style):
     centre, radius = spheres(seed, style, np.float32)
     tree = built(centre, radius)
     at = probes(rng, centre, radius, tree)
-    coordinates = looked_up(tree, *jnp.asarray(at).T)[1]
-    macrocells = [np.clip(place, 0, 1 - 1e-6) * tree.occupancy_cells for place in coordinates]
-    occupied = np.asarray(tree.occupancy.any_in(macrocells, macrocells))
+    coordinates = looked_up(tree, *at.T)[1]
+    macrocells = [np.clip(np.asarray(place), 0, np.float32(1 - 1e-6)) * tree.occupancy_cells for place in coordinates]
+    occupied = np.asarray(any_in(tree, macrocells, macrocells))
     away = at.astype(np.float64)[:, None] - centre.astype(np.float64)
     touched = ((away**2).sum(-1) <= radius.astype(np.float64) ** 2).any(1)
     assert occupied[touched].all() and touched.any()
@@ -115,6 +119,6 @@ def test_empty_space_is_told():
     """Between two clusters, a corner of the box each."""
     ends = np.repeat([[0.0, 0, 0], [1, 1, 1]], SPHERES // 2, axis=0).astype(np.float32)
     tree = built(ends, np.full(SPHERES, 0.05, np.float32))
-    low, high = ([jnp.float32(part * tree.occupancy_cells) for part in corner] for corner in ((0.6, 0.1, 0.4), (0.7, 0.2, 0.6)))
-    assert not bool(tree.occupancy.any_in(low, high))
-    assert int(looked_up(tree, *jnp.full((3, 1), 0.5))[0].length[0]) == 0
+    corners = ([np.float32(part * tree.occupancy_cells) for part in corner] for corner in ((0.6, 0.1, 0.4), (0.7, 0.2, 0.6)))
+    assert not bool(any_in(tree, *corners))
+    assert int(looked_up(tree, *np.full((3, 1), 0.5, np.float32))[0].length[0]) == 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from octrees import SPHERES, built, members, spheres
@@ -10,6 +10,7 @@ from octrees import SPHERES, built, members, spheres
 from jaxsph.engine.access.octree import build_octree
 
 EVERY = np.ones(SPHERES, bool)
+leaf_at = jax.jit(lambda tree, place: tree.leaf_at(list(place)))
 
 
 def some():
@@ -39,7 +40,7 @@ def test_spheres_all_in_one_place_reach_the_maximal_level():
     centre[0] = 0
     tree = built(centre, radius, max_level=6)
     assert tree.levels == 6
-    leaf = tree.leaf_at(list((jnp.asarray(centre[1]) - tree.lower) / tree.side))
+    leaf = leaf_at(tree, (centre[1] - np.asarray(tree.lower)) / np.asarray(tree.side))
     assert members(tree, leaf.begin, leaf.length)[1:].all()
 
 
@@ -47,7 +48,7 @@ def test_spheres_all_in_one_place_reach_the_maximal_level():
 def test_where_no_sphere_is_live_leaves_are_empty(count):
     tree = built(np.ones((count, 3), np.float32), np.ones(count, np.float32), np.zeros(count, bool))
     assert not lengths(tree).any() and not np.asarray(tree.occupancy.before).any()
-    assert not int(tree.leaf_at([jnp.float32(0.5)] * 3).length)
+    assert not int(leaf_at(tree, np.full(3, 0.5, np.float32)).length)
 
 
 def test_spheres_that_are_no_spheres_are_left_out():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,29 +16,34 @@ from jaxsph.engine.control.adapt import ControlPlan
 MANY = 8
 
 
-@pytest.mark.parametrize("shards", [1, 2, 4, MANY])
-def test_what_is_dealt_out_is_put_back_in_its_place(shards):
-    bundles = {"last": np.arange(24.0).reshape(3, 8), "only": np.arange(8)}
-    dealt = [shard(bundles, nth, shards) for nth in range(shards)]
-    for nth, one in enumerate(dealt):
-        np.testing.assert_array_equal(one["last"], bundles["last"][:, nth::shards])
-    found = unshard(tuple(dealt))
-    for name, value in bundles.items():
-        np.testing.assert_array_equal(found[name], value)
+@jax.jit
+def there_and_back(bundles):
+    """Shards by their number, and what they are put together to."""
+    dealt = {shards: tuple(shard(bundles, nth, shards) for nth in range(shards)) for shards in (1, 2, 4, MANY)}
+    return dealt, {shards: unshard(parts) for shards, parts in dealt.items()}
 
 
-@pytest.mark.parametrize("axis", [0, 1, -1])
-def test_shards_are_put_back_along_any_axis(axis):
-    color = np.arange(8.0**3).reshape(8, 8, 8)
-    dealt = [np.moveaxis(np.moveaxis(color, axis, 0)[nth::MANY], 0, axis) for nth in range(MANY)]
-    np.testing.assert_array_equal(unshard(tuple(dealt), axis), color)
+def test_what_is_dealt_out_is_put_back_in_its_place():
+    bundles = {"last": np.arange(24, dtype=np.float32).reshape(3, 8), "only": np.arange(8)}
+    dealt, found = there_and_back(bundles)
+    for shards, parts in dealt.items():
+        for nth, one in enumerate(parts):
+            np.testing.assert_array_equal(one["last"], bundles["last"][:, nth::shards])
+        for name, value in bundles.items():
+            np.testing.assert_array_equal(found[shards][name], value)
+
+
+def test_shards_are_put_back_along_any_axis():
+    color, axes = np.arange(8.0**3, dtype=np.float32).reshape(8, 8, 8), (0, 1, -1)
+    dealt = [tuple(np.moveaxis(np.moveaxis(color, axis, 0)[nth::MANY], 0, axis) for nth in range(MANY)) for axis in axes]
+    for found in jax.jit(lambda dealt: [unshard(parts, axis) for parts, axis in zip(dealt, axes, strict=True)])(dealt):
+        np.testing.assert_array_equal(found, color)
 
 
 def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
     rng = np.random.default_rng(0)
     grid, _ = stages(frames.scene(rng).particles, frames.camera(rng), plan=frames.plan())
-    for nth in range(2):
-        found = shard_of_grid(grid, nth, 2)
+    for nth, found in enumerate(jax.jit(lambda grid: [shard_of_grid(grid, nth, 2) for nth in range(2)])(grid)):
         for name in ("row", "column"):
             np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(grid, name))[nth::2])
         for name in ("start", "end"):
@@ -60,7 +66,7 @@ def require_alike(images):
 
 @pytest.mark.core
 @pytest.mark.parametrize("tolerance", [None, 0.012])
-def test_two_shards_make_the_image_of_one(frames, on_cores, tolerance):
+def test_two_shards_make_the_image_of_one(frames, on_cores, tolerance, quick_programs):
     rng, images, frames = np.random.default_rng(2), [], frames.deep(4)
     scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
     settings = dataclasses.replace(frames.settings, tolerance=tolerance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ def members(grid):
     return [set(rank[a:b].tolist()) for a, b in zip(start, end, strict=True)]
 
 
+@pytest.mark.usefixtures("quick_programs")
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 @given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([1.0, 4.0]), distance=st.sampled_from([3.0, 0.8, 0.0001]))
 def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decades, distance):
@@ -51,7 +53,7 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
     for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
         size = {"samples": SAMPLES, "tuning": tuning}
         ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), slab_samples=4, between_samples=False, **size)
-        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, jnp.int32(0)), lists=lists, beside=False, **size)
+        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, np.int32(0)), lists=lists, beside=False, **size)
         assert int(grid.lists.faults) == 0
         found.append(members(grid))
     assert found[0] == found[1]
@@ -61,11 +63,18 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
         assert particle in found[0][corners[row // BUNDLE * BUNDLE, column // BUNDLE * BUNDLE]]
 
 
+@jax.jit
+def rays(camera, rows, columns):
+    """Depths of samples, and lateral coordinates of rays."""
+    depth = camera.depth(jnp.arange(SAMPLES, dtype=jnp.float32) + 0.5, SAMPLES)
+    return depth, camera.column(columns + 0.5), camera.row(rows + 0.5)
+
+
 def met(ordered, camera, rows, columns):
     """Whether the ray of a pixel has a sample in a support, in the arithmetic of the march: (rows, columns, particles)."""
-    s = np.asarray(camera.depth(jnp.arange(SAMPLES, dtype=jnp.float32) + 0.5, SAMPLES))[:, None]
+    s, u, v = map(np.asarray, rays(camera, np.float32(rows), np.float32(columns)))
+    s = s[:, None]
     spread = s if camera.is_perspective else np.ones_like(s)
-    u, v = np.asarray(camera.column(jnp.float32(columns) + 0.5)), np.asarray(camera.row(jnp.float32(rows) + 0.5))
     x, y, z, scale, size, live = (np.asarray(getattr(ordered, name)) for name in ("x", "y", "z", "scale", "size", "live"))
     across, down = ((spread * u[:, None, None] - x) * scale) ** 2, ((spread * v[:, None, None] - y) * scale) ** 2
     margin = size**2 - ((s - z) * scale) ** 2 - down[:, None] - across[None]

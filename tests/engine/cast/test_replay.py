@@ -19,13 +19,17 @@ SLABS, BUNDLES, SAMPLES, RAYS = 5, 331, 4, 64
 TOGETHER = Together.of(BUNDLES, CPU)
 
 
-def batch():
+@jax.jit
+def batch_of(filled):
     """One batch that holds all slabs, light of none, and where the layers begin."""
-    filled = jnp.asarray(np.random.default_rng(0).uniform(size=(SLABS, BUNDLES)) < 0.7)
     compacted, slots = compact(filled), SLABS * BUNDLES
     each = jnp.arange(slots)
     found = (each, each, each, jnp.int32(0), filled.sum(dtype=jnp.int32), jnp.int32(1))
     return empty_segments(slots + 1, SAMPLES, RAYS, jnp.float32), found, compacted.start
+
+
+def batch():
+    return batch_of(np.random.default_rng(0).uniform(size=(SLABS, BUNDLES)) < 0.7)
 
 
 def test_a_copy_in_a_loop_is_found():
@@ -35,12 +39,12 @@ def test_a_copy_in_a_loop_is_found():
         reversed_image = image[::-1]
         return image.at[k].set(reversed_image[k]) + reversed_image * (k > 3)
 
-    image = jnp.zeros((7, 8, 64))
+    image = np.zeros((7, 8, 64), np.float32)
     assert copies_in_loops(lambda image: jax.lax.fori_loop(0, 5, turn, image), (image,), image.shape) != []
 
 
 def test_compositing_copies_no_image():
-    rays = fresh_rays(BUNDLES, RAYS, jnp.float32, TOGETHER)
+    rays = jax.jit(lambda: fresh_rays(BUNDLES, RAYS, jnp.float32, TOGETHER))()
     borders = functools.partial(jnp.full, fill_value=0.0, dtype=jnp.float32)
 
     def put(rays, light, found, starts):
@@ -50,8 +54,8 @@ def test_compositing_copies_no_image():
 
 
 def test_pulling_back_copies_no_image():
-    image = jnp.zeros((3, BUNDLES, 8, 8)), jnp.ones((BUNDLES, 8, 8))
-    state = jax.jit(functools.partial(fresh_replay, together=TOGETHER))(image, image, jnp.arange(BUNDLES))
+    image = np.zeros((3, BUNDLES, 8, 8), np.float32), np.ones((BUNDLES, 8, 8), np.float32)
+    state = jax.jit(functools.partial(fresh_replay, together=TOGETHER))(image, image, np.arange(BUNDLES))
 
     def pull(state, light, found, starts):
         return pull_composite(state, (*light.color, light.transmittance), Batch(*found), starts, TOGETHER)

@@ -6,6 +6,7 @@ import functools
 
 import jax
 import numpy as np
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.bounds import Spheres, sample_bounds
@@ -15,19 +16,19 @@ RAYS = np.linspace(-0.1, 0.1, 8, dtype=np.float32)[:, None]
 BORDERS = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0], np.float32)[:, None]
 
 
-@functools.partial(jax.jit, static_argnums=7)
+@functools.partial(jax.jit, static_argnums=7, compiler_options=QUICKLY)
 def bounds_of(*given):
     *seen, transfer, subdivisions = given
     return sample_bounds(*seen, tables_of_parts(transfer), perspective=False, subdivisions=subdivisions)
 
 
 def bounds(*balls, subdivisions=2):
-    """Bounds of the four samples of one bundle of parallel rays, by balls (x, y, z, radius, quantity)."""
-    x, y, z, radius, quantity = (np.float32(column) for column in zip(*balls, strict=True))
+    """Bounds of the four samples of one bundle of parallel rays, by one or two balls (x, y, z, radius, quantity)."""
+    x, y, z, radius, quantity = np.float32([*balls, balls[0]][:2]).T  # of which a window may have the first alone
     spheres = Spheres(x, y, z, 1 / radius, 1 / radius, (quantity,))
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 0.5, 0]], [1.0, 3.0])
     window = np.zeros((1, 1), np.int32), np.full((1, 1), len(balls), np.int32)
-    rank, reference = np.arange(len(balls), dtype=np.int32), np.full(1, 0.5, np.float32)
+    rank, reference = np.arange(2, dtype=np.int32), np.full(1, 0.5, np.float32)
     return bounds_of(spheres, rank, window, (RAYS, RAYS), BORDERS, ((reference, reference),), transfer, subdivisions)
 
 

@@ -25,11 +25,11 @@ def found(relax):
     covered = touched & (rng.uniform(size=shape) < np.where(np.arange(BUNDLES) % 4 == 1, 0.8, 1))
     low = [rng.uniform(0, 0.5, shape) for _ in range(4)]
     high = [value + rng.uniform(0, 0.3, shape) for value in low]
-    low, high = ([jnp.asarray(value, jnp.float32) for value in side] for side in (low, high))
-    bounds = SampleBounds(jnp.asarray(touched), jnp.asarray(covered), low, high)
-    borders = jnp.broadcast_to(jnp.linspace(1, 2, CELL_SAMPLES + 1, dtype=jnp.float32)[:, None], (CELL_SAMPLES + 1, BUNDLES))
-    path, none = jnp.ones(BUNDLES, jnp.float32), jnp.zeros(BUNDLES, jnp.float32)
-    errors = errors_of(bounds, borders, path, path, (none, none), jnp.float32(relax))
+    low, high = ([np.float32(value) for value in side] for side in (low, high))
+    bounds = SampleBounds(touched, covered, low, high)
+    borders = np.tile(np.linspace(1, 2, CELL_SAMPLES + 1, dtype=np.float32)[:, None], BUNDLES)
+    path, none = np.ones(BUNDLES, np.float32), np.zeros(BUNDLES, np.float32)
+    errors = errors_of(bounds, borders, path, path, (none, none), np.float32(relax))
     return np.asarray(errors.error), np.asarray(errors.strict), (covered | ~touched).all(0)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.probe import MIN_PROMISING_SHARE, probe
@@ -19,13 +19,16 @@ def probed(frames, stages):
     """Which cells are promising, of particles with given quantities and a transfer function with given extinction."""
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng, decades=0.3), frames.camera(rng), frames.plan()
-    run = jax.jit(functools.partial(probe, slab_samples=4, cells_at_once=64))
+
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def run(grid, transfer, tolerance):
+        return probe(grid, tables_of_parts(transfer), tolerance, slab_samples=4, cells_at_once=64)
 
     def look(quantity, extinction, tolerance):
-        particles = js.Particles(**{**vars(scene.particles), "quantity": jnp.asarray(quantity, jnp.float32)})
+        particles = js.Particles(**{**vars(scene.particles), "quantity": np.float32(quantity)})
         transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [extinction, extinction])
         grid, _ = stages(particles, camera, plan=plan)
-        found = run(grid, tables_of_parts(transfer), jnp.float32(tolerance))
+        found = np.asarray(run(grid, transfer, np.float32(tolerance)))
         count = np.pad(np.asarray(grid.windows.count), ((0, -grid.windows.count.shape[0] % 4), (0, 0)))
         return found, count.reshape(-1, 4, count.shape[1]).sum(1)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 from jaxsph.engine.control.spacing import choose_spacing, second_differences
 from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
@@ -12,8 +13,8 @@ from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL
 NODE_SAMPLES = 2
 PLENTY = np.full(1, 1e6, np.float32)
 
-chosen = jax.jit(choose_spacing, static_argnums=3)
-bends = jax.jit(second_differences)
+chosen = jax.jit(choose_spacing, static_argnums=3, compiler_options=QUICKLY)
+bends = jax.jit(second_differences, compiler_options=QUICKLY)
 
 
 def test_straight_light_is_spaced_as_widely_as_groups_allow():

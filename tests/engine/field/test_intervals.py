@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +20,12 @@ SAMPLES = 5
 DEPTH = 2.0 + 0.3 * np.arange(SAMPLES)
 LINE = 0.7, -0.4  # a quantity that is linear along the ray: value at depth 0, and change a unit of depth
 intervals = jax.jit(intervals_of)
-means = jax.jit(lambda looks, made: means_of(MeanTables.of(looks.segments()), made, slice(0, 4)))
+
+
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def means(looks, made):
+    return means_of(MeanTables.of(looks.segments()), made, slice(0, 4))
+
 
 
 def field(depth):
@@ -34,9 +40,9 @@ def found(pieces, pivot):
     far = np.finfo(np.float32).max
     ends = np.array([piece or (far, -far) for piece in pieces])
     of_ends = np.where(np.abs(ends) < far, field(ends), 0)
-    cover = Cover(*(jnp.asarray(part, jnp.float32)[:, None, None] for part in (*ends.T, *of_ends.T)), jnp.full((1, 1), pivot))
-    quantity = jnp.asarray(np.where(inside, field(DEPTH), 0), jnp.float32)[None, :, None]
-    made = intervals(quantity, jnp.asarray(inside)[None, :, None], cover, jnp.asarray(DEPTH, jnp.float32)[None])
+    cover = Cover(*(np.float32(part)[:, None, None] for part in (*ends.T, *of_ends.T)), np.full((1, 1), pivot, np.float32))
+    quantity = np.float32(np.where(inside, field(DEPTH), 0))[None, :, None]
+    made = intervals(quantity, inside[None, :, None], cover, np.float32(DEPTH)[None])
     return [np.asarray(part)[0, :, 0] for part in made]
 
 
@@ -93,16 +99,16 @@ def test_what_is_inside_at_both_ends_is_so_all_along():
 
 def test_borders_that_the_cover_does_not_tell_count_half_of_an_interval():
     """Two gaps that end in one slab: the second is no border of a piece."""
-    inside = jnp.asarray([True, False, True, False, True])[None, :, None]
-    front, back = jnp.asarray([[1.0], [2.5]]), jnp.asarray([[2.1], [4.0]])
-    cover = Cover(*(part[..., None] for part in (front, back, 0 * front, 0 * back)), jnp.full((1, 1), DEPTH[1]))
-    share = np.asarray(intervals(jnp.ones((1, SAMPLES, 1)), inside, cover, jnp.asarray(DEPTH, jnp.float32)[None]).share)[0, :, 0]
+    inside = np.array([True, False, True, False, True])[None, :, None]
+    front, back = np.float32([[1.0], [2.5]]), np.float32([[2.1], [4.0]])
+    cover = Cover(*(part[..., None] for part in (front, back, 0 * front, 0 * back)), np.full((1, 1), DEPTH[1], np.float32))
+    share = np.asarray(intervals(np.ones((1, SAMPLES, 1), np.float32), inside, cover, np.float32(DEPTH)[None]).share)[0, :, 0]
     np.testing.assert_allclose(share, [(2.1 - 2.0) / 0.3, (2.6 - 2.5) / 0.3, 0.5, 0.5], atol=1e-5)
 
 
 def test_means_are_of_the_part_that_is_inside():
     looks = TransferFunction.from_points([0.0, 1.0], [[0, 0, 1.0], [1, 0, 0]], [0.0, 2.0])
-    near, far, share = (jnp.asarray(part, jnp.float32)[None, :, None] for part in ([0.0, 0.5], [1.0, 0.5], [0.25, 0.0]))
+    near, far, share = (np.float32(part)[None, :, None] for part in ([0.0, 0.5], [1.0, 0.5], [0.25, 0.0]))
     made = Intervals(near, far, share)
     red, green, blue, extinction = (np.asarray(mean)[0, :, 0] for mean in means(looks, made))
     np.testing.assert_allclose([red, green, blue, extinction], [[0.25 * 2 / 3, 0], [0, 0], [0.25 / 3, 0], [0.25, 0]], atol=1e-6)

@@ -1,7 +1,6 @@
 """Slabs of any fullness are looped over whole, each block once and in order."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from examples import examples
 from hypothesis import given
@@ -14,12 +13,17 @@ TASKS = 256
 
 
 def task_of(length):
-    count = jnp.asarray(length, jnp.int32)
-    entry = SlabSchedule(
-        count > 0, 0 * count, jnp.zeros((2, TASKS), jnp.int32), jnp.stack([count // 3, count - count // 3]), count, (0.0 * count,)
-    )
-    nothing = jnp.zeros((TASKS, 1))
+    count = np.asarray(length, np.int32)
+    of_both = np.zeros((2, TASKS), np.int32), np.stack([count // 3, count - count // 3])
+    entry = SlabSchedule(count > 0, 0 * count, *of_both, count, (np.zeros(TASKS, np.float32),))
+    nothing = np.zeros((TASKS, 1), np.float32)
     return SlabTask(entry, count, count, nothing, nothing, nothing, nothing, True)
+
+
+@jax.jit
+def turned(task):
+    """Of each turn its slabs, of which there are so many, and its blocks: the first, and the one behind the last."""
+    return [(turns.task.depth, turns.number, turns.begin, turns.end) for turns in task.turns(4, (4,))]
 
 
 @examples(20)
@@ -31,10 +35,10 @@ def test_each_block_of_each_slab_is_met_once_and_in_order(seed, sorted_first):
     ]
     length = sorted(length, reverse=True) if sorted_first else length
     met = [[] for _ in range(TASKS)]
-    for turns in task_of(length).turns(4, (4,)):
-        assert turns.task.depth.shape[0] == turns.number
-        for block in range(int(turns.begin), int(turns.end)):
-            for slab in range(turns.number):
+    for depth, number, begin, end in turned(task_of(length)):
+        assert depth.shape[0] == number
+        for block in range(int(begin), int(end)):
+            for slab in range(int(number)):
                 met[slab].append(block)
     for slab, blocks in enumerate(met):
         needed = -(-length[slab] // 4)
@@ -44,7 +48,7 @@ def test_each_block_of_each_slab_is_met_once_and_in_order(seed, sorted_first):
 
 def test_one_full_slab_does_not_keep_the_others_waiting():
     length = [1000] + [1] * (TASKS - 1)
-    looped = sum(turns.number * int(turns.end - turns.begin) for turns in task_of(length).turns(4, (4,)))
+    looped = sum(int(number) * int(end - begin) for _, number, begin, end in turned(task_of(length)))
     assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
     assert jax.tree.leaves(task_of(length).first(3))[0].shape == (3,)
     np.testing.assert_array_equal(task_of(length).first(2).entry.count, [1000, 1])

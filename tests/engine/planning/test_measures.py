@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -70,14 +70,17 @@ def test_nothing_seen_has_no_pairs_and_no_median():
     assert (found.rows, found.columns) == (1, 1) and np.isnan(found.diameter)
 
 
+counted_of = jax.jit(lambda count: counted(count, count.sum()))
+
+
 @pytest.mark.parametrize("over", [0, 1, 3])
 def test_a_sum_of_pairs_is_compared_exactly(over):
     """float32(117440515) is 117440512: a plan with room for that many dropped three without a word."""
     capacity = 117_440_512
-    count = jnp.full(8, capacity // 8, jnp.int32).at[3].add(over)
-    assert int(counted(count, count.sum())) == capacity + over
+    count = np.full(8, capacity // 8, np.int32)
+    count[3] += over
+    assert int(counted_of(count)) == capacity + over
 
 
 def test_a_sum_that_wraps_is_no_sum():
-    count = jnp.full(5, 1 << 30, jnp.int32)
-    assert int(counted(count, count.sum())) == -1
+    assert int(counted_of(np.full(5, 1 << 30, np.int32))) == -1

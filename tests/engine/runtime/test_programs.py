@@ -7,9 +7,10 @@ import warnings
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from jaxsph.engine.runtime import memory_maps
+from jaxsph.engine.runtime import memory_maps, programs
 from jaxsph.engine.runtime.executors import Clock, Forecast
 from jaxsph.engine.runtime.programs import Programs, compiled_quickly, shapes_of
 
@@ -31,12 +32,20 @@ def settle(value):
 
 @pytest.fixture(autouse=True)
 def no_traces():
+    """Nor what earlier tests have left: to collect it again and again is what would take long."""
     traces.clear()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+def ones(size, dtype=np.float32):
+    return np.ones(size, dtype)
 
 
 def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
     clock = Clock(Programs())
-    for value, wanted in ((jnp.ones(3), 1), (jnp.zeros(3), 1), (jnp.ones(4), 2), (jnp.ones(3, jnp.int32), 3), (jnp.ones(3), 3)):
+    for value, wanted in ((ones(3), 1), (0 * ones(3), 1), (ones(4), 2), (ones(3, np.int32), 3), (ones(3), 3)):
         assert clock.one("cast", double, (value,)).shape == value.shape
         assert len(traces) == wanted
 
@@ -44,38 +53,37 @@ def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
 def test_the_least_recently_used_programs_are_let_go():
     clock = Clock(Programs(most=2))
     for size in (1, 2, 1, 3, 1, 2):
-        clock.one("cast", double, (jnp.ones(size),))
+        clock.one("cast", double, (ones(size),))
     assert traces == [(1,), (2,), (3,), (2,)], "1 is used all the time and never compiled again"
 
 
 def test_programs_that_are_let_go_give_their_memory_maps_back():
     """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function."""
-    programs = Programs()
-    Clock(programs).one("cast", settle, (jnp.ones(5),))
-    programs.clear()
-    gc.collect()
+    kept = Programs()
+    Clock(kept).one("cast", settle, (ones(5),))
+    kept.clear()
     before = memory_maps.in_use() or 0
-    for size in range(10, 20):
-        Clock(programs).one("cast", settle, (jnp.ones(size),))
+    for size in range(10, 15):
+        Clock(kept).one("cast", settle, (ones(size),))
     held = (memory_maps.in_use() or 0) - before
-    programs.clear()
-    gc.collect()
+    kept.clear()
     left = (memory_maps.in_use() or 0) - before
-    assert held >= 10 * 3 or memory_maps.in_use() is None
+    assert held >= 5 * 3 or memory_maps.in_use() is None
     assert left <= held // 5
 
 
 def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch):
-    programs = Programs()
-    Clock(programs).one("cast", double, (jnp.ones(7),))
+    kept, let_go = Programs(), []
+    Clock(kept).one("cast", double, (ones(7),))
+    monkeypatch.setattr(programs, "_LET_GO", [lambda: let_go.append(len(kept))])  # instead of what others hold
     monkeypatch.setattr(memory_maps, "limit", lambda: 1)
     monkeypatch.setattr(memory_maps, "in_use", lambda: 1)
     with pytest.warns(UserWarning, match="memory maps"):
-        Clock(programs).one("cast", double, (jnp.ones(8),))
-    assert len(programs) == 1
+        Clock(kept).one("cast", double, (ones(8),))
+    assert len(kept) == 1 and let_go == [0], "those of caches go where those that are kept are not enough"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert float(Clock(programs).one("cast", double, (jnp.ones(9),)).sum()) == 18
+        assert float(Clock(kept).one("cast", double, (ones(9),)).sum()) == 18
 
 
 def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
@@ -87,17 +95,17 @@ def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_results_come_in_the_order_of_inputs(number):
     clock = Clock(Programs())
-    found = clock.each("cast", double, [(jnp.float32(k),) for k in range(number)])
+    found = clock.each("cast", double, [(np.float32(k),) for k in range(number)])
     assert [float(value) for value in found] == [2 * k for k in range(number)]
     assert clock.seconds["cast"] > 0 and clock.seconds["grid"] == 0
 
 
 def test_what_was_foreseen_is_not_compiled_again():
-    programs = Programs()
-    value = jnp.ones(6)
-    shape = Forecast(programs).one("cast", double, (Forecast(programs).one("cast", double, shapes_of((value,))),))
+    kept = Programs()
+    value = ones(6)
+    shape = Forecast(kept).one("cast", double, (Forecast(kept).one("cast", double, shapes_of((value,))),))
     assert shape.shape == (6,) and len(traces) == 1
-    clock = Clock(programs)
+    clock = Clock(kept)
     assert float(clock.one("cast", double, (clock.one("cast", double, (value,)),)).sum()) == 24
     assert len(traces) == 1
 
@@ -112,5 +120,5 @@ def test_a_program_that_cannot_be_compiled_is_tried_again():
 
     clock = Clock(Programs())
     with pytest.raises(RuntimeError, match="no luck"):
-        clock.one("cast", broken, (jnp.ones(3),))
-    assert clock.one("cast", broken, (jnp.ones(3),)).shape == (3,)
+        clock.one("cast", broken, (ones(3),))
+    assert clock.one("cast", broken, (ones(3),)).shape == (3,)

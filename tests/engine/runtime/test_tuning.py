@@ -60,7 +60,7 @@ def test_what_is_on_an_accelerator_is_tuned_for_one_and_may_take_half_of_it():
 SMALL = {"samples_at_once": 64, "samples_held": 256, "bundles_composited": 8, "half_depths_found": 4, "cells_of_nodes": 16}
 
 
-def test_how_much_is_done_at_once_changes_no_bit_of_few_particles(frames):
+def test_how_much_is_done_at_once_changes_no_bit_of_few_particles(frames, quick_programs):
     rng, images = np.random.default_rng(0), []
     scene, camera, usual = frames.scene(rng), frames.camera(rng), frames.plan()
     for tuning in (usual.cast.tuning, dataclasses.replace(usual.cast.tuning, **SMALL)):

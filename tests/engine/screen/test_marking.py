@@ -1,9 +1,10 @@
 """Marking: the worst leaves are found, and no more than were asked for."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +14,7 @@ from jaxsph.engine.screen.marking import FEWEST, Leaves, leaves_of, wanted_by, w
 from jaxsph.engine.screen.pyramid import places
 
 ALL = np.float32(1)
-SIDES = 8, 4, 2
+SIDES, STRIDE = (8, 4, 2), 4
 
 
 def some_leaves(seed, hidden=0.0):
@@ -27,21 +28,25 @@ def some_leaves(seed, hidden=0.0):
     return found
 
 
-@jax.jit
-def worst_of(arrays, number):
+def worst_of(arrays, number, share):
     """So many of the worst leaves, without their sides, which are not traced."""
-    return worst([Leaves(*some, side) for some, side in zip(arrays, SIDES, strict=True)], number, ALL)
+    return worst([Leaves(*some, side) for some, side in zip(arrays, SIDES, strict=True)], number, share)
+
+
+so_many = jax.jit(worst_of)
 
 
 def worst_some(leaves, number):
-    return worst_of([some[:-1] for some in leaves], np.int32(number))
+    return so_many([some[:-1] for some in leaves], np.int32(number), ALL)
 
 
-@jax.jit
-def looked_at(canvas, tolerance):
-    """What leaves of two sides say, and the pixels that splitting them asks for."""
+@functools.partial(jax.jit, static_argnums=0)
+def looked_at(shape, nodes, tolerance):
+    """What leaves of two sides say, the pixels that splitting them asks for, and those that are known."""
+    there = nodes.shape[:2]
+    canvas = of_lattice(shape, nodes, jnp.zeros(there), jnp.ones(there), STRIDE)
     leaves, quality = leaves_of(canvas, (4, 2), tolerance)
-    return [some.split for some in leaves], quality, wanted_by([some.split for some in leaves], canvas, (4, 2))
+    return [some.split for some in leaves], quality, wanted_by([some.split for some in leaves], canvas, (4, 2)), canvas.known
 
 
 def flat(marked):
@@ -60,21 +65,27 @@ def test_the_worst_leaves_are_so_many_and_none_that_is_left_is_worse(seed, numbe
         assert norm[marked].min() >= norm[candidates & ~marked].max()
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch, share):
+def holding(leaves):
+    """By the number of leaves that `FEWEST` is now."""
+    arrays, marked = [some[:-1] for some in leaves], jax.jit(functools.partial(worst_of, number=None))
+    return lambda share: flat(marked(arrays, share=np.float32(share)))
+
+
+def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch):
     monkeypatch.setattr("jaxsph.engine.screen.marking.FEWEST", 1)
     leaves = some_leaves(3)
-    marked = flat(worst(leaves, None, jnp.float32(share)))
-    candidates = flat([some.split for some in leaves])
+    marked_for, candidates = holding(leaves), flat([some.split for some in leaves])
     squares = flat([some.norm for some in leaves]) ** 2
-    held, total = squares[marked].sum(), squares[candidates].sum()
-    assert held >= share * total * (1 - 1e-5) and held - squares[marked].min() < share * total
+    for share in (0.1, 0.5, 0.9):
+        marked = marked_for(share)
+        held, total = squares[marked].sum(), squares[candidates].sum()
+        assert held >= share * total * (1 - 1e-5) and held - squares[marked].min() < share * total
 
 
 def test_a_stage_splits_all_where_there_are_few():
     leaves = some_leaves(4)
     assert sum(int(some.split.sum()) for some in leaves) < FEWEST
-    np.testing.assert_array_equal(flat(worst(leaves, None, jnp.float32(0.1))), flat([some.split for some in leaves]))
+    np.testing.assert_array_equal(holding(leaves)(0.1), flat([some.split for some in leaves]))
 
 
 def test_leaves_that_look_empty_compete_with_those_of_their_size():
@@ -85,21 +96,19 @@ def test_leaves_that_look_empty_compete_with_those_of_their_size():
     assert (flat(worst_some(alone, 1)) == flat([some.hidden for some in leaves])).all()  # nothing tells them apart
 
 
-def canvas_of(image, stride):
+def nodes_of(image):
     height, width = image.shape
     value = np.zeros((height, width, 6), np.float32)
     value[..., 0], value[..., 3] = image, 0.5
-    rows, columns = (places(size, stride) for size in image.shape)
-    nodes = jnp.asarray(value[np.ix_(rows, columns)])
-    return of_lattice(image.shape, nodes, jnp.zeros(nodes.shape[:2]), jnp.ones(nodes.shape[:2]), stride)
+    return value[np.ix_(*(places(size, STRIDE) for size in image.shape))]
 
 
 def test_a_linear_image_is_good_at_once_and_a_corner_is_split_where_it_is():
     rows, columns = np.mgrid[:33, :41].astype(np.float32)
-    linear, quality, _ = looked_at(canvas_of(0.01 * rows + 0.005 * columns, 4), np.float32(1e-3))
+    linear, quality, *_ = looked_at(rows.shape, nodes_of(0.01 * rows + 0.005 * columns), np.float32(1e-3))
     assert not flat(linear).any() and float(quality.over) == 0 and float(quality.l2) < 1e-6
-    canvas = canvas_of((columns > 20).astype(np.float32), 4)
-    leaves, quality, wanted = looked_at(canvas, np.float32(1e-3))
-    split, wanted = np.asarray(leaves[0]), np.asarray(wanted)
+    corner = nodes_of((columns > 20).astype(np.float32))
+    leaves, quality, wanted, known = jax.tree.map(np.asarray, looked_at(rows.shape, corner, np.float32(1e-3)))
+    split = leaves[0]
     assert float(quality.over) == split.sum() > 0 and split.any(0).sum() <= 4 and split.any(0)[5]
-    assert wanted.any() and not wanted[np.asarray(canvas.known)].any() and wanted[:, 22].any()
+    assert wanted.any() and not wanted[known].any() and wanted[:, 22].any()
