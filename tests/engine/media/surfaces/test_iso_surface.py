@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -83,23 +82,6 @@ def test_what_lies_in_front_is_seen_and_what_lies_behind_is_not():
     np.testing.assert_allclose(behind.color[middle], alone.color[middle], atol=1e-6)
     assert (np.abs(np.asarray(front.color - alone.color)[middle]) > 0.02).all()
     assert (np.asarray(front.alpha)[middle] == 1).all()
-
-
-@pytest.mark.slow
-def test_shading_has_derivatives_by_level_and_color():
-    view = camera("perspective", 8, 8)
-    plan = js.plan(js.Scene(media=(surface(),)), view, SETTINGS)
-
-    def light(level, color):
-        shown = dataclasses.replace(surface(), level=level, color=color)
-        return js.render(js.Scene(media=(shown,)), view, SETTINGS, plan=plan).color[3:5, 3:5].sum()
-
-    both, step = jax.jit(jax.value_and_grad(light, (0, 1))), 2e-3
-    level, color = jnp.float32(RADIUS), jnp.asarray(COLOR)
-    value, (of_level, of_color) = both(level, color)
-    wanted = (both(level + step, color)[0] - both(level - step, color)[0]) / (2 * step)
-    np.testing.assert_allclose(of_level, wanted, rtol=0.2, atol=0.02)
-    np.testing.assert_allclose((of_color * color).sum(), value, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -9,18 +9,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
+from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
+from jaxsph.numerics import faults
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 WIDTH, HEIGHT, AMBIENT = 16, 14, 0.2
 SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32
+ALL = js.Plane((0.0, 0.0, 9.0), (0.0, 0.0, -1.0))  # a clip of nothing, whose programs are those of one that cuts
 GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
 
 
@@ -68,11 +71,17 @@ def test_a_ball_is_in_its_place_without_holes_and_lit_by_its_gradient(projection
     assert image.stats["evaluations"] > 0
 
 
+def lit(level=0.45, **more):
+    """By a light that is far away."""
+    surface = js.Surface(level, color=(0.8, 0.6, 0.4), ambient=AMBIENT, light=np.array([0.3, 2.0, -1.0]))
+    return js.Scene(particles=ball(), surface=surface, **({"within": ALL} | more))
+
+
 @pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_a_light_far_away_lights_the_side_that_is_seen_by_the_cosine(projection):
-    light = np.array([0.3, 2.0, -1.0])
-    surface = js.Surface(0.45, color=(0.8, 0.6, 0.4), ambient=AMBIENT, light=light)
-    image, truth, both = check(js.Scene(particles=ball(), surface=surface), camera(projection))
+    scene = lit()
+    image, truth, both = check(scene, camera(projection))
+    light = np.asarray(scene.surface.light)
     towards = camera(projection).axes @ (light / np.linalg.norm(light))
     cosine = np.maximum(truth.normal @ np.asarray(towards), 0)  # from outside, the normal faces the eye
     wanted = (AMBIENT + (1 - AMBIENT) * cosine)[..., None] * np.array([0.8, 0.6, 0.4])
@@ -87,23 +96,23 @@ def test_in_double_precision_depths_are_good_to_many_digits(x64):
     assert image.depth.dtype == jnp.float64
 
 
-def test_jit_and_vmap_give_the_eager_picture_and_a_level_changes_without_compiling():
-    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45)), camera()
-    plan = js.plan(scene, view, SETTINGS)
+def test_a_lower_level_lies_farther_out_and_compiles_nothing(compiled):
+    high = js.render(lit(), camera(), SETTINGS).depth
+    compiled.clear()
+    low = js.render(lit(0.3), camera(), SETTINGS).depth
+    assert (np.asarray(low) <= np.asarray(high)).all() and not compiled
 
-    def draw(level):
-        return js.render(dataclasses.replace(scene, surface=js.Surface(level)), view, SETTINGS, plan=plan)
 
-    eager = js.render(scene, view, SETTINGS, plan=plan)
-    levels = jnp.asarray([0.45, 0.3], jnp.float32)
-    jitted = jax.jit(draw, compiler_options=QUICKLY)
-    alone, both = jitted(levels[0]), jax.jit(jax.vmap(draw), compiler_options=QUICKLY)(levels)
-    for image in (alone, jax.tree.map(lambda leaf: leaf[0], both)):
-        np.testing.assert_allclose(image.color, eager.color, atol=1e-5)
-        np.testing.assert_allclose(np.asarray(image.depth), eager.depth, atol=1e-6)
-    assert (np.asarray(both.depth[1]) <= np.asarray(both.depth[0])).all()  # the lower level lies farther out
-    assert int(both.faults[0]) == 0
-    assert jitted(jnp.asarray(jnp.nan, jnp.float32)).fault_messages[0].startswith("a surface must have a level")
+def test_a_level_that_makes_no_surface_is_a_fault_under_jit():
+    scene = lit()
+
+    @jax.jit
+    def word(level):
+        viewed = view_particles(scene.particles, camera(), jnp.linspace(1.2, 3.2, 40), 3)
+        surface = dataclasses.replace(scene.surface, level=level)
+        return ParticleSurface.seen(surface, scene.particles, viewed, None, None).faults()
+
+    assert [int(word(np.float32(level))) for level in (0.45, 0, -1, np.nan, np.inf)] == [0, *4 * [faults.BAD_SURFACE]]
 
 
 @pytest.mark.slow
@@ -139,7 +148,7 @@ CLIPS = {
 def test_a_clip_cuts_the_surface_and_closes_nothing(name):
     """At a face of the clip by the very ray; what lies behind is seen through the cut."""
     clip, inside = CLIPS[name]
-    scene = js.Scene(particles=ball(), surface=js.Surface(0.45), within=clip)
+    scene = lit(within=clip)
     _, truth, both = check(scene, camera(), within=inside)
     whole = crossing(dataclasses.replace(scene, within=None), camera()).depth
     assert (truth.depth[both] > whole[both] + 0.05).sum() > 20
@@ -154,8 +163,7 @@ def test_what_lies_in_front_is_seen_and_what_lies_behind_is_hidden():
         position = np.concatenate([grid, np.full((25, 1), z)], 1).astype(np.float32)
         return js.Points.from_arrays(position, np.full(25, 0.1), np.ones((25, 3)), np.full(25, 20.0))
 
-    alone = js.render(scene, view, SETTINGS)
-    front, behind = (js.render(dataclasses.replace(scene, points=sheet(z)), view, SETTINGS) for z in (-0.7, 0.7))
+    alone, front, behind = (js.render(dataclasses.replace(scene, points=sheet(z)), view, SETTINGS) for z in (9.0, -0.7, 0.7))
     hit = np.isfinite(np.asarray(alone.depth))
     assert np.asarray(front.color)[hit].max() > 0.05 and not np.asarray(behind.color)[hit].any()
     through = hit & (np.asarray(front.color).max(-1) < 0.45)

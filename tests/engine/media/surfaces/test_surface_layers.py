@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from jaxsph.reference.where import inside, to_world
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 LEVEL, OPACITY, AMBIENT, COLOR = 0.45, 0.35, 0.2, np.array([0.9, 0.6, 0.3])
-SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)  # of `test_particle_surface`, whose programs these share
+SETTINGS = js.Settings(samples=40)
 PLACES = 2000  # of each ray
 GRAZED = 3e-3  # of the level: a field that turns so near to it may be on either side
 
@@ -90,39 +89,39 @@ def test_droplets_between_samples_are_two_layers_each():
     """Three particles behind one another, each of which a ray enters and leaves between two samples."""
     view = camera()
     rays = rays_of(view, np.array([6]), np.array([9]))
-    position = to_world(rays.start + np.array([[1.7], [2.02], [2.31]]) * rays.direction, view)
-    drops = js.Particles.from_arrays(position, 0.1, np.zeros(3), 2e-4).padded(12)
-    image = js.render(js.Scene(particles=drops, surface=js.Surface(0.3, opacity=0.25)), view, COARSE)
+    depth = np.array([[1.7], [2.0], [2.3]])  # samples are 0.05 apart, and a droplet is half as wide
+    position = to_world(rays.start + depth * rays.direction, view)
+    drops = js.Particles.from_arrays(position, 0.1, np.zeros(3), 2e-4, "cubic_spline")
+    image = js.render(js.Scene(particles=drops, surface=js.Surface(0.48, opacity=0.25)), view, SETTINGS)
     np.testing.assert_allclose(np.asarray(image.transmittance)[6, 9], 0.75**6, rtol=1e-5)
 
 
-def test_one_opacity_of_one_is_the_opaque_surface_and_a_number_changes_without_compiling():
-    shown, view = scene(), camera()
-    opaque, clear = (dataclasses.replace(shown, surface=dataclasses.replace(shown.surface, opacity=one)) for one in (None, 1.0))
-    wanted, image = js.render(opaque, view, SETTINGS), js.render(clear, view, SETTINGS)
+def test_one_opacity_of_one_is_the_opaque_surface_and_a_number_changes_without_compiling(compiled):
+    shown = scene()
+
+    def of(opacity):
+        surface = dataclasses.replace(shown.surface, opacity=opacity)
+        return js.render(dataclasses.replace(shown, surface=surface), camera(), SETTINGS)
+
+    wanted, image = of(None), of(jnp.float32(1))
     np.testing.assert_allclose(image.color, wanted.color, atol=1e-5)
     np.testing.assert_array_equal(image.alpha, wanted.alpha)
     np.testing.assert_allclose(image.depth, wanted.depth, rtol=1e-6)
-    plan, compiled = js.plan(shown, view, SETTINGS), []
-
-    @jax.jit
-    def alpha(opacity):
-        compiled.append(opacity)
-        surface = js.Surface(LEVEL, opacity=opacity)
-        return js.render(dataclasses.replace(shown, surface=surface), view, SETTINGS, plan=plan).alpha
-
+    compiled.clear()
     met = np.isfinite(np.asarray(wanted.depth))
-    thin, thick = (np.asarray(alpha(jnp.float32(opacity))) for opacity in (0.1, 0.6))
-    assert len(compiled) == 1 and (thin[met] < thick[met]).all() and not thin[~met].any()
+    thin, thick = (np.asarray(of(jnp.float32(opacity)).alpha) for opacity in (0.1, 0.6))
+    assert not compiled and (thin[met] < thick[met]).all() and not thin[~met].any()
 
 
 def test_what_lies_behind_shines_through_and_points_that_are_exported_are_of_the_first_layer():
     grid = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 5), np.linspace(-0.6, 0.6, 5)), -1).reshape(-1, 2)
     sheet = js.Points.from_arrays(np.c_[grid, np.full(25, 0.8)].astype(np.float32), 0.25, np.ones((25, 3)), np.full(25, 50.0))
-    view = camera()
-    alone, lit = js.render(scene(), view, SETTINGS), js.render(scene(points=sheet), view, SETTINGS)
-    behind = js.render(js.Scene(points=sheet), view, SETTINGS)
+    unmet = dataclasses.replace(scene().surface, level=1e3)
+    scenes = scene(), scene(points=sheet), dataclasses.replace(scene(points=sheet), surface=unmet)
+    alone, lit, behind = (js.render(one, camera(), SETTINGS) for one in scenes)
+    assert not np.asarray(behind.normal).any() and np.asarray(behind.alpha).max() > 0.9
     through = np.asarray(alone.transmittance)[..., None] * np.asarray(behind.color)
     np.testing.assert_allclose(np.asarray(lit.color), np.asarray(alone.color) + through, atol=2e-3)
     opaque = dataclasses.replace(scene(), surface=js.Surface(LEVEL))
-    np.testing.assert_array_equal(js.surface_depth(scene(), view, SETTINGS).depth, js.surface_depth(opaque, view, SETTINGS).depth)
+    depths = [js.surface_depth(one, camera(), SETTINGS).depth for one in (scene(), opaque)]
+    np.testing.assert_array_equal(*depths)
