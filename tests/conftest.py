@@ -28,7 +28,7 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory_maps, programs
 
-pytest_plugins = ["compiled", "core", "share"]
+pytest_plugins = ["by_reference", "compiled", "core", "share"]
 
 # `dev` tries other examples each time, and what failed before first; `ci` the same ones; `nightly` (`--hypothesis-profile`) ten
 # times as many.

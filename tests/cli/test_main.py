@@ -1,7 +1,6 @@
 """The command line: what it writes, what it says, and how it refuses."""
 
 import argparse
-import dataclasses
 import subprocess
 import sys
 import warnings
@@ -30,22 +29,6 @@ def file(tmp_path, monkeypatch):
     columns = {"temperature": position[:, 0], "pressure": position[:, 1] ** 2, "support": np.full(60, 0.8, np.float32)}
     np.savez(path, position=position, **columns)
     return path
-
-
-@pytest.fixture
-def by_reference(monkeypatch):
-    """Images that commands ask for are made by the reference renderer, which compiles nothing; what is asked of it."""
-    asked = []
-
-    def render(scene, camera, settings, **_):
-        asked.append(settings)
-        image = js.reference.render(scene, camera, dataclasses.replace(settings, tolerance=None))
-        certified = {} if settings.tolerance is None else {"error_bound": np.full(image.shape, 0.003), "certified": True}
-        seconds = {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}
-        return dataclasses.replace(image, stats={"seconds": seconds, **image.stats}, **certified)
-
-    monkeypatch.setattr(js, "render", render)
-    return asked
 
 
 def test_a_draft_takes_a_quarter_of_the_samples_and_what_is_known_of_errors_is_said(file, by_reference, capsys):

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import json
-import os
 import re
 import signal
 import subprocess
@@ -17,7 +16,7 @@ from PIL import Image as Pillow
 
 pytest.importorskip("websockets", reason="the extra `view` is not installed")
 import browser as browsers
-from derivatives import QUICKLY
+import by_reference
 
 import jaxsph as js
 
@@ -28,14 +27,12 @@ SECONDS = 120
 
 
 @contextlib.contextmanager
-def served(*more, of=(f"scene:radial:particles={PARTICLES}",)):
-    """A view that is served, as the command line does it: its address."""
-    words = [*of, "--size", f"{SIZE[0]}x{SIZE[1]}", "--samples", str(SAMPLES)]
+def served(*more, of=(f"scene:radial:particles={PARTICLES}",), size=SIZE):
+    """A view that is served, as the command line does it, with pictures of the reference: its address."""
+    words = [*of, "--size", f"{size[0]}x{size[1]}", "--samples", str(SAMPLES)]
     more = ["--integrator", "samples", "--no-browser", "-q", *more]
-    quickly = " ".join(f"--{name}={str(value).lower()}" for name, value in QUICKLY.items())
-    environment = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {quickly}".strip()}
-    command = [sys.executable, "-m", "jaxsph", "view", *words, *more]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
+    command = [sys.executable, by_reference.__file__, "view", *words, *more]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     yield process.stdout.readline().strip()
     process.send_signal(signal.SIGINT)
     try:
@@ -91,12 +88,13 @@ def shown(page):
 
 
 def rendered(page):
-    """What `jaxsph.render` makes of the same view, by the code that the page tells, (H, W, 3)."""
+    """What is made of the same view by the code that the page tells, (H, W, 3)."""
     page.ask("document.querySelector('button[title=\"Python and command\"]').click()")
     code = page.until("document.querySelector('.code').textContent").partition("\n\n")[2]
     page.ask("document.querySelector('dialog[open] button').click(), document.querySelector('.code').textContent = ''")
     space = {}
-    exec(code.replace('image.save("view.png")', ""), space)
+    with by_reference.pictures_by_reference():
+        exec(code.replace('image.save("view.png")', ""), space)
     return space["image"].to_uint8()
 
 
@@ -104,9 +102,9 @@ def near(picture, other):
     return np.abs(picture.astype(int) - other.astype(int)).max() <= 1
 
 
-def test_what_stands_still_is_what_render_makes(page):
+def test_what_stands_still_is_the_picture(page):
     scene, camera = js.scenes.load("radial", PARTICLES, width=SIZE[0], height=SIZE[1])
-    image = js.render(scene, camera, js.Settings(samples=SAMPLES))
+    image = by_reference.render(scene, camera, js.Settings(samples=SAMPLES))
     assert near(shown(page), image.to_uint8()) and image.to_uint8().max() > 100
     assert page.ask("document.querySelector('.status').innerText").replace("\n", " ").startswith(f"full {SIZE[0]} x {SIZE[1]}")
     assert page.ask("document.querySelectorAll('.editor .absorbed').length") in (0, 64)
@@ -169,7 +167,7 @@ def test_a_norm_is_chosen_and_the_address_holds_it(page):
 
 
 def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
-    with served("--surface", "0.2") as address, opened(browser, address) as page:
+    with served("--surface", "0.2", size=(32, 24)) as address, opened(browser, address) as page:
         assert shown(page).max() > 100
         said = page.ask("document.querySelector('.panel').innerText.toLowerCase()")
         assert "colour and opacity" not in said and "thinner" not in said and "extinction" not in said

@@ -1,12 +1,15 @@
-"""A view without anybody who shows it: inputs coalesce, what is old is abandoned, and pictures are those of `jaxsph.render`."""
+"""A view without anybody who shows it: inputs coalesce, and what is old is abandoned; its pictures are of the reference."""
 
 import dataclasses
 import shlex
 import threading
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from views import HEIGHT, SETTINGS, WIDTH, camera, compiles, scene
+from by_reference import pictures_by_reference
+from views import HEIGHT, SETTINGS, WIDTH, as_it_began, camera, same, scene
 
 import jaxsph as js
 from jaxsph.cli.options import values
@@ -23,40 +26,16 @@ pytestmark = pytest.mark.usefixtures("quick_programs")
 SECONDS = 240
 
 
-def same(image, other):
-    names = ("color", "transmittance", "depth")
-    return all(np.array_equal(np.asarray(getattr(image, name)), np.asarray(getattr(other, name))) for name in names)
-
-
 @pytest.fixture(scope="module")
 def session():
-    with Session(scene(), camera(), SETTINGS) as made:
+    with pictures_by_reference(), Session(scene(), camera(), SETTINGS) as made:
         yield made
 
 
 @pytest.fixture
 def home(session):
-    """The session, as it began."""
     yield session
-    session.do({"do": "reset_look"})
-    session.do({"do": "cut", "kind": "off"})
-    session.do({"do": "home"})
-
-
-def test_the_last_picture_of_a_view_is_that_of_render_bit_for_bit(home):
-    picture = home.wait(seconds=SECONDS)
-    assert picture.final and picture.stage == FULL and picture.image.shape == (HEIGHT, WIDTH)
-    assert same(picture.image, js.render(scene(), camera(), SETTINGS))
-    for message in (
-        {"do": "orbit", "right": 0.2, "down": -0.1},
-        {"do": "zoom", "factor": 1.7, "right": 0.2},
-        {"do": "roll", "degrees": 20},
-    ):
-        home.do(message)
-    picture, state = home.wait(seconds=SECONDS), home.snapshot()
-    assert picture.version == state.version and picture.camera.near is None
-    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
-    assert not same(picture.image, js.render(scene(), camera(), SETTINGS))
+    as_it_began(session)
 
 
 def test_every_frame_says_what_it_is_and_how_wrong(home):
@@ -79,45 +58,6 @@ def test_every_frame_says_what_it_is_and_how_wrong(home):
     assert draft.encoded[:2] == b"\xff\xd8" and full.encoded[:4] == b"\x89PNG"
 
 
-def test_nothing_compiles_after_the_first_drag_and_the_first_edit(home):
-    home.do({"do": "orbit", "right": 0.1, "down": 0})
-    home.wait(seconds=SECONDS)
-    rows = home.state()["look"]["points"]
-    rows[1][1] *= 2
-    home.do({"do": "points", "points": rows})
-    home.wait(seconds=SECONDS)
-    compiled = compiles()
-    for turn in range(4):
-        home.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
-        home.do({"do": "points", "points": [*rows, [0.3, turn, 0.1, 0.2, 0.3]][turn % 2 :]})
-        home.wait(seconds=SECONDS)
-    assert not compiled
-
-
-def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(home, tmp_path, monkeypatch):
-    home.do({"do": "cut", "kind": "plane"})
-    home.do({"do": "orbit", "right": 0.1, "down": 0})
-    whole, picture, state = js.render(scene(), home.snapshot().camera, SETTINGS), home.wait(seconds=SECONDS), home.snapshot()
-    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS)) and not same(picture.image, whole)
-    compiled = compiles()
-    for share in (-0.3, 0.2, -2.0, 2.0, 0.1):
-        home.do({"do": "cut", "share": share})
-        home.do({"do": "orbit", "right": 0.1, "down": 0})
-        picture = home.wait(seconds=SECONDS)
-        assert share < 2 or float(np.asarray(picture.image.transmittance).min()) == 1  # nothing is left
-    home.do({"do": "cut", "follows": False})
-    home.do({"do": "orbit", "right": 0.1, "down": 0})
-    for name in ("share", "tip"):
-        home.do({"do": "grip", "name": name, "right": 0.03, "down": 0.05})
-        picture, before = home.wait(seconds=SECONDS), picture
-        assert not same(picture.image, before.image)
-    assert not compiled
-    monkeypatch.chdir(tmp_path)
-    space = {"scene": scene(), "camera": None}
-    exec(home.code()["python"], space)
-    assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6
-
-
 def test_the_command_of_a_cut_has_all_clips(tmp_path):
     held = dataclasses.replace(scene(), within=js.Sphere((0, 0, 0), 0.75))
     made = Session(held, camera(), SETTINGS, Source(file="a.npz", words=("--width", "2", "--clip", "none")))
@@ -135,22 +75,26 @@ def test_the_command_of_a_cut_has_all_clips(tmp_path):
     assert "--width" not in words and "none" not in words and words[4].startswith("--target=")
 
 
+def signature(scene):
+    """What programs are compiled for."""
+    leaves, structure = jax.tree.flatten(scene)
+    return structure, [(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+
+
 @pytest.fixture(scope="module")
-def laid():
-    """A session whose look has room for a norm, which it keeps."""
+def laid(session):
+    """A session whose look has room for a norm, which it keeps; its pictures are of the reference as long as the other one is."""
     with Session(scene(), camera(), SETTINGS) as made:
         yield made
 
 
 @pytest.mark.parametrize("norm", ["log", "symlog", "equalised"])
-def test_code_and_look_of_a_norm_make_the_same_picture_and_no_edit_of_it_compiles(laid, tmp_path, monkeypatch, norm):
+def test_code_and_look_of_a_norm_make_the_same_picture_and_no_edit_of_it_needs_a_program(laid, tmp_path, monkeypatch, norm):
     laid.do({"do": "norm", "name": norm})
-    laid.wait(seconds=SECONDS)
-    compiled = compiles()
-    rows = laid.state()["look"]["points"]
+    before, rows = signature(laid.snapshot().scene), laid.state()["look"]["points"]
     laid.do({"do": "points", "points": [[0.31, 2.0, 0.1, 0.2, 0.3], *rows[1:]]})
     picture = laid.wait(seconds=SECONDS)
-    assert not compiled
+    assert signature(laid.snapshot().scene) == before
     monkeypatch.chdir(tmp_path)
     space = {"scene": scene(), "camera": camera()}
     exec(laid.code()["python"], space)

@@ -4,7 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from by_reference import DEPTHS, pictures_by_reference
 from commanded import run
+from surfaced import crossing
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
@@ -33,7 +35,7 @@ def surfaced(split=False):
 
 @pytest.fixture(scope="module")
 def session():
-    with Session(surfaced(), camera(), SETTINGS, Source("# a file", "drop.ply", ("drop.ply",))) as made:
+    with pictures_by_reference(), Session(surfaced(), camera(), SETTINGS, Source("# a file", "drop.ply", ("drop.ply",))) as made:
         yield made
 
 
@@ -54,11 +56,12 @@ def test_pictures_are_those_of_render_and_say_what_they_are(session):
 def test_a_pixel_has_its_depth_and_normal_and_where_there_is_no_surface_says_so(session):
     session.do({"do": "home"})
     session.wait(seconds=SECONDS)
-    told, seen = session.do({"do": "pick", "right": 0.0, "down": 0.0}), js.surface_depth(surfaced(), camera(), SETTINGS)
-    at = HEIGHT // 2, WIDTH // 2
-    np.testing.assert_allclose(told["place"], seen.position[at], atol=1e-5)
-    np.testing.assert_allclose(told["normal"], seen.normal[at], atol=1e-3)
-    assert told["depth"] == float(seen.depth[at]) and told["quantity"] == pytest.approx(seen.quantity[at], abs=1e-4)
+    told, seen = session.do({"do": "pick", "right": 0.0, "down": 0.0}), crossing(surfaced(), camera(), samples=DEPTHS)
+    at, (right, up, ahead) = (HEIGHT // 2, WIDTH // 2), np.asarray(camera().axes, np.float64)
+    depth, (u, v) = seen.depth[at], float(camera().half_height) / HEIGHT * np.float64([1, -1])
+    np.testing.assert_allclose(told["place"], camera().exact_eye() + depth * (ahead + u * right + v * up), atol=1e-5)
+    np.testing.assert_allclose(told["normal"], seen.normal[at] @ [right, up, ahead], atol=1e-3)
+    assert told["depth"] == pytest.approx(depth) and told["quantity"] == pytest.approx(seen.quantity[at], abs=1e-4)
     nothing = session.do({"do": "pick", "right": 0.7, "down": -0.45})
     assert nothing["surface"] and "place" not in nothing and "normal" not in nothing
 

@@ -2,42 +2,16 @@
 
 import dataclasses
 import threading
-import time
 
 import numpy as np
 import pytest
-from views import SETTINGS, camera, compiles, scene
+from by_reference import pictures_by_reference
+from views import NUMBER, SECONDS, SETTINGS, asked, camera, scene, sequence, until
 
-import jaxsph as js
 from jaxsph.viewer.code import Source
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.timeline import Frame, Timeline, timeline_of
-
-pytestmark = pytest.mark.usefixtures("quick_programs")
-
-SECONDS = 240
-NUMBER = 5
-
-
-def sequence(folder, wrong=(3,)):
-    """Files of a ball that moves, some of which are none."""
-    for number in range(NUMBER):
-        path = folder / f"s_{number}.npz"
-        position = np.asarray(scene().particles.position) + np.float32(0.1 * number)
-        columns = {"support": np.full(80, 0.4, np.float32), "heat": position[:, 0], "id": np.arange(80)}
-        np.savez(path, position=position, time=0.5 * number, **columns)
-        if number in wrong:
-            path.write_bytes(path.read_bytes()[:99])
-    paths = sorted(folder.glob("s_*.npz"))
-    return js.sequence.Snapshots.from_files(paths, "heat", transfer=scene().transfer, strict=False)
-
-
-def until(happens):
-    end = time.monotonic() + SECONDS
-    while not happens():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
@@ -45,34 +19,9 @@ def sequenced(tmp_path_factory):
     """A view of a sequence, and its folder."""
     folder = tmp_path_factory.mktemp("sequence")
     first, timeline = timeline_of(sequence(folder))
-    with Session(first, camera(), SETTINGS, timeline=timeline) as session:
+    with pictures_by_reference(), Session(first, camera(), SETTINGS, timeline=timeline) as session:
         session.wait(seconds=SECONDS)
         yield session, folder
-
-
-def asked(session, number):
-    session.do({"do": "frame", "number": number})
-    until(lambda: session.state()["frames"]["number"] == number)
-    return session.wait(seconds=SECONDS)
-
-
-def test_a_frame_is_shown_with_the_look_the_camera_and_the_cut_and_compiles_nothing(sequenced):
-    session, _ = sequenced
-    session.do({"do": "orbit", "right": 0.1, "down": 0})
-    session.do({"do": "exposure", "stops": 1})
-    session.do({"do": "cut", "kind": "plane"})
-    before, place = session.wait(seconds=SECONDS), session.snapshot()
-    compiled = compiles()
-    picture, state = asked(session, 1), session.snapshot()
-    assert not compiled
-    assert state.pose is place.pose and np.array_equal(state.scene.transfer.extinction, place.scene.transfer.extinction)
-    assert np.allclose(np.asarray(state.scene.particles.position)[:80], np.asarray(scene().particles.position) + 0.1, atol=1e-6)
-    assert not np.array_equal(picture.image.color, before.image.color)
-    expected = js.render(state.scene, state.camera, SETTINGS)
-    assert np.array_equal(np.asarray(picture.image.color), np.asarray(expected.color))
-    session.do({"do": "cut", "kind": "off"})
-    session.do({"do": "reset_look"})
-    session.do({"do": "home"})
 
 
 def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):

@@ -7,6 +7,7 @@ import time
 
 import browser as browsers
 import pytest
+from by_reference import pictures_by_reference
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
@@ -62,9 +63,10 @@ class Notebook:
 
 @pytest.fixture(scope="module")
 def widget():
-    made = js.view(scene(), camera(), SETTINGS)
-    yield made
-    made.close()
+    with pictures_by_reference():
+        made = js.view(scene(), camera(), SETTINGS)
+        yield made
+        made.close()
     assert not made.session._listeners
 
 

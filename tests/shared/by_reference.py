@@ -1,0 +1,85 @@
+"""Stands in for the renderer where a test is about what is around it: pictures by the float64 reference, which compiles nothing.
+
+Also a program: `by_reference.py view FILE ...` is a command whose pictures are made so, in a process of its own.
+"""
+
+import contextlib
+import dataclasses
+import sys
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from surfaced import crossing
+
+import jaxsph as js
+from jaxsph.cli.main import main
+from jaxsph.model.camera.snug import with_depths
+from jaxsph.viewer import stages
+
+DEPTHS = 200  # along a ray, between which a surface is looked for
+BOUND = 0.003  # of the error of what was asked for with a tolerance
+
+
+class Roomy:
+    """A plan that has room for everything."""
+
+    choices = None
+
+    def serves(self, _: Any) -> bool:
+        return True
+
+
+def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, **_: Any) -> js.Image:
+    """As `jaxsph.render`; between two bands somebody may leave it."""
+    settings = js.Settings() if settings is None else settings
+    if progress is not None:
+        progress(1, 2)
+    plainly = dataclasses.replace(settings, tolerance=None)
+    image = _surface(scene, camera) if scene.surface is not None else js.reference.render(scene, camera, plainly)
+    certified = {} if settings.tolerance is None else {"error_bound": np.full(image.shape, BOUND), "certified": True}
+    seconds = {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}
+    return dataclasses.replace(image, stats={"seconds": seconds, **image.stats}, **certified)
+
+
+def _surface(scene: Any, camera: Any) -> js.Image:
+    """In colours without light and shade, and opaque."""
+    found, look = crossing(scene, with_depths(camera, scene), samples=DEPTHS), scene.transfer
+    met = np.isfinite(found.depth)
+    colors = np.asarray(look.colors, np.float64).T
+    color = np.stack([np.interp(found.quantity, np.asarray(look.values, np.float64), one) for one in colors], -1)
+    none = np.zeros(met.shape)
+    layers = np.where(met[..., None], color, 0), np.where(met, 0.0, 1.0), found.depth, none, none
+    counts = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0}
+    return js.Image(*layers, True, 0, counts, normal=np.where(met[..., None], found.normal, 0))
+
+
+@contextlib.contextmanager
+def pictures_by_reference() -> Iterator[None]:
+    """Those of `jaxsph.render`, as users and commands call it, and of an interactive view."""
+    with (
+        mock.patch.object(js, "render", render),
+        mock.patch.object(stages, "render", render),
+        mock.patch.object(stages, "plan", lambda *_, **__: Roomy()),
+    ):
+        yield
+
+
+@pytest.fixture
+def by_reference() -> Iterator[list[Any]]:
+    """Pictures are made by the reference; the settings that they were asked for with."""
+    asked: list[Any] = []
+
+    def recorded(scene: Any, camera: Any, settings: Any = None, **more: Any) -> js.Image:
+        asked.append(settings)
+        return render(scene, camera, settings, **more)
+
+    with pictures_by_reference(), mock.patch.object(js, "render", recorded):
+        yield asked
+
+
+if __name__ == "__main__":
+    with pictures_by_reference():
+        sys.exit(main())
