@@ -22,12 +22,10 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source, command_of, python_of
 from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking, quantity_of
 from jaxsph.viewer.cut import Cut, asked, read
-from jaxsph.viewer.grips import pulled
-from jaxsph.viewer.grips import told as outline
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
 from jaxsph.viewer.pose import Pose
 
-OTHERS = ("fit", "home", "center", "cut", "grip", "restore", "key", "unkey")
+OTHERS = ("fit", "home", "center", "cut", "restore", "key", "unkey")
 """What can be done besides motions and edits of the look."""
 QUIET = ("key", "unkey")
 """What changes no picture."""
@@ -113,7 +111,6 @@ class State:
             "edited": self.edited,
             "moved": self.moved,
             "cut": None if self.cut is None else self.cut.told(),
-            "outline": None if self.cut is None else outline(self.cut, self.pose),
             "keys": len(self._keys),
         }
 
@@ -155,8 +152,6 @@ class State:
             self._move(self.pose.centred(seen(message)))
         elif name == "cut":
             self._cut(asked(self.cut, message, self.pose))
-        elif name == "grip":
-            self._cut(pulled(self.cut, message, self.pose))
         elif name == "key":
             self._keep()
         elif name == "unkey":
