@@ -156,18 +156,6 @@ def test_opacity_takes_a_shape_whose_colours_stay(page):
     assert near(shown(page), before)
 
 
-def test_a_norm_is_chosen_and_the_address_holds_it(page):
-    before = shown(page)
-    choose = "(() => { const of = document.querySelector('select[aria-label^=norm]');"
-    choose += " of.value = 'equalised'; of.dispatchEvent(new Event('change')); })()"
-    changed(page, lambda: page.ask(choose))
-    after = shown(page)
-    assert not near(before, after) and near(after, rendered(page))
-    page.until("decodeURIComponent(location.hash).includes('equalised')")
-    changed(page, lambda: page.ask("document.querySelector('button[title=\"undo (u)\"]').click()"))
-    assert near(shown(page), before) and page.ask("document.querySelector('select[aria-label^=norm]').value") == "given"
-
-
 def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
     with served("--surface", "0.2") as address, opened(browser, address) as page:
         assert shown(page).max() > 100

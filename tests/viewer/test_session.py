@@ -133,31 +133,6 @@ def test_the_command_of_a_cut_has_all_clips(tmp_path):
     assert "--width" not in words and "none" not in words and words[4].startswith("--target=")
 
 
-@pytest.fixture(scope="module")
-def laid():
-    """A session whose look has room for a norm, which it keeps."""
-    with Session(scene(), camera(), SETTINGS) as made:
-        yield made
-
-
-@pytest.mark.parametrize("norm", ["log", "symlog", "equalised"])
-def test_code_and_look_of_a_norm_make_the_same_picture_and_no_edit_of_it_compiles(laid, tmp_path, monkeypatch, norm):
-    laid.do({"do": "norm", "name": norm})
-    laid.wait(seconds=SECONDS)
-    compiled = compiles()
-    rows = laid.state()["look"]["points"]
-    laid.do({"do": "points", "points": [[0.31, 2.0, 0.1, 0.2, 0.3], *rows[1:]]})
-    picture = laid.wait(seconds=SECONDS)
-    assert not compiled
-    monkeypatch.chdir(tmp_path)
-    space = {"scene": scene(), "camera": camera()}
-    exec(laid.code()["python"], space)
-    assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6
-    laid.transfer.save(tmp_path / "look.json")
-    again = dataclasses.replace(scene(), transfer=js.TransferFunction.load(tmp_path / "look.json"))
-    assert same(picture.image, js.render(again, camera(), SETTINGS))
-
-
 def test_a_look_is_edited_and_taken_back(home):
     before = np.asarray(home.transfer.extinction)
     assert len(before) == 8  # four points, and room
