@@ -8,8 +8,12 @@ from commanded import run
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
+from jaxsph.analysis.at_places import ParticleField
 from jaxsph.cli.commands import view as cli_view
+from jaxsph.model.scene import widened
 from jaxsph.model.transfer.domains import Scale
+from jaxsph.reference.chords import rays_of
+from jaxsph.reference.where import to_world
 from jaxsph.viewer.code import Source
 from jaxsph.viewer.explained import histogram_of
 from jaxsph.viewer.inputs import InputError
@@ -54,11 +58,14 @@ def test_pictures_are_those_of_render_and_say_what_they_are(session):
 def test_a_pixel_has_its_depth_and_normal_and_where_there_is_no_surface_says_so(session):
     session.do({"do": "home"})
     session.wait(seconds=SECONDS)
-    told, seen = session.do({"do": "pick", "right": 0.0, "down": 0.0}), js.surface_depth(surfaced(), camera(), SETTINGS)
+    told, image = session.do({"do": "pick", "right": 0.0, "down": 0.0}), js.render(surfaced(), camera(), SETTINGS)
     at = HEIGHT // 2, WIDTH // 2
-    np.testing.assert_allclose(told["place"], seen.position[at], atol=1e-5)
-    np.testing.assert_allclose(told["normal"], seen.normal[at], atol=1e-3)
-    assert told["depth"] == float(seen.depth[at]) and told["quantity"] == pytest.approx(seen.quantity[at], abs=1e-4)
+    rays, field = rays_of(camera(), *np.reshape(at, (2, 1))), ParticleField(widened(surfaced()).particles)
+    place = to_world(rays.start + float(image.depth[at]) * rays.direction, camera())
+    np.testing.assert_allclose(told["place"], place[0], atol=1e-5)
+    np.testing.assert_allclose(told["normal"], image.normal[at], atol=1e-3)
+    assert told["depth"] == float(image.depth[at])
+    assert told["quantity"] == pytest.approx(field.at(place).quantity[0], abs=1e-4)
     nothing = session.do({"do": "pick", "right": 0.7, "down": -0.45})
     assert nothing["surface"] and "place" not in nothing and "normal" not in nothing
 
