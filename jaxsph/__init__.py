@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.project import project
     from jaxsph.analysis.resample import resample
     from jaxsph.analysis.slices import slice
-    from jaxsph.analysis.surface_depth import surface_depth
     from jaxsph.analysis.visibility import visibility_histogram
     from jaxsph.engine.access.morton import prepare
     from jaxsph.engine.frame.progressive import progressive
@@ -70,7 +69,6 @@ __all__ = [
     "scenes",
     "sequence",
     "slice",
-    "surface_depth",
     "sweep",
     "view",
     "visibility_histogram",
@@ -102,7 +100,6 @@ NAMES = {
     "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",
     "slice": "jaxsph.analysis.slices:slice",
-    "surface_depth": "jaxsph.analysis.surface_depth:surface_depth",
     "resample": "jaxsph.analysis.resample:resample",
     "explain": "jaxsph.analysis.explanation.explain:explain",
     "view": "jaxsph.viewer.widget:view",

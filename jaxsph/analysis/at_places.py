@@ -1,6 +1,6 @@
 r"""What particles are at any places in space, in float64: field, coverage, its gradient, and who makes it (host side).
 
-Flow: Particles, places -> [at_places] -> depths of surfaces, pixels explained, the view.
+Flow: Particles, places -> [at_places] -> pixels explained, the view.
 
 $C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field.
 """

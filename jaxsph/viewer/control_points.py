@@ -2,23 +2,21 @@
 
 Flow: TransferFunction, edits -> [look] -> TransferFunction of as many points, so that no edit compiles anything.
 
-A function with room is padded by its last point: equal neighbours change no picture. Points lie at places 0 to 1 of an axis: that
-of the function that the view began with, or one that a norm lays over the same range. A function is linear in Q between its
-control points; so that it is linear on the axis of a norm, it has more of them than are shown, at even places.
+A function with room is padded by its last point: equal neighbours change no picture. Points lie at places 0 to 1 of the axis
+of the function that the view began with.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer.domains import DOMAINS, Scale, control_values
+from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import POINTS, colormap
+from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.checks import array_of
 
 ROOMS = (8, 16, 32, 64, 128, 256)
@@ -28,10 +26,6 @@ MAX_STEPS = 200
 TOP = 4.0
 """Largest extinction of an editor, over the largest that the view began with."""
 MAX_STOPS = 10.0
-GIVEN = "given"
-NORMS = (GIVEN, *DOMAINS)
-CLOSE = 0.1  # of the way between even places: a point that is so near to one stands for it
-FINE = 4 * (POINTS - 1) + 1  # values that an axis without a formula is known by, those of a map's points among them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +47,6 @@ class ControlPoints:
         points: ascending by place, at least one; None is the function as it was given.
         capacity: points that there is room for.
         flat: whether they are of colours alone, as those of a surface, which is opaque.
-        norm: which laid the scale, one of `NORMS`.
-        quantity: values that a norm may need, once it does; None where there are none.
     """
 
     first: TransferFunction
@@ -62,16 +54,15 @@ class ControlPoints:
     points: tuple[Point, ...] | None = None
     capacity: int = 0
     flat: bool = False
-    norm: str = GIVEN
-    quantity: Callable[[], Any] = lambda: None
 
     @classmethod
-    def of(cls, transfer: TransferFunction, *, flat: bool = False, quantity: Callable[[], Any] = lambda: None) -> ControlPoints:
+    def of(cls, transfer: TransferFunction, *, flat: bool = False) -> ControlPoints:
         """That of a function; where it is to be `flat`, of its colours."""
         if flat:
             transfer = dataclasses.replace(transfer, extinction=array_of(np.ones_like(transfer.values)), extinction_values=None)
+        values = transfer.values if transfer.extinction_values is None else transfer.extinction_values
         room = room_for(len(transfer.extinction) + SPARE)
-        return cls(transfer, _scale_of(transfer), None, room, flat, quantity=quantity)
+        return cls(transfer, Scale.of(np.asarray(values, np.float64)), None, room, flat)
 
     @property
     def is_split(self) -> bool:
@@ -104,31 +95,11 @@ class ControlPoints:
         if not 1 <= len(points) <= ROOMS[-1]:
             raise ValueError(f"a look has 1 to {ROOMS[-1]} control points, got {len(points)}")
         ordered = tuple(sorted(points, key=lambda point: point.place))
-        room = room_for(len(ordered) + (POINTS if self._is_bent else 0))
-        return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room))
+        return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
 
     def as_given(self) -> ControlPoints:
         """The function that the view began with."""
-        return dataclasses.replace(self, points=None, norm=GIVEN, scale=_scale_of(self.first))
-
-    def normed(self, norm: str) -> ControlPoints:
-        """At the same places of the axis that a norm lays over the range that the view began with.
-
-        `log` begins at the least positive value where that range does not, and `percentile` has a range of its own.
-
-        Raises:
-            ValueError: the norm needs values that there are not, as `log` positive ones.
-        """
-        if norm == GIVEN:
-            scale = _scale_of(self.first)
-        else:
-            low, high = _scale_of(self.first).value(np.array([0.0, 1.0])).tolist()
-            ends = {} if norm == "percentile" else {"high": high} if norm == "log" and low <= 0 else {"low": low, "high": high}
-            needed = norm == "equalised" or len(ends) < 2
-            values = control_values(norm, self.quantity() if needed else None, points=FINE, **ends)
-            name = {"linear": "linear", "percentile": "linear", "log": "log"}.get(norm, "even")
-            scale = Scale(name, values if name == "even" else values[[0, -1]])
-        return dataclasses.replace(self, norm=norm, scale=scale).edited(list(self.shown))
+        return dataclasses.replace(self, points=None)
 
     def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
@@ -153,17 +124,10 @@ class ControlPoints:
         if self.points is None:
             return self._with_room()
         rows = np.array([(point.place, point.extinction, *point.color) for point in self.points])
-        if self._is_bent:
-            rows = _with_even_places(rows)
         values = self.scale.value(rows[:, 0])
         if self.is_split:
             return self._with_room(extinction_values=values, extinction=rows[:, 1])
         return self._with_room(values=values, extinction=rows[:, 1], colors=rows[:, 2:])
-
-    @property
-    def _is_bent(self) -> bool:
-        """Whether a norm laid the axis such that a line on it is none in Q."""
-        return self.norm != GIVEN and self.scale.name != "linear"
 
     def _with_room(self, **given: np.ndarray) -> TransferFunction:
         """The function with those control points; host arrays become the device's once they are of one shape."""
@@ -183,7 +147,7 @@ class ControlPoints:
         rows = [[point.place, point.extinction, *point.color, value] for point, value in zip(shown, values, strict=True)]
         ends = self.scale.value(np.linspace(0, 1, 5)).tolist()
         kind = {"split": self.is_split, "flat": self.flat}
-        return {"points": rows, "top": self.top, "scale": self.scale.name, "norm": self.norm, "ticks": ends, **kind}
+        return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, **kind}
 
 
 class Steps:
@@ -215,28 +179,6 @@ class Steps:
 def room_for(points: int) -> int:
     """The smallest room."""
     return next((room for room in ROOMS if room >= points), points)
-
-
-def _scale_of(transfer: TransferFunction) -> Scale:
-    values = transfer.values if transfer.extinction_values is None else transfer.extinction_values
-    return Scale.of(np.asarray(values, np.float64))
-
-
-def _with_even_places(rows: np.ndarray) -> np.ndarray:
-    """Rows of place and what is there, with those at even places between the first and the last where no row is close by."""
-    places, even = rows[:, 0], np.linspace(0, 1, POINTS)
-    far = (np.abs(even[:, None] - places) > CLOSE / (POINTS - 1)).all(1)
-    new = even[far & (even > places[0]) & (even < places[-1])]
-    more = np.stack([new, *(np.interp(new, places, column) for column in rows[:, 1:].T)], 1)
-    found = np.concatenate([rows, more])
-    return found[np.argsort(found[:, 0], kind="stable")]
-
-
-def quantity_of(scene: Scene) -> np.ndarray | None:
-    """Values of what is edited, of particles those of extinction where there are two; None of what has none."""
-    if scene.transfer is not None and scene.particles is not None:
-        return np.asarray(scene.particles.quantities[-1])[np.asarray(scene.particles.valid)]
-    return np.asarray(scene.volumes[0][0].values) if scene.volumes else None
 
 
 def first_look(scene: Scene) -> TransferFunction | None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from jaxsph.viewer.control_points import NORMS, ControlPoints, Point, Steps
+from jaxsph.viewer.control_points import ControlPoints, Point, Steps
 from jaxsph.viewer.pose import Pose
 
 MAX_SHARE, MAX_FACTOR, MAX_DEGREES = 100.0, 100.0, 3600.0
@@ -71,11 +71,6 @@ MOTIONS: dict[str, Callable[[Pose, dict[str, Any]], Pose]] = {
 """What moves the camera, and needs nothing but the pose."""
 
 
-def _points(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
-    look = look.normed(word(said, "norm", NORMS)) if "norm" in said else look
-    return look.edited(points_of(said))
-
-
 def _colormap(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
     name = said.get("name")
     if not isinstance(name, str) or len(name) > 100:
@@ -84,10 +79,9 @@ def _colormap(look: ControlPoints, said: dict[str, Any]) -> ControlPoints:
 
 
 EDITS: dict[str, Callable[[ControlPoints, dict[str, Any]], ControlPoints]] = {
-    "points": _points,
+    "points": lambda look, said: look.edited(points_of(said)),
     "colormap": _colormap,
     "exposure": lambda look, said: look.exposed(number(said, "stops", -10, 10)),
-    "norm": lambda look, said: look.normed(word(said, "name", NORMS)),
     "reset_look": lambda look, said: look.as_given(),
 }
 """What changes the look."""

@@ -136,12 +136,6 @@ class Pose:
         scale = 2 * self.tangent * (depth if self.perspective else self.distance)
         return self.eye + depth * self.axes[2] + scale * (right * self.axes[0] - down * self.axes[1])
 
-    def seen_at(self, place: np.ndarray) -> np.ndarray:
-        """(..., 3) where places are seen, right and down in shares of the picture's height from its middle, and their depths."""
-        right, up, depth = np.moveaxis((place - self.eye) @ self.axes.T, -1, 0)
-        scale = 2 * self.tangent * (np.where(depth == 0, np.inf, depth) if self.perspective else self.distance)
-        return np.stack([right / scale, -up / scale, depth], -1)
-
     def told(self) -> dict[str, Any]:
         """As numbers for JSON, from which `read` makes it again."""
         vectors = {name: getattr(self, name).tolist() for name in ("target", "pole")}

@@ -20,14 +20,12 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source, command_of, python_of
-from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking, quantity_of
+from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking
 from jaxsph.viewer.cut import Cut, asked, read
-from jaxsph.viewer.grips import pulled
-from jaxsph.viewer.grips import told as outline
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
 from jaxsph.viewer.pose import Pose
 
-OTHERS = ("fit", "home", "center", "cut", "grip", "restore", "key", "unkey")
+OTHERS = ("fit", "home", "center", "cut", "restore", "key", "unkey")
 """What can be done besides motions and edits of the look."""
 QUIET = ("key", "unkey")
 """What changes no picture."""
@@ -54,8 +52,7 @@ class State:
         look = first_look(scene)
         self._given, self._first = camera, Pose.of(camera, scene)
         self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
-        points = None if look is None else ControlPoints.of(look, flat=is_flat(scene), quantity=lambda: quantity_of(scene))
-        self._steps = None if points is None else Steps(points)
+        self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
         self._base, self._keys = scene, []  # type: Scene, list[tuple[Camera, np.ndarray]]
         self.scene = self._looked()
 
@@ -113,7 +110,6 @@ class State:
             "edited": self.edited,
             "moved": self.moved,
             "cut": None if self.cut is None else self.cut.told(),
-            "outline": None if self.cut is None else outline(self.cut, self.pose),
             "keys": len(self._keys),
         }
 
@@ -155,8 +151,6 @@ class State:
             self._move(self.pose.centred(seen(message)))
         elif name == "cut":
             self._cut(asked(self.cut, message, self.pose))
-        elif name == "grip":
-            self._cut(pulled(self.cut, message, self.pose))
         elif name == "key":
             self._keep()
         elif name == "unkey":
@@ -168,9 +162,7 @@ class State:
             pose.camera(1, 1)  # before the look changes
             cut = read(message["cut"]) if "cut" in message else self.cut
             if message.get("points") is not None and self._steps is not None:
-                self._edit(
-                    self._steps, {"do": "points", **{name: message[name] for name in ("points", "norm") if name in message}}
-                )
+                self._edit(self._steps, {"do": "points", "points": message["points"]})
             self._move(pose)
             self._cut(None if cut is None else cut.seen_from(pose))
         else:

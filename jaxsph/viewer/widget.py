@@ -21,7 +21,7 @@ from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.timeline import timeline_of
 
-MODULES = ("made", "moves", "editor", "cut", "grips", "time", "view", "notebook")
+MODULES = ("made", "moves", "editor", "cut", "time", "view", "notebook")
 """Of the page, each after those that it imports."""
 IMPORT = re.compile(r'^import \{([^}]*)\} from "\./(\w+)\.js";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const) (\w+))", re.MULTILINE)

@@ -206,33 +206,6 @@ def test_a_surface_with_what_it_does_not_have_is_wrong_usage(command, words, mat
     assert code == 2 and match in err[-1]
 
 
-def test_points_of_a_surface_are_written_as_ply_and_said(asked, capsys):
-    words = ["drop.npz", "--surface", "0.2", "--size", "8x8", "--samples", "8", "-o", "points.ply"]
-    code, out, err = run(capsys, "render", *words)
-    assert (code, err) == (0, [])
-    found = js.surface_depth(*io.read_scene("drop.npz", surface=0.2, size=(8, 8)), js.Settings(samples=8))
-    count = int(found.met.sum())
-    assert count > 4 and f"points.ply, {count} of 64 rays meet the surface" in " ".join(out.split())
-    table = io.read_table("points.ply")
-    np.testing.assert_array_equal(table.position, found.position[found.met])
-    assert {"n", "quantity"} <= {name.lower() for name in table.columns} and not asked
-
-
-@pytest.mark.parametrize(
-    ("words", "match"),
-    [
-        ([], "points.ply holds points of a surface, and drop.npz is shown as a medium; add --surface"),
-        (["--surface", "--background", "white"], "--background is of pictures"),
-        (["--surface", "--from-disk", "1"], "--from-disk is of pictures"),
-        (["--surface", "--tile", "1/2"], "--tile is of pictures"),
-        (["other.npz", "--surface"], "points.ply is one picture, but there are 2"),
-    ],
-)
-def test_points_of_what_has_none_are_wrong_usage(words, match, asked, capsys):
-    code, _, err = run(capsys, "render", "drop.npz", *words, "--size", "8x8", "-o", "points.ply")
-    assert code == 2 and match in err[-1] and not Path("points.ply").exists()
-
-
 def test_even_particles_of_other_kinds_of_files_are_a_medium(asked, capsys):
     places, speed = of_lattice()
     np.savez("even.npz", position=places, speed=speed)

@@ -154,18 +154,6 @@ def test_opacity_takes_a_shape_whose_colours_stay(page):
     assert near(shown(page), before)
 
 
-def test_a_norm_is_chosen_and_the_address_holds_it(page):
-    before = shown(page)
-    choose = "(() => { const of = document.querySelector('select[aria-label^=norm]');"
-    choose += " of.value = 'equalised'; of.dispatchEvent(new Event('change')); })()"
-    changed(page, lambda: page.ask(choose))
-    after = shown(page)
-    assert not near(before, after) and near(after, rendered(page))
-    page.until("decodeURIComponent(location.hash).includes('equalised')")
-    changed(page, lambda: page.ask("document.querySelector('button[title=\"undo (u)\"]').click()"))
-    assert near(shown(page), before) and page.ask("document.querySelector('select[aria-label^=norm]').value") == "given"
-
-
 def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
     with served("--surface", "0.2", size=(32, 24)) as address, opened(browser, address) as page:
         assert shown(page).max() > 100
@@ -249,30 +237,6 @@ def test_a_cut_is_chosen_moved_and_turned_and_the_address_holds_it(page):
         changed(page, lambda key=key: page.key(key))
     changed(page, lambda: page.key("h"))
     assert near(shown(page), whole) and page.ask("document.querySelector('input[aria-label^=place]').offsetParent === null")
-
-
-@pytest.mark.parametrize(("presses", "kind", "name"), [(1, "plane", "share"), (2, "box", "middle"), (3, "sphere", "share")])
-def test_a_grip_of_the_cut_is_pulled_and_the_camera_stays(page, presses, kind, name):
-    page.ask("document.querySelector('.picture').focus()")
-    for _ in range(presses):
-        changed(page, lambda: page.key("x"))
-    grip = f".grip[data-name={name}]"
-    first, eye = shown(page), "document.querySelector('.triad').innerHTML"
-    axes, (x, y) = page.ask(eye), page.middle(grip)
-    changed(
-        page, lambda: page.drag([(x, y), (x + 20, y), (x + 40, y)] if kind != "plane" else [(x, y), (x, y + 30), (x, y + 60)])
-    )
-    after = shown(page)
-    assert not near(first, after) and near(after, rendered(page)) and page.ask(eye) == axes
-    if kind != "plane":
-        assert page.middle(grip) == pytest.approx((x + 40, y), abs=0.6)
-    page.ask(f"document.querySelector('{grip}').focus()")
-    before = page.ask("document.querySelector('.outline path').getAttribute('d')")
-    changed(page, lambda: page.key("ArrowDown" if kind == "plane" else "ArrowRight"))
-    assert page.ask("document.querySelector('.outline path').getAttribute('d')") != before and page.ask(eye) == axes
-    for key in ["x"] * (4 - presses) + ["h"]:  # which a grip hands on, and then the picture that has its focus
-        changed(page, lambda key=key: page.key(key))
-    assert page.ask("document.querySelector('.outline').hasAttribute('hidden') && document.activeElement.className") == "picture"
 
 
 def test_a_picture_is_saved_and_the_address_holds_the_view(page, browser):

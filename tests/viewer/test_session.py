@@ -4,12 +4,10 @@ import dataclasses
 import shlex
 import threading
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from by_reference import pictures_by_reference
-from views import HEIGHT, SETTINGS, WIDTH, as_it_began, camera, same, scene
+from views import HEIGHT, SETTINGS, WIDTH, as_it_began, camera, scene
 
 import jaxsph as js
 from jaxsph.cli.options import values
@@ -73,35 +71,6 @@ def test_the_command_of_a_cut_has_all_clips(tmp_path):
     exec(line, space)
     assert np.array_equal(space["scene"].within.contains(places), clip.contains(places))
     assert "--width" not in words and "none" not in words and words[4].startswith("--target=")
-
-
-def signature(scene):
-    """What programs are compiled for."""
-    leaves, structure = jax.tree.flatten(scene)
-    return structure, [(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
-
-
-@pytest.fixture(scope="module")
-def laid(session):
-    """A session whose look has room for a norm, which it keeps; its pictures are of the reference as long as the other one is."""
-    with Session(scene(), camera(), SETTINGS) as made:
-        yield made
-
-
-@pytest.mark.parametrize("norm", ["log", "symlog", "equalised"])
-def test_code_and_look_of_a_norm_make_the_same_picture_and_no_edit_of_it_needs_a_program(laid, tmp_path, monkeypatch, norm):
-    laid.do({"do": "norm", "name": norm})
-    before, rows = signature(laid.snapshot().scene), laid.state()["look"]["points"]
-    laid.do({"do": "points", "points": [[0.31, 2.0, 0.1, 0.2, 0.3], *rows[1:]]})
-    picture = laid.wait(seconds=SECONDS)
-    assert signature(laid.snapshot().scene) == before
-    monkeypatch.chdir(tmp_path)
-    space = {"scene": scene(), "camera": camera()}
-    exec(laid.code()["python"], space)
-    assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6
-    laid.transfer.save(tmp_path / "look.json")
-    again = dataclasses.replace(scene(), transfer=js.TransferFunction.load(tmp_path / "look.json"))
-    assert same(picture.image, js.render(again, camera(), SETTINGS))
 
 
 def test_a_look_is_edited_and_taken_back(home):

@@ -1,6 +1,6 @@
 """A pixel of a surface of particles explained: where its ray meets the surface, who makes it there, and what was passed before.
 
-Flow: scene, camera, settings, pixel -> render, surface_depth; coverage along the ray -> [surface] -> SurfaceExplanation.
+Flow: scene, camera, settings, pixel -> render; coverage along the ray -> [surface] -> SurfaceExplanation.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The command `render`: a picture of each file, whole or a part of it, in one go or in stages; or points of a surface.
+"""The command `render`: a picture of each file, whole or a part of it, in one go or in stages.
 
-Flow: options -> Scene, Camera, Settings -> [render] -> EXR, PNG or PLY, its path on stdout, prose on stderr.
+Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on stdout, prose on stderr.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 import jaxsph
-from jaxsph.analysis.surface_depth import surface_depth
 from jaxsph.cli import disk, voice
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
@@ -38,14 +37,13 @@ from jaxsph.cli.options.settings import SETTINGS, as_medium, devices_of, setting
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
 from jaxsph.io.images.image_files import write_image
-from jaxsph.io.images.point_cloud import SUFFIX
 from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr or .png, of a surface .ply; of several files a folder, or a name with {} in it (default: after FILE, here)"
+WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: after FILE, here)"
 
 
 @Parameter(name="*")
@@ -75,7 +73,6 @@ class Render(groups.Options, groups.Draft, groups.Key, groups.SurfaceLook, group
 
 RENDER = Render()
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
-OF_PICTURES = ("tile", "progressive", "annotate", "background", "unit", "length_unit", "devices", "points", "volume", "iso")
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
@@ -125,7 +122,7 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in IMAGES or _is_points(output):
+    if output.suffix.lower() in IMAGES:
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
@@ -138,9 +135,7 @@ def _render(options: Any) -> None:
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0].file
     output = options.output or Path(stem_of(first) + merge.suffix(options))
-    require_writable(output, "an image must be", IMAGES if not _is_points(output) else (output.suffix,))
-    if _is_points(output):
-        refuse(options, (*OF_PICTURES, "from_disk"), f"is of pictures, and {output} is to hold points of a surface; leave it out")
+    require_writable(output, "an image must be", IMAGES)
     cli_look.check_key(options, output)
     merge.check_tile(options, settings, output)
     _check_background(options, output)
@@ -153,9 +148,6 @@ def _render(options: Any) -> None:
         return
     scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
     say("camera", camera_line(camera, options))
-    if _is_points(output):
-        _write_points(scene, camera, settings, options, output)
-        return
     started = time.perf_counter()
     if options.progressive:
         voice.release()
@@ -205,30 +197,6 @@ def _say_written(output: Path, image: Image, camera: Camera, settings: Settings,
         seconds=image.stats.get("seconds", {}),
         error={"bound": largest(image.error_bound), "certified": bool(image.certified)},
     )
-
-
-def _is_points(output: Path) -> bool:
-    """Whether what is asked for are points of a surface instead of a picture of it."""
-    return output.suffix.lower() == SUFFIX
-
-
-def _write_points(scene: Scene, camera: Camera, settings: Settings, options: Any, output: Path) -> None:
-    """Write the points that are seen, and say how many.
-
-    Raises:
-        UsageError: there is no surface.
-    """
-    if scene.surface is None:
-        raise UsageError(f"{output} holds points of a surface, and {options.source} is shown as a medium; add --surface")
-    started = time.perf_counter()
-    found = surface_depth(scene, camera, settings)
-    found.save(output)
-    count = int(found.met.sum())
-    met = f"{count:,} of {camera.width * camera.height:,} rays meet the surface"
-    say("points", f"{output}, {met}, {settings.samples} samples a ray")
-    say("time", f"{time.perf_counter() - started:.2f} s")
-    size = [camera.width, camera.height]
-    voice.written(output, points=count, size=size, camera=camera_line(camera, options))
 
 
 def _check_background(options: Any, output: Path) -> None:

@@ -11,7 +11,6 @@ const SHAPES = { // of opacity: places, and shares of the height that there is
   shells: [[0.15, 0], [0.25, 1], [0.35, 0], [0.65, 0], [0.75, 1], [0.85, 0]],
   even: [[0, 0.5], [1, 0.5]],
 };
-const NORMS = ["given", "linear", "log", "symlog", "percentile", "equalised"]; // how values lie on the axis
 const FINE = 16; // pieces of a line: extinction is linear, its height here is a root
 
 export function editor(send) {
@@ -29,9 +28,7 @@ export function editor(send) {
   const add = made("button", { type: "button", title: "add a point beside the chosen one (Enter)" }, "Add");
   const shapes = made("select", { "aria-label": "shape of opacity", onchange: () => { if (shapes.value) shape(SHAPES[shapes.value]); shapes.value = ""; } },
     made("option", { value: "" }, "Shape…"), ...Object.keys(SHAPES).map((name) => made("option", { value: name }, name)));
-  const norms = made("select", { "aria-label": "norm: how values lie on the axis", onchange: () => send({ do: "norm", name: norms.value }) },
-    ...NORMS.map((name) => made("option", { value: name }, `Norm: ${name}`)));
-  const element = made("div", {}, svg, made("div", { class: "row" }, color, value, add, remove), made("div", { class: "row" }, shapes, norms));
+  const element = made("div", {}, svg, made("div", { class: "row" }, color, value, add, remove), made("div", { class: "row" }, shapes));
 
   const x = (place) => PAD + Math.max(0, Math.min(1, place)) * (WIDTH - 2 * PAD);
   const y = (extinction) => look.flat ? HEIGHT / 2 : HEIGHT - PAD - Math.min(1, Math.sqrt(Math.max(0, extinction) / look.top)) * (HEIGHT - 2 * PAD);
@@ -198,7 +195,6 @@ export function editor(send) {
       element.hidden = !told;
       if (!told || held) return;
       look = told;
-      norms.value = told.norm;
       points = told.points.map((row) => [...row]);
       chosen = Math.min(chosen, points.length - 1);
       draw();

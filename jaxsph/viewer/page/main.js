@@ -46,9 +46,9 @@ function kept(one) {
   let timer = 0;
   if (location.hash.length > 1) {
     try {
-      const { pose, points, norm, cut, frame } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+      const { pose, points, cut, frame } = JSON.parse(decodeURIComponent(location.hash.slice(1)));
       if (frame != null) one.send({ do: "frame", number: frame });
-      one.send({ do: "restore", pose, points, norm, cut });
+      one.send({ do: "restore", pose, points, cut });
     } catch {
       history.replaceState(null, "", location.pathname + location.search);
     }
@@ -58,7 +58,7 @@ function kept(one) {
     clearTimeout(timer);
     timer = setTimeout(() => {
       const view = { pose: message.pose, cut: message.cut, frame: message.frames?.asked };
-      if (message.edited) Object.assign(view, { points: message.look.points.map((row) => row.slice(0, 5)), norm: message.look.norm });
+      if (message.edited) view.points = message.look.points.map((row) => row.slice(0, 5));
       const hash = message.moved || message.edited || message.cut || message.frames?.asked ? `#${encodeURIComponent(JSON.stringify(view))}` : "";
       history.replaceState(null, "", location.pathname + location.search + hash);
     }, KEEP);

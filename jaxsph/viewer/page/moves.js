@@ -19,7 +19,6 @@ export const KEYS = [
   ["x", "cut: by a plane, a box, a sphere, not at all"],
   ["n, m", "move or size the cut, with shift by more"],
   ["o, k", "the other side of the cut; whether its plane follows the view"],
-  ["rings in the picture, Tab and arrows", "pull the cut: its place or size, its middle; a plane that is held turns by the tip of its normal"],
   [", and .", "the frame before, and after, of a sequence; with shift the first, and the last"],
   ["u, y", "undo, redo a change of colours and opacity"],
   ["g, b", "keep this view as a key frame of a movie, forget the last one"],
@@ -40,7 +39,7 @@ export function moves(picture, send, doing) {
     };
   };
   function later(message) {
-    if (waiting && (waiting.do !== message.do || waiting.name !== message.name)) flush();
+    if (waiting && waiting.do !== message.do) flush();
     if (!waiting) waiting = { ...message };
     else if (message.do === "zoom") {
       waiting.factor *= message.factor;
@@ -88,13 +87,12 @@ export function moves(picture, send, doing) {
     },
     { passive: false },
   );
-  picture.addEventListener("keydown", pressed);
-  function pressed(event) {
+  picture.addEventListener("keydown", (event) => {
     if (event.altKey || ((event.ctrlKey || event.metaKey) && event.key !== "z")) return;
     if (!byKey(event)) return;
     event.preventDefault();
     event.stopPropagation(); // notebooks have keys of their own
-  }
+  });
   function byKey(event) {
     const { key, shiftKey } = event;
     const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[key];
@@ -116,5 +114,4 @@ export function moves(picture, send, doing) {
     else return false;
     return true;
   }
-  return { later, flush, share, pressed };
 }

@@ -1,7 +1,6 @@
 // A view: the picture with what it is in words, and beside it all that changes it.
 import { cutter } from "./cut.js";
 import { editor } from "./editor.js";
-import { gripper } from "./grips.js";
 import { boxOf, drawn, made, short } from "./made.js";
 import { KEYS, moves } from "./moves.js";
 import { timer } from "./time.js";
@@ -78,8 +77,7 @@ export function mount(root, link) {
       URL.revokeObjectURL(to.href);
     });
   }
-  const grips = gripper(picture, moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, g: () => send({ do: "key" }), b: () => send({ do: "unkey" }), "?": () => help.showModal() }));
-  picture.after(grips.element);
+  moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, g: () => send({ do: "key" }), b: () => send({ do: "unkey" }), "?": () => help.showModal() });
 
   async function show(header, blob) {
     const turn = ++drawing;
@@ -115,7 +113,6 @@ export function mount(root, link) {
     const ends = ["x", "y", "z"].map((name, i) => ({ name, right: state.axes[0][i], up: state.axes[1][i], away: state.axes[2][i] }));
     triad.replaceChildren(...ends.sort((one, other) => other.away - one.away).map(({ name, right, up }) =>
       drawn("g", { class: name }, drawn("line", { x1: 0, y1: 0, x2: 20 * right, y2: -20 * up }), drawn("text", { x: 26 * right, y: -26 * up + 3.5 }, name))));
-    grips.show(state.outline, state.cut);
     rays.textContent = state.pose.perspective ? "Perspective" : "Parallel";
   }
   function pick(found) {

@@ -11,6 +11,8 @@ from jaxsph.analysis.at_places import ParticleField
 from jaxsph.analysis.explanation import surface
 from jaxsph.analysis.explanation.surface import SurfaceExplanation
 from jaxsph.model.scene import widened
+from jaxsph.reference.chords import rays_of
+from jaxsph.reference.where import to_world
 
 LEVEL = 5.0
 MIDDLE = HEIGHT // 2, WIDTH // 2
@@ -21,12 +23,13 @@ def surfaced(**more):
 
 
 def test_place_light_and_shares_are_those_of_the_picture():
-    made, seen = js.explain(surfaced(), camera(), SETTINGS, pixel=MIDDLE), js.surface_depth(surfaced(), camera(), SETTINGS)
-    image = js.render(surfaced(), camera(), SETTINGS)
+    made, image = js.explain(surfaced(), camera(), SETTINGS, pixel=MIDDLE), js.render(surfaced(), camera(), SETTINGS)
     assert isinstance(made, SurfaceExplanation) and made.surface_depth == float(image.depth[MIDDLE])
     np.testing.assert_array_equal(made.color, image.color[MIDDLE])
-    np.testing.assert_allclose(made.position, seen.position[MIDDLE])
-    np.testing.assert_allclose(made.normal, seen.normal[MIDDLE])
+    rays = rays_of(camera(), *np.reshape(MIDDLE, (2, 1)))
+    place = to_world(rays.start + float(image.depth[MIDDLE]) * rays.direction, camera())
+    np.testing.assert_allclose(made.position, place[0])
+    np.testing.assert_allclose(made.normal, image.normal[MIDDLE], atol=1e-3)
     ambient = float(surfaced().surface.ambient)
     values, colors = (np.asarray(one, np.float64) for one in (scene().transfer.values, scene().transfer.colors))
     own = np.array([np.interp(made.surface_quantity, values, channel) for channel in colors.T])

@@ -17,9 +17,10 @@ from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.field.schedule import full_rate
 from jaxsph.engine.screen.packets import every_bundle
 
+
 @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
 def looked(grid, reference, camera, point, *, plan):
-    """Boxes of slabs, their distance to a point, and where samples are, on borders or between: (slabs, bundles, samples, rays)."""
+    """Boxes of slabs, their distance to a point, and where samples are, on borders or between."""
     schedule, packets = full_rate(grid.windows, reference), every_bundle(grid, camera)
     found, samples = slab_extents(grid, camera, plan.cast.slab_samples), []
     for on_borders in (False, True):

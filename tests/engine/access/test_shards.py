@@ -43,7 +43,7 @@ def test_shards_are_put_back_along_any_axis():
 def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
     rng = np.random.default_rng(0)
     grid, _ = stages(frames.scene(rng).particles, frames.camera(rng), plan=frames.plan())
-    for nth, found in enumerate(jax.jit(lambda grid: [shard_of_grid(grid, nth, 2) for nth in range(2)])(grid)):
+    for nth, found in enumerate(jax.jit(lambda grid: [shard_of_grid(grid, of, 2) for of in range(2)])(grid)):
         for name in ("row", "column"):
             np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(grid, name))[nth::2])
         for name in ("start", "end"):

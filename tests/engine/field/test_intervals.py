@@ -27,7 +27,6 @@ def means(looks, made):
     return means_of(MeanTables.of(looks.segments()), made, slice(0, 4))
 
 
-
 def field(depth):
     return LINE[0] + LINE[1] * np.asarray(depth)
 

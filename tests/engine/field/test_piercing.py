@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from slabs_drawn import FORMS, SAMPLES, drawn
 
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.piercing import Piercing, SlabRays
+from jaxsph.engine.field.piercing import Piercing
 from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 

@@ -113,7 +113,7 @@ def test_one_opacity_of_one_is_the_opaque_surface_and_a_number_changes_without_c
     assert not compiled and (thin[met] < thick[met]).all() and not thin[~met].any()
 
 
-def test_what_lies_behind_shines_through_and_points_that_are_exported_are_of_the_first_layer():
+def test_what_lies_behind_shines_through():
     grid = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 5), np.linspace(-0.6, 0.6, 5)), -1).reshape(-1, 2)
     sheet = js.Points.from_arrays(np.c_[grid, np.full(25, 0.8)].astype(np.float32), 0.25, np.ones((25, 3)), np.full(25, 50.0))
     unmet = dataclasses.replace(scene().surface, level=1e3)
@@ -122,6 +122,3 @@ def test_what_lies_behind_shines_through_and_points_that_are_exported_are_of_the
     assert not np.asarray(behind.normal).any() and np.asarray(behind.alpha).max() > 0.9
     through = np.asarray(alone.transmittance)[..., None] * np.asarray(behind.color)
     np.testing.assert_allclose(np.asarray(lit.color), np.asarray(alone.color) + through, atol=2e-3)
-    opaque = dataclasses.replace(scene(), surface=js.Surface(LEVEL))
-    depths = [js.surface_depth(one, camera(), SETTINGS).depth for one in (scene(), opaque)]
-    np.testing.assert_array_equal(*depths)
