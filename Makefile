@@ -70,9 +70,9 @@ test-nightly: $(VENV)/.installed-test
 
 # Of the tests marked slow, a part that changes with every commit, so that all have their turn in as many runs as there are parts;
 # of a shallow clone, whose commits cannot be counted, with every hour.
-SLOW_PARTS ?= 8
+SLOW_PARTS ?= 12
 SLOW_RUN ?= $(shell [ "$$(git rev-parse --is-shallow-repository 2>/dev/null)" = false ] && git rev-list --count HEAD || echo $$(( $$(date -u +%s) / 3600 )))
-SLOW_SECONDS ?= 300
+SLOW_SECONDS ?= 200
 test-slow-share: $(VENV)/.installed-test
 	@echo "run $(SLOW_RUN): one in $(SLOW_PARTS) of the tests marked slow, none begun after $(SLOW_SECONDS) s"
 	@$(SUITE) -m slow --share=$(SLOW_RUN)/$(SLOW_PARTS) --budget=$(SLOW_SECONDS) $(PYTEST_ARGS)
