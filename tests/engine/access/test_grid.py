@@ -18,8 +18,14 @@ from jaxsph.engine.access.slab_windows import find_slab_windows
 from jaxsph.engine.access.view import view_particles
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
 def sample_depths(camera, samples, dtype):
     return camera.depth(jnp.arange(samples, dtype=dtype) + 0.5, samples).astype(dtype)
+
+
+@jax.jit
+def columns_of(camera, place):
+    return camera.column(place)
 
 
 @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
@@ -110,7 +116,7 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
     rng = np.random.default_rng(seed)
     camera = js.Camera.look_at((0, 0, 0), (0, 0, 1), fov_degrees=50, width=frames.width, height=frames.height, near=0.4, far=3.0)
     s = np.asarray(sample_depths(camera, frames.samples, np.float32), np.float64)
-    u = np.asarray(camera.column(np.arange(frames.width + 1)))
+    u = np.asarray(columns_of(camera, np.arange(frames.width + 1)))
     count = frames.capacity
     k, c = rng.integers(0, frames.samples, count), rng.integers(0, frames.width, count)
     support = 10 ** -rng.uniform(0, 3, count)
@@ -121,7 +127,7 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
     if where == "eye":
         position *= 1e-3
     if where == "ray":
-        position[:, 0] = np.asarray(camera.column(c + 0.5)) * s[k] + support * np.cos(angle)
+        position[:, 0] = np.asarray(columns_of(camera, c + 0.5)) * s[k] + support * np.cos(angle)
         position[:, 1] += support * np.sin(angle)
     if where == "cell border":
         position[:, 0] = u[(c // 8) * 8] * s[k] + support * rng.choice([-1, 1], count)

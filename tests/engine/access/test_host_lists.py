@@ -20,6 +20,8 @@ from jaxsph.engine.runtime.tuning import CPU
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
+SIZE, LISTS = {"width": 45, "height": 38}, ListPlan(1, 3, 2 * 24, 8 * 24)  # frames as those of `test_strided_lists.py`
+
 
 @given(st.lists(st.integers(0, 2**32 - 1) | st.sampled_from([7, 1 << 16, (1 << 16) + 7]), max_size=40), st.integers(1, 3))
 def test_keys_are_sorted_stably(keys, threads):
@@ -64,12 +66,12 @@ def both(scene, camera, lists, first_row=0, samples=24):
 
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@given(seed=st.integers(0, 2**32 - 1), distance=st.sampled_from([3.0, 0.8, 0.0001]), first_row=st.sampled_from([0, 16]))
+@given(seed=st.integers(0, 2**32 - 1), distance=st.sampled_from([3.0, 0.8, 0.0001]), first_row=st.sampled_from([0, 16, 32]))
 def test_the_host_makes_the_lists_and_windows_that_xla_makes(frames, dtype, projection, seed, distance, first_row):
     with jax.enable_x64(dtype == np.float64):
-        rng, capacity = np.random.default_rng(seed), frames.capacity
-        scene, camera = frames.scene(rng, decades=4, dtype=dtype), frames.camera(rng, projection, distance, dtype)
-        (ordered, expected), (same, found) = both(scene, camera, ListPlan(1, 2, 2 * capacity, 8 * capacity), first_row)
+        rng, shape = np.random.default_rng(seed), dataclasses.replace(frames, **SIZE)
+        scene, camera = shape.scene(rng, decades=4, dtype=dtype), shape.camera(rng, projection, distance, dtype)
+        (ordered, expected), (same, found) = both(scene, camera, LISTS, first_row)
         for name, column in dataclasses.asdict(ordered).items():
             np.testing.assert_array_equal(getattr(same, name), column)
         assert int(found.lists.faults) == 0 and int(found.pairs) == int(expected.pairs) == sum(map(len, lists_of(found)))
@@ -92,10 +94,9 @@ def test_places_that_a_byte_cannot_count_are_told_apart():
 
 @pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
 def test_a_full_capacity_is_the_same_fault_on_the_host(frames, capacity):
-    rng = np.random.default_rng(0)
-    scene, camera = frames.scene(rng, decades=0), frames.camera(rng)
-    lists = dataclasses.replace(ListPlan(2, 2, 4 * frames.capacity, 16 * frames.capacity), **{capacity: 5})
-    expected, found = (grid for _, grid in both(scene, camera, lists))
+    rng, shape = np.random.default_rng(0), dataclasses.replace(frames, **SIZE)
+    scene, camera = shape.scene(rng, decades=0), shape.camera(rng)
+    expected, found = (grid for _, grid in both(scene, camera, dataclasses.replace(LISTS, **{capacity: 5})))
     assert int(found.lists.faults) & int(expected.lists.faults) != 0
     assert int(found.lists.end.max()) == 0
 

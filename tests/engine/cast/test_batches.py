@@ -24,10 +24,10 @@ def schedule_of(rng, level=None, painted=None):
     count = np.where(filled, rng.integers(1, 200, filled.shape), 0)
     level = np.zeros_like(count) if level is None else np.full_like(count, level)
     columns = filled, level, count[None] * 0, count[None], count
-    painted = None if painted is None else jnp.full(filled.shape, painted)
-    paint = None if painted is None else jnp.zeros((4, *filled.shape))
-    reference = jnp.zeros(filled.shape, jnp.float32)
-    return SlabSchedule(*(jnp.asarray(column) for column in columns), (reference,), painted, paint)
+    painted = None if painted is None else np.full(filled.shape, painted)
+    paint = None if painted is None else np.zeros((4, *filled.shape), np.float32)
+    reference = np.zeros(filled.shape, np.float32)
+    return SlabSchedule(*columns, (reference,), painted, paint)
 
 
 def batches(schedule, list_id=None, samples=SLABS * 4 - 1, on_borders=False):
@@ -86,9 +86,9 @@ def test_chunks_hold_slabs_of_one_method():
     rng = np.random.default_rng(2)
     schedule = schedule_of(rng)
     method = rng.integers(0, NUM_METHODS, schedule.count.shape)
-    level = jnp.asarray(np.maximum(method - INTERPOLATED, 0), jnp.int32)
-    count = jnp.where(method >= INTERPOLATED, 0, schedule.count)
-    schedule = dataclasses.replace(schedule, count=count, level=level, method=jnp.asarray(method, jnp.int32))
+    level = np.maximum(method - INTERPOLATED, 0).astype(np.int32)
+    count = np.where(method >= INTERPOLATED, 0, schedule.count)
+    schedule = dataclasses.replace(schedule, count=count, level=level, method=method.astype(np.int32))
     seen = []
     for batch, chunks in batches_with_chunks(schedule):
         number = int(batch.number)

@@ -115,12 +115,14 @@ def test_one_program_serves_all_tolerances_and_faults_are_told_under_jit() -> No
     assert np.isfinite(np.asarray(loose)).all()
 
 
-def test_a_plan_with_a_tolerance_is_refused_without_one() -> None:
-    scene, camera = frame(24)
-    plan = js.plan(scene, camera, SEGMENTS)
+def test_a_plan_with_a_tolerance_is_refused_without_one(frames, quick_programs) -> None:
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    asked = dataclasses.replace(SEGMENTS, samples=2 * (frames.samples // 2))
+    plan = js.plan(scene, camera, asked)
     with pytest.raises(ValueError, match="samples"):
-        js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=None), plan=plan)
-    twice = dataclasses.replace(SEGMENTS, tolerance=None, samples=48)
+        js.render(scene, camera, dataclasses.replace(asked, tolerance=None), plan=plan)
+    twice = dataclasses.replace(asked, tolerance=None, samples=frames.samples // 2)
     with pytest.raises(ValueError, match="was made for a tolerance"):
         js.render(scene, camera, twice, plan=plan)
 

@@ -43,16 +43,19 @@ def task(rng, perspective):
     border = np.cumsum(rng.uniform(0.1, 0.4, (TASKS, SAMPLES + 1)), 1)
     sides = rng.uniform(-1, 1, (TASKS, COLUMNS)), rng.uniform(-1, 1, (TASKS, ROWS))
     depths = 0.5 * (border[:, 1:] + border[:, :-1]), border
-    return SlabTask(None, jnp.arange(TASKS), jnp.arange(TASKS), *(jnp.asarray(v) for v in (*sides, *depths)), perspective)
+    return SlabTask(None, np.arange(TASKS), np.arange(TASKS), *sides, *depths, perspective)
 
 
-@functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
-def light(several, where, in_few_passes):
-    """Colours and transmittance of rays, and the thickness of their samples."""
-    with barriers(in_few_passes):
-        medium = Mixture.of(several)
-        found = PointSamples()(medium, medium.gather(where), where)
-    return jnp.stack([*found.color, found.transmittance]), jnp.broadcast_to(found.thickness, where.shape)
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def lights(several, where):
+    """Colours and transmittance of rays, and the thickness of samples, in few passes and plainly; and the length of samples."""
+    ways = []
+    for in_few_passes in (True, False):
+        with barriers(in_few_passes):
+            medium = Mixture.of(several)
+            found = PointSamples()(medium, medium.gather(where), where)
+        ways.append((jnp.stack([*found.color, found.transmittance]), jnp.broadcast_to(found.thickness, where.shape)))
+    return ways, where.path()
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -61,13 +64,13 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
     rng = np.random.default_rng(media)
     there = rng.uniform(size=(media, 1, TASKS, SAMPLES, 1)) < 0.7
     optics = rng.uniform(0, 2, (media, 4, TASKS, SAMPLES, ROWS * COLUMNS)) * there
-    several, where = tuple(Given(jnp.asarray(one)) for one in optics), task(rng, perspective)
-    lit, thickness = (np.asarray(layer) for layer in light(several, where, True))
-    for few, plain in zip((lit, thickness), light(several, where, False), strict=True):
+    ways, path = jax.tree.map(np.asarray, lights(tuple(Given(one) for one in optics), task(rng, perspective)))
+    for few, plain in zip(*ways, strict=True):
         np.testing.assert_allclose(few, plain, rtol=1e-12, atol=1e-15)
+    lit, _ = ways[0]
     # each sample adds its colour times what it takes away of the light
     extinction = optics[:, 3].sum(0)
-    left = np.exp(-np.cumsum(extinction * np.asarray(where.path()), 1))
+    left = np.exp(-np.cumsum(extinction * path, 1))
     taken = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], 1) - left
     for channel in range(3):
         color = (optics[:, channel] * optics[:, 3]).sum(0) / np.where(extinction > 0, extinction, 1)
@@ -77,6 +80,6 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
 
 def test_colours_add_up_to_the_alpha_that_is_lost():
     """However thin samples are, of a colour that is one."""
-    thickness = jnp.full((3, 1 << 6, 1), 1e-7).at[1].set(0.3).at[2].set(50.0)
-    *color, left = emitted([jnp.ones_like(thickness)], transmitted(thickness))
+    thickness = np.tile(np.float32([1e-7, 0.3, 50.0])[:, None, None], (1 << 6, 1))
+    *color, left = jax.jit(lambda thickness: emitted([jnp.ones_like(thickness)], transmitted(thickness)))(thickness)
     np.testing.assert_allclose(color[0], 1 - np.asarray(left), rtol=1e-6)

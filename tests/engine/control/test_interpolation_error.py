@@ -13,7 +13,7 @@ from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import SUBSAMPLED_SHARE, interpolation_error
-from jaxsph.engine.field.lattice import FINEST, GAP, Spacing, region_of
+from jaxsph.engine.field.lattice import FINEST, GAP, Region, Spacing, region_of
 from jaxsph.engine.frame.stages import sum_shard
 
 
@@ -25,7 +25,7 @@ def band(stages):
     sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
     lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
     judge = jax.jit(functools.partial(interpolation_error, slab_samples=plan.cast.slab_samples), compiler_options=QUICKLY)
-    return grid, lattice, lambda lattice: judge(grid, lattice, camera, scene.transfer)
+    return grid, lattice, lambda lattice: jax.tree.map(np.asarray, judge(grid, lattice, camera, scene.transfer))
 
 
 def test_some_slabs_with_particles_can_be_interpolated(band):
@@ -42,7 +42,7 @@ def test_some_slabs_with_particles_can_be_interpolated(band):
 def test_rougher_sums_are_judged_worse(band):
     _, lattice, judge = band
     (weighted,) = lattice.weighted
-    rough = weighted * (1 + 0.1 * np.random.default_rng(0).normal(size=weighted.shape).astype(np.float32))
+    rough = np.asarray(weighted) * (1 + 0.1 * np.random.default_rng(0).normal(size=weighted.shape)).astype(np.float32)
     smooth, found = judge(lattice).variance, judge(dataclasses.replace(lattice, weighted=(rough,))).variance
     both = np.isfinite(smooth) & np.isfinite(found) & (np.asarray(smooth) > 1e-9)
     assert both.any() and (np.asarray(found)[both] > np.asarray(smooth)[both]).mean() > 0.95
@@ -50,19 +50,19 @@ def test_rougher_sums_are_judged_worse(band):
 
 def test_nothing_is_interpolated_without_a_lattice(band):
     _, lattice, judge = band
-    assert np.isinf(judge(jax.tree.map(jnp.zeros_like, lattice)).variance).all()
+    assert np.isinf(judge(jax.tree.map(np.zeros_like, lattice)).variance).all()
 
 
 @pytest.mark.parametrize("nodes", [FINEST, Spacing(8, 2)])
 def test_what_would_be_interpolated_from_beyond_the_lattice_is_not(band, nodes):
     """Even where sums fall off so evenly that nodes which are missing look like zero."""
     grid, lattice, judge = band
-    region = dataclasses.replace(region_of(grid, 12, 13, nodes), row=jnp.int32(0), column=jnp.int32(0))
+    region = dataclasses.replace(region_of(grid, 12, 13, nodes), row=np.int32(0), column=np.int32(0))
     layers, down, across = lattice.weight.shape[0], 12 * nodes.across, 13 * nodes.across
     ramp = np.zeros((layers, down + GAP, across + GAP), np.float32)
     ramp[:, :down, :across] = across - np.arange(across)
-    even = dataclasses.replace(lattice, weight=jnp.asarray(ramp), weighted=(jnp.asarray(0.3 * ramp),), region=region)
-    row, column, inside = (np.asarray(value) for value in region.place(grid))
+    even = dataclasses.replace(lattice, weight=ramp, weighted=(np.float32(0.3) * ramp,), region=region)
+    row, column, inside = (np.asarray(value) for value in jax.jit(Region.place)(region, grid))
     usable = np.isfinite(judge(even).variance).any(0)
     last = (column + 1) * nodes.across + 1, (row + 1) * nodes.across + 1  # nodes that a cubic takes
     assert usable.any() and inside[usable].all() and (row[usable] > 0).all() and (column[usable] > 0).all()

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,13 +22,12 @@ from jaxsph.engine.field.schedule import evaluations
 
 SLAB_SAMPLES = [4, 8, 16]
 merge = jax.jit(merged_levels, static_argnums=2)
-unions = jax.jit(coarser_windows, static_argnums=1)
+unions = jax.jit(coarser_windows, static_argnums=1, compiler_options=QUICKLY)
+
+costs = jax.jit(evaluations_of_levels, static_argnums=(1, 2, 3), compiler_options=QUICKLY)
 
 
-costs = jax.jit(evaluations_of_levels, static_argnums=(1, 2, 3))
-
-
-@functools.partial(jax.jit, static_argnums=2)
+@functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
 def evaluated(windows, levels, slab_samples, past):
     shape = windows[0].length.shape[1:]
     schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
@@ -62,7 +62,7 @@ def test_cells_merge_at_the_highest_level_that_all_of_a_group_allow(slab_samples
     every = st.sampled_from([SUPER_PIXEL, *range(MAX_LEVEL + 1), MAX_LEVEL, MAX_LEVEL])
     chosen = data.draw(hnp.arrays(np.int32, (CELLS, BUNDLES), elements=every, fill=st.just(MAX_LEVEL)))
     free = data.draw(hnp.arrays(bool, (CELLS, BUNDLES)))
-    found = np.asarray(merge(jnp.asarray(chosen), jnp.asarray(free), slab_samples))
+    found = np.asarray(merge(chosen, free, slab_samples))
     fitting = fits(slab_samples)
     allows = np.where(free, MAX_LEVEL, np.where(chosen == SUPER_PIXEL, 0, chosen))
     for cell, bundle in np.ndindex(chosen.shape):

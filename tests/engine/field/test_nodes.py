@@ -20,6 +20,7 @@ from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.particles import kernels
 
 WIDER = Spacing(8, 4)
+rays = jax.jit(lambda camera, columns, rows: (camera.column(columns), camera.row(rows)))
 node_sums = jax.jit(sum_at_nodes, static_argnums=(2, 3, 6), compiler_options=QUICKLY)
 
 
@@ -35,17 +36,17 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
         camera,
         scene.particles.kernel,
         plan.cast.slab_samples,
-        Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, spacing),
-        (jnp.float64(0.4),),
+        Region(np.int32(0), np.int32(0), *plan.lists.bundles, spacing),
+        (np.float64(0.4),),
         plan.cast.tuning.cells_of_nodes,
     )
 
-    kept = slice(REACH, -GAP), slice(-GAP), slice(-GAP)
+    lattice, kept = jax.tree.map(np.asarray, lattice), (slice(REACH, -GAP), slice(-GAP), slice(-GAP))
     deep, down, across = lattice.weight[kept].shape
     deep = min(deep, -(-plan.samples // spacing.samples))
     depth = np.asarray(grid.half_steps)[1::2][:: spacing.samples][:, None, None]
-    u = np.asarray(camera.column(spacing.pixels * np.arange(across) + 0.5))
-    v = np.asarray(camera.row(spacing.pixels * np.arange(down) + 0.5))[:, None]
+    u, v = map(np.asarray, rays(camera, spacing.pixels * np.arange(across) + 0.5, spacing.pixels * np.arange(down) + 0.5))
+    v = v[:, None]
     spread = depth if camera.is_perspective else np.ones_like(depth)
     smooth, weight, weighted = kernels.by_name(scene.particles.kernel), 0.0, 0.0
     x, y, z, scale, size, quantity = (
@@ -59,7 +60,7 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
     # nodes beyond the image lie in bundles that it has no list for
     rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
     for found, wanted in ((lattice.weight, weight), (*lattice.weighted, weighted)):
-        assert np.asarray(found != 0).sum() == np.asarray(found[kept] != 0).sum(), "margins are zero"
+        assert (found != 0).sum() == (found[kept] != 0).sum(), "margins are zero"
         np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
     assert weight.max() > 0
 
