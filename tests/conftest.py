@@ -200,6 +200,17 @@ def compare() -> Callable[..., None]:
     return check
 
 
+@pytest.fixture(scope="session")
+def traced(frames):
+    """A whole image as part of a trace, `traced(scene, camera, plan)`: one program for all random frames."""
+
+    @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
+    def draw(scene, camera, plan):
+        return js.render(scene, camera, frames.settings, plan=plan)
+
+    return draw
+
+
 @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
 def grid_of(particles, camera, *, plan):
     """The grid of a frame of one band, and what its sums are taken relative to."""

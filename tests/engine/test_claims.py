@@ -4,7 +4,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
@@ -22,12 +21,13 @@ ALL = [bit for bit in faults.MESSAGES if not bit & faults.TOLD]
 
 @pytest.fixture(scope="module")
 def drawn(frames):
-    """A jitted frame of a plan with little room, a transfer function and an extent that may be anything."""
+    """Three frames side by side of a plan with little room, of a transfer function and an extent that may be anything."""
     rng = np.random.default_rng(3)
     scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
     plan = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, list_capacity=96))
 
     @functools.partial(jax.jit, compiler_options=QUICKLY)
+    @jax.vmap
     def draw(grown, change, at):
         particles = dataclasses.replace(scene.particles, support=scene.particles.support * grown)
         look = dataclasses.replace(scene.transfer, colors=scene.transfer.colors.at[at, 0].add(change))
@@ -38,22 +38,31 @@ def drawn(frames):
 
 
 @given(
-    st.sampled_from([0.01, 0.1, 1.0, 3.0]),
-    st.sampled_from([0.0, 1e-9, 0.3, -0.3, 5.0, -5.0, np.nan, np.inf]),
-    st.integers(0, 4),
+    st.lists(
+        st.tuples(
+            st.sampled_from([0.01, 0.1, 1.0, 3.0]),
+            st.sampled_from([0.0, 1e-9, 0.3, -0.3, 5.0, -5.0, np.nan, np.inf]),
+            st.integers(0, 4),
+        ),
+        min_size=3,
+        max_size=3,
+    )
 )
-def test_no_image_with_a_fault_is_certified_and_its_bound_is_1(drawn, grown, change, at):
-    image = drawn(grown, change, at)
-    faulty = int(image.faults) != 0
-    assert bool(image.certified) != faulty
-    assert (np.asarray(image.error_bound) == (1 if faulty else 0)).all()
-    assert np.isfinite(image.color).all() and bool(image.fault_messages) == faulty
-    if not np.isfinite(change) or abs(change) >= 5 or grown == 3:
-        assert faulty
+def test_no_image_with_a_fault_is_certified_and_its_bound_is_1(drawn, given):
+    images = drawn(*(np.array(column) for column in zip(*given, strict=True)))
+    for nth, (grown, change, _) in enumerate(given):
+        image = jax.tree.map(lambda leaf, nth=nth: np.asarray(leaf)[nth], images)
+        faulty = int(image.faults) != 0
+        assert bool(image.certified) != faulty
+        assert (image.error_bound == (1 if faulty else 0)).all()
+        assert np.isfinite(image.color).all() and bool(image.fault_messages) == faulty
+        if not np.isfinite(change) or abs(change) >= 5 or grown == 3:
+            assert faulty
 
 
 def test_under_vmap_each_image_is_judged_alone(drawn):
-    images = jax.vmap(drawn, (0, None, None))(jnp.array([0.01, 3.0, 0.01]), 0.0, 0)
+    images = drawn(np.array([0.01, 3.0, 0.01]), np.zeros(3), np.zeros(3, int))
+    assert int(images.faults[1]) & faults.LIST_OVERFLOW
     assert np.asarray(images.certified).tolist() == [True, False, True]
     assert np.asarray(images.error_bound).max((1, 2)).tolist() == [0, 1, 0]
     with pytest.raises(js.CapacityError, match="too small"):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY, still
-from rows import HEIGHT, WIDTH, Row
+from rows import HEIGHT, SAMPLES, WIDTH, Row
 
 import jaxsph as js
 
@@ -204,12 +204,8 @@ REFUSED = [
 
 @pytest.mark.parametrize(("row", "how", "error", "match"), REFUSED, ids=[f"{row.name}, {how}" for row, how, *_ in REFUSED])
 def test_what_cannot_be_combined_is_refused_by_name(row, how, error, match, frames, x64):
-    inputs = row.inputs(frames)
-    if row.integrator == "step_doubling":  # of which no plan can be made of such scenes
-        plan = dataclasses.replace(row, integrator="samples").plan(frames)
-        plan = dataclasses.replace(plan, integrator=row.integrator, step_tolerance=row.settings.step_tolerance)
-    else:
-        plan = row.plan(frames)
+    inputs, size = row.inputs(frames), dataclasses.replace(frames, width=WIDTH, height=HEIGHT, samples=SAMPLES)
+    plan = dataclasses.replace(size.plan(), integrator=row.integrator, step_tolerance=row.settings.step_tolerance)
     cotangent = jnp.ones((HEIGHT, WIDTH, 4))
     of = {"jit": light, "grad": jax.grad(light, allow_int=True)}[how]
     with pytest.raises(error, match=match):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
-from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, looked, pulled, still, total, towards, weights
+from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, looked, pulled, total, towards, weights
 from examples import examples
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -63,11 +63,7 @@ def small(frames, rng):
 
 def check(inputs, named, cotangent, asked, plan):
     """That both modes give the slope of differences in a direction."""
-    check_along(inputs, towards(inputs, named), cotangent, asked, plan)
-
-
-def check_along(inputs, move, cotangent, asked, plan):
-    """The same in a direction of all leaves."""
+    move = towards(inputs, named)
     difference, pushed, gradient = differ(inputs, move, cotangent, asked, plan)
     slope, size = along(gradient, move)
     assert slope == pytest.approx(difference, rel=RTOL, abs=CLOSE * (1 + size))
@@ -166,37 +162,6 @@ def test_both_modes_agree_on_hard_scenes(frames, data, seed):
         slope, size = along(gradient, move)
         assert np.isfinite(size)
         assert float(pushed) == pytest.approx(slope, abs=AGREE * (1 + size))
-
-
-def mixed(rng):
-    """Points, particles and a volume whose box lies in view."""
-    volume = js.Volume.from_array(rng.uniform(0, 1, (4, 3, 5)), (-0.7, -0.6, -0.8), (0.45, 0.5, 0.35))
-    given = np.sort(rng.uniform(0.1, 0.9, 3)), rng.uniform(0, 1, (3, 3)), rng.uniform(0.5, 3, 3)
-    points = js.Points.from_arrays(
-        rng.uniform(-0.7, 0.7, (4, 3)), rng.uniform(0.1, 0.4, 4), rng.uniform(0, 1, (4, 3)), rng.uniform(1, 4, 4)
-    )
-    return {"volume": volume, "volume_transfer": js.TransferFunction.from_points(*given), "points": points}
-
-
-def everywhere(part, rng):
-    """A direction for every float of a part."""
-    return jax.tree.map(
-        lambda leaf: leaf if leaf.dtype == jax.dtypes.float0 else jnp.asarray(rng.normal(size=leaf.shape)), still(part)
-    )
-
-
-@pytest.mark.slow
-def test_gradients_by_volumes_and_points_are_those_of_differences(frames, x64):
-    """Where rays enter and leave the box moves with it, and with the camera."""
-    rng = np.random.default_rng(2)
-    scene, camera = small(frames, rng)
-    inputs = dataclasses.replace(scene, **mixed(rng)), camera
-    plan = dataclasses.replace(PLAN, num_particles=16)
-    cotangent = jnp.asarray(rng.normal(size=(6, 8, 4)))
-    for name in ("volume", "volume_transfer", "points", "particles"):
-        way = everywhere(getattr(inputs[0], name), rng)
-        check_along(inputs, (dataclasses.replace(still(inputs)[0], **{name: way}), still(inputs)[1]), cotangent, SETTINGS, plan)
-    check(inputs, anyhow("eye")(inputs, rng) | turns(inputs, rng), cotangent, SETTINGS, plan)
 
 
 @pytest.mark.slow

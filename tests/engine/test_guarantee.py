@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.control.adapt import ControlPlan
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 ADAPTIVE = {
     "budget": ControlPlan(True, True, "budget"),
     "levels": ControlPlan(False, True, "budget"),

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from extreme import Extreme, error_and_allowance
@@ -65,9 +64,9 @@ def test_comfortable_frames_are_left_alone(frames):
         assert asked.digits == 0 and asked.scene is scene and asked.camera is camera
 
 
-def test_under_a_trace_the_fault_stays(frames):
+def test_under_a_trace_the_fault_stays(frames, traced):
     scene, camera = frame(frames, length=1e24)
-    image = jax.jit(lambda s, c: js.render(s, c, frames.settings, plan=frames.plan()))(scene, camera)
+    image = traced(scene, camera, frames.plan())
     assert int(image.faults) & faults.UNRESOLVED
 
 

@@ -15,6 +15,8 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.engine.screen.quadtree import QuadtreePlan
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 QUADTREE = {"screen": "quadtree", "leaf_pixels": 8}
 ROUNDING = 1e-6
 

@@ -15,9 +15,11 @@ import jaxsph as js
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")  # as everyone has them: `test_extremes`, `test_exactness`
+
 ALL = list(itertools.product(KERNELS, ["perspective", "orthographic"]))
 IN_FLOAT32 = [("poly6", "perspective"), ("wendland_c2", "orthographic"), ("wendland_c4", "perspective")]
-IN_FLOAT64 = [("poly6", "orthographic"), ("cubic_spline", "perspective"), ("wendland_c6", "orthographic")]
+IN_FLOAT64 = [("cubic_spline", "perspective"), ("wendland_c6", "perspective")]
 
 
 def with_kernels_and_projections(chosen):
@@ -164,17 +166,15 @@ def test_the_memory_limit_makes_bands_and_too_little_is_refused(frames):
         js.plan(scene, camera, js.Settings(samples=64, memory_limit=1000))
 
 
-@pytest.mark.parametrize(("capacity", "bit"), [
-    ("list_capacity", faults.LIST_OVERFLOW), pytest.param("tile_capacity", faults.TILE_OVERFLOW, marks=pytest.mark.slow),
-])  # fmt: skip
-def test_a_plan_that_is_too_small_raises_and_is_a_fault_under_jit(frames, capacity, bit):
+@pytest.mark.parametrize("capacity", ["list_capacity", pytest.param("tile_capacity", marks=pytest.mark.slow)])
+def test_a_plan_that_is_too_small_raises(frames, capacity):
+    """Under `jit` it is a fault: `test_claims`."""
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng, decades=0), frames.camera(rng)
     plan = frames.plan()
     small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 4}))
     with pytest.raises(js.CapacityError, match="make a new plan"):
         js.render(scene, camera, frames.settings, plan=small)
-    assert int(jax.jit(lambda s: js.render(s, camera, frames.settings, plan=small).faults)(scene)) & bit
 
 
 def test_tiles_that_do_not_fit_are_a_fault(frames, stages):
@@ -198,11 +198,6 @@ def test_a_plan_for_other_shapes_is_refused(frames, change):
         js.render(scene, camera, settings, plan=frames.plan())
 
 
-@pytest.fixture(scope="module")
-def jitted(frames):
-    return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
-
-
 @pytest.mark.parametrize(
     ("part", "field", "value", "message"),
     [
@@ -218,7 +213,7 @@ def jitted(frames):
         ("camera", "far", 0.001, "camera is not usable"),
     ],
 )
-def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, jitted, part, field, value, message):
+def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, traced, part, field, value, message):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng), frames.camera(rng)
 
@@ -230,7 +225,7 @@ def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, jitted, part
         camera = spoil(camera)
     else:
         scene = dataclasses.replace(scene, **{part: spoil(getattr(scene, part))})
-    image = jitted(scene, camera)
+    image = traced(scene, camera, frames.plan())
     assert int(image.faults) != 0 and not image.certified and (np.asarray(image.error_bound) == 1).all()
     with pytest.raises(ValueError, match=message):
         image.check()

@@ -15,11 +15,11 @@ import jaxsph as js
 ROUNDING = 64 * np.finfo(np.float32).eps  # programs differ in which products they fuse into a sum
 
 
-def test_eager_and_jit_give_the_same_image_but_for_rounding(frames):
+def test_eager_and_jit_give_the_same_image_but_for_rounding(frames, traced):
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
     eager = js.render(scene, camera, frames.settings, plan=plan)
-    jitted = jax.jit(lambda s: js.render(s, camera, frames.settings, plan=plan))(scene)
+    jitted = traced(scene, camera, plan)
     for layer in ("color", "transmittance", "depth", "evaluations"):
         np.testing.assert_allclose(getattr(eager, layer), getattr(jitted, layer), rtol=ROUNDING, atol=ROUNDING)
     assert int(jitted.faults) == 0
@@ -43,20 +43,6 @@ def test_vmap_over_cameras(frames):
     batch = jax.jit(draw, compiler_options=QUICKLY)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras))
     for camera, color in zip(cameras, batch, strict=True):
         np.testing.assert_allclose(color, js.render(scene, camera, frames.settings, plan=plan).color, atol=ROUNDING)
-
-
-@pytest.mark.slow
-def test_vmap_over_quantities(frames):
-    rng = np.random.default_rng(0)
-    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
-
-    def of(quantity):
-        other = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
-        return js.render(other, camera, frames.settings, plan=plan).color
-
-    quantities = jnp.asarray(rng.uniform(0, 1, (2, frames.capacity)), jnp.float32)
-    for quantity, color in zip(quantities, jax.jit(jax.vmap(of), compiler_options=QUICKLY)(quantities), strict=True):
-        np.testing.assert_allclose(color, of(quantity), atol=ROUNDING)
 
 
 @pytest.mark.slow

@@ -188,10 +188,13 @@ def test_extinctions_add_up_and_colours_weigh_by_them(name, projection):
         np.testing.assert_allclose(np.asarray(optics[k])[filled & ~close], wanted, rtol=1e-4, atol=1e-6)
 
 
+SEEN = jax.jit(OctreePoints.seen_by, compiler_options=QUICKLY)
+
+
 def test_cotangents_are_the_transpose_of_tangents(x64):
     """By all numbers of the points, of a profile, of the camera and of where samples are: <c, J t> = <J^T c, t>."""
     view, rng = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), camera()), np.random.default_rng(5)
-    seen, task = OctreePoints.of(points(shaped, np.float64)).seen_by(view), slabs("perspective", np.float64)
+    seen, task = SEEN(OctreePoints.of(points(shaped, np.float64)), view), slabs("perspective", np.float64)
     weights = [jnp.asarray(rng.normal(size=task.shape)) for _ in range(4)]
     move = [jnp.asarray(rng.normal(size=np.shape(part))) for part in (seen.seen.table, seen.seen.common[1], task.depth, 1.0)]
 
@@ -208,8 +211,8 @@ def test_cotangents_are_the_transpose_of_tangents(x64):
         return found, tangents, (total.seen.table, total.seen.common[1], places.depth, places.factor)
 
     _, tangents, pulled = both(seen.seen.table, seen.seen.common[1], task.depth, jnp.float64(1))
-    forward = sum(float((one * weight).sum()) for one, weight in zip(tangents, weights, strict=True))
-    parts = [float((one * way).sum()) for one, way in zip(pulled, move, strict=True)]
+    forward = sum(np.vdot(one, weight) for one, weight in zip(tangents, weights, strict=True))
+    parts = [np.vdot(one, way) for one, way in zip(pulled, move, strict=True)]
     assert min(map(abs, parts)) > 1e-3
     assert forward == pytest.approx(sum(parts), rel=1e-10)
 

@@ -69,7 +69,8 @@ def particles():
 
 def shaped(offset, attributes):
     x, y, z = offset
-    return jnp.exp(-4 * (x * x + 4 * y * y + z * z)) * attributes["brightness"]
+    exp = np.exp if isinstance(x, np.ndarray) else jnp.exp  # of the reference, and of programs
+    return exp(-4 * (x * x + 4 * y * y + z * z)) * attributes["brightness"]
 
 
 def off(image, truth):
@@ -208,23 +209,14 @@ def traced(scene):
     return js.render(scene, camera(), SETTINGS, plan=PLAN)
 
 
-def test_an_image_under_jit_is_the_same():
-    scene = js.Scene(points=points())
-    np.testing.assert_allclose(traced(scene).color, shown(scene).color, atol=2e-6)
-    assert int(traced(scene).faults) == 0
-
-
 @pytest.mark.slow
-def test_an_image_in_bands_and_one_under_jit_are_the_same():
+def test_an_image_in_bands_is_the_same():
     scene, view = js.Scene(points=points(splats_beyond=3.0), **field()), camera()
     image, plan = js.render(scene, view, SETTINGS), js.plan(scene, view, SETTINGS)
     limited = dataclasses.replace(SETTINGS, memory_limit=plan.bytes // 2 + 40_000)
     assert js.plan(scene, view, limited).bands > 1
     in_bands = js.render(scene, view, limited)
-    jitted = jax.jit(lambda scene: js.render(scene, view, SETTINGS, plan=plan))(scene)
     np.testing.assert_array_equal(in_bands.color, image.color)
-    np.testing.assert_allclose(jitted.color, image.color, atol=2e-6)
-    assert int(jitted.faults) == 0
 
 
 @pytest.mark.slow
@@ -291,10 +283,10 @@ def moved(scene, view, step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mix", ["extinction", pytest.param("opacity", marks=pytest.mark.slow)])
-def test_derivatives_are_those_of_differences_in_both_modes(mix, x64):
+def test_derivatives_of_media_that_are_mixed_by_opacity_are_those_of_differences_in_both_modes(x64):
+    """By extinction: `test_conformance`."""
     names = "position", "radius", "color", "extinction", "values", "eye", "opening", "near"
-    scene, view = dataclasses.replace(gentle(), mix=mix), camera()
+    scene, view = dataclasses.replace(gentle(), mix="opacity"), camera()
     wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), view)
     plan, settings = js.plan(scene, wide, SETTINGS), SETTINGS
     weights = np.random.default_rng(0).uniform(-1, 1, (HEIGHT, WIDTH, 4))

@@ -87,29 +87,6 @@ def test_a_scene_of_float64_is_rendered_in_float64(x64):
     assert np.abs(np.asarray(image.color) - truth.color).max() < 2e-5  # the camera is float32
 
 
-@pytest.mark.slow
-def test_derivatives_are_those_of_differences(x64):
-    """By values and extinction, in reverse mode."""
-    shown, view = scene(FIELD.astype(np.float64)), camera(width=8, height=8)
-    shown = dataclasses.replace(shown, volume_transfer=transfer(extinction=(0.1, 2.0, 0.5)))
-    plan = js.plan(shown, view, SETTINGS)
-
-    def light(values, extinction):
-        volume = dataclasses.replace(shown.volume, values=values)
-        looks = dataclasses.replace(shown.volume_transfer, extinction=extinction)
-        image = js.render(dataclasses.replace(shown, volume=volume, volume_transfer=looks), view, SETTINGS, plan=plan)
-        return (image.color * jnp.arange(1.0, 4.0)).sum() + image.transmittance.sum()
-
-    at = shown.volume.values, shown.volume_transfer.extinction.astype(float)
-    rng, step = np.random.default_rng(0), 1e-6
-    both = jax.jit(jax.value_and_grad(light, (0, 1)))
-    found = both(*at)[1]
-    for k, gradient in enumerate(found):
-        way = jnp.asarray(rng.normal(size=at[k].shape))
-        ends = [both(*(leaf + sign * step * way if i == k else leaf for i, leaf in enumerate(at)))[0] for sign in (1, -1)]
-        np.testing.assert_allclose((gradient * way).sum(), (ends[0] - ends[1]) / (2 * step), rtol=2e-3)
-
-
 def test_values_that_are_no_numbers_are_a_fault_under_jit():
     shown, view = scene(), camera()
     broken = dataclasses.replace(shown.volume, values=jnp.asarray(np.where(FIELD[3, 2, 1] == FIELD, np.nan, FIELD)))
