@@ -8,6 +8,8 @@ from commanded import apart, run
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 TINY = ["--size", "24x16", "--samples", "16"]
 
 
@@ -38,7 +40,7 @@ def test_json_has_the_budget_and_the_ray_in_one_object(capsys):
 
 def test_a_figure_is_written_and_its_path_said(capsys):
     pytest.importorskip("matplotlib")
-    code, out, err = run(capsys, "explain", "scene:radial:particles=50", "--pixel", 8, 12, *TINY, "-o", "pixel.png")
+    code, out, err = run(capsys, "explain", "a.npz", "--color-by", "heat", "--pixel", 8, 12, *TINY, "-o", "pixel.png")
     assert (code, err) == (0, []) and "\npixel.png" in out
     with open("pixel.png", "rb") as file:
         assert file.read(4) == b"\x89PNG"
@@ -63,7 +65,7 @@ def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, sai
     assert code == 2 and len(err) == 1 and said in err[0]
 
 
-def test_a_pixel_of_a_picture_of_a_surface_is_explained_as_one(capsys):
+def test_a_pixel_of_a_picture_of_a_surface_is_explained_as_one(by_reference, capsys):
     more = ["--color-by", "heat", "--surface", "0.2", "--size", "24x16", "--samples", 16]
     code, out, _, wrong = apart(capsys, "explain", "a.npz", *more, "--pixel", 8, 12, "--json")
     told = json.loads(out)

@@ -78,7 +78,7 @@ def test_the_picture_is_the_one_that_the_library_makes(file, tmp_path, capsys):
     assert np.asarray(found.color).max() > 0.1
 
 
-def test_colour_and_opacity_are_by_the_quantities_asked_for(file, capsys):
+def test_colour_and_opacity_are_by_the_quantities_asked_for(file, by_reference, capsys):
     names = ["--color-by", "temperature", "--opacity-by", "log10:pressure"]
     code, out, _ = run(capsys, "render", file, "-o", "a.exr", *names, *TINY)
     assert code == 0 and "by log10:pressure" in out and "over temperature" in out
@@ -216,7 +216,7 @@ def test_verbose_shows_where_a_failure_comes_from(tmp_path, capsys):
     assert code == 1 and err[0].startswith("Traceback") and err[-1].startswith("jaxsph render:")
 
 
-def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, capsys):
+def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, by_reference, capsys):
     monkeypatch.chdir(tmp_path)
     np.savez("none.npz", position=np.zeros((0, 3)), temperature=np.zeros(0))
     assert run(capsys, "info", "none.npz")[0] == 0
@@ -237,23 +237,31 @@ def test_it_runs_as_a_module():
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
-def test_a_volume_is_rendered_described_and_cut_at_a_level(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def ball(tmp_path, monkeypatch):
+    """A volume in an otherwise empty working directory."""
     monkeypatch.chdir(tmp_path)
     x = np.linspace(-1, 1, 9)
-    ball = (200 * np.clip(1.2 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2), 0, 1)).astype(np.uint8)
-    io.write_volume("ball.vti", js.Volume.from_array(ball, (-1, -1, -1), 0.25))
+    values = (200 * np.clip(1.2 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2), 0, 1)).astype(np.uint8)
+    io.write_volume("ball.vti", js.Volume.from_array(values, (-1, -1, -1), 0.25))
+
+
+def test_a_volume_is_rendered_and_described(ball, by_reference, capsys):
     code, out, err = run(capsys, "render", "ball.vti", "-o", "out.exr", "--colormap", "heat", *TINY)
     assert (code, err) == (0, [])
     assert all(said in out for said in ("9 x 9 x 9 points", "uint8", "heat over", "= 0 .. ", "--eye"))
     assert np.asarray(io.read_image("out.exr").alpha).max() > 0.3
-    code, out, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
-    assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}
     code, out, _ = run(capsys, "info", "ball.vti")
     assert code == 0 and all(said in out for said in ("VTK XML image, 9 x 9 x 9", "spacing 0.25 0.25 0.25", "0 to 200"))
     code, _, err = run(capsys, "render", "ball.vti", "--support", "1", *TINY)
     assert code == 2 and err == ["jaxsph render: --support is for particles, and this is a volume (see `jaxsph render --help`)"]
     code, _, err = run(capsys, "render", "ball.vti", "--quantity", "rho", *TINY)
     assert code == 1 and err == ["jaxsph render: ball.vti: has no quantity 'rho'; it has values"]
+
+
+def test_a_volume_is_cut_at_a_level(ball, capsys):
+    code, _, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
+    assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}
 
 
 @pytest.mark.slow

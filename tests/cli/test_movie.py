@@ -37,7 +37,7 @@ def run(capsys, *arguments):
     return commanded.run(capsys, "movie", *arguments)
 
 
-def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence, tmp_path, capsys):
+def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence, tmp_path, by_reference, capsys):
     code, out, err = run(capsys, *sequence, "--frames", 5, "--fps", 10, "--orbit", 360, "-o", "m.mp4", *TINY)
     assert (code, err) == (0, [])
     said = (
@@ -60,7 +60,7 @@ def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence
     assert all(image.max() > 0.1 for image in images)
 
 
-def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, capsys):
+def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, by_reference, capsys):
     key = {"eye": [0, 0, 9], "target": [0, 0, 0], "near": 4, "far": 14}
     keys = {"keys": [{"time": 1} | key, {"time": 1.3} | key | {"eye": [1, 0, 9]}], "width": 20, "height": 12}
     (tmp_path / "keys.json").write_text(json.dumps(keys))

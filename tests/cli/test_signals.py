@@ -65,9 +65,9 @@ def left(folder):
 
 @posix
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_command_that_is_asked_to_end_at_any_moment_leaves_nothing(command, folder, capsys, monkeypatch):
+def test_a_command_that_is_asked_to_end_at_any_moment_leaves_nothing(command, folder, by_reference, capsys, monkeypatch):
     arguments = COMMANDS[command]
-    for _ in range(2):  # the first compiles
+    for _ in range(2):  # the first imports
         whole = Moment()
         assert run(whole, arguments, monkeypatch) == 0
         content = (folder / arguments[-1]).read_bytes()

@@ -8,15 +8,15 @@ from commanded import run
 import jaxsph as js
 from jaxsph.trade.measurement import JOURNAL, TABLE, read_journal
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
+pytestmark = pytest.mark.usefixtures("by_reference")
 
-PARTICLES, WIDTH, HEIGHT, SAMPLES = 2000, 40, 33, 16
+PARTICLES, WIDTH, HEIGHT, SAMPLES = 200, 24, 16, 16
 SOURCE = [f"scene:radial:particles={PARTICLES}", "--size", f"{WIDTH}x{HEIGHT}", "--samples", SAMPLES]
 LEAST_WORK = ["--estimators=", "--baselines", "samples/2", "--repeats", 1, "--converged", 1, "--integral", 10]
 
 
-@pytest.fixture(scope="module")
-def rows():
+@pytest.fixture
+def rows(by_reference):
     view, settings = js.scenes.load("radial", PARTICLES, width=WIDTH, height=HEIGHT), js.Settings(samples=SAMPLES)
     return js.sweep(*view, settings, estimators=(), baselines=("samples/2",), repeats=1, converged=1, integral=0, name="radial")
 

@@ -8,8 +8,6 @@ from commanded import run
 
 import jaxsph as js
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
-
 TINY = ["--size", "24x16", "--samples", "8"]
 
 
@@ -32,7 +30,7 @@ def saved(capsys, file, *arguments):
     return np.array(json.loads(open("x.json").read())["values"]), out
 
 
-def test_transfer_draws_a_figure_and_saves_a_function_that_render_takes(file, tmp_path, capsys):
+def test_transfer_draws_a_figure_and_saves_a_function_that_render_takes(file, tmp_path, by_reference, capsys):
     pytest.importorskip("matplotlib")
     _, out = saved(capsys, file, "--quantity", "density", "--norm", "log", *TINY[:2])
     assert (tmp_path / "drop_transfer.png").stat().st_size > 1000 and "log," in out
@@ -60,7 +58,7 @@ def test_a_preset_of_a_logarithmic_quantity_takes_no_logarithm_again(file, capsy
     assert "(density)" in out
 
 
-def test_annotate_writes_a_wider_picture_that_keeps_its_record(file, tmp_path, capsys):
+def test_annotate_writes_a_wider_picture_that_keeps_its_record(file, tmp_path, by_reference, capsys):
     pytest.importorskip("matplotlib")
     from PIL import Image
 
@@ -71,7 +69,7 @@ def test_annotate_writes_a_wider_picture_that_keeps_its_record(file, tmp_path, c
     assert run(capsys, "render", "scene:mixer:particles=40", "--annotate", "-o", "b.png", *TINY)[0] == 0
 
 
-def test_a_volume_has_domains_and_a_key_too(tmp_path, monkeypatch, capsys):
+def test_a_volume_has_domains_and_a_key_too(tmp_path, monkeypatch, by_reference, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.chdir(tmp_path)
     volume = js.Volume.from_array(np.geomspace(1, 1e4, 64).reshape(4, 4, 4).astype(np.float32), (0, 0, 0), 1.0)

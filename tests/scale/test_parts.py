@@ -1,6 +1,7 @@
 """Parts of a picture: together the same bits as the whole, and refused where they make none."""
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -11,6 +12,8 @@ import jaxsph as js
 from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.scale.parts import cuts
+
+pytestmark = pytest.mark.usefixtures("quick_programs")
 
 LAYERS = ("color", "transmittance", "depth", "error_bound", "evaluations")
 LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 6.0])
@@ -30,9 +33,14 @@ def parts_of(scene, camera, settings, count):
     return [js.scale.render_tile(scene, camera, settings, index, count) for index in range(count)]
 
 
-@pytest.fixture(scope="module")
-def three():
+@functools.cache
+def parts():
     return parts_of(*view(), SETTINGS, 3)
+
+
+@pytest.fixture
+def three(quick_programs):
+    return parts()
 
 
 @pytest.mark.parametrize(

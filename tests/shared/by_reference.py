@@ -5,6 +5,7 @@ Also a program: `by_reference.py view FILE ...` is a command whose pictures are 
 
 import contextlib
 import dataclasses
+import importlib
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -16,9 +17,12 @@ from surfaced import crossing
 
 import jaxsph as js
 from jaxsph.cli.main import main
+from jaxsph.engine.frame.images import metadata_of
 from jaxsph.model.camera.snug import with_depths
-from jaxsph.viewer import stages
 
+RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task")
+RENDER += ("jaxsph.analysis.surface_depth", "jaxsph.analysis.explanation.surface")
+PLAN = {"jaxsph.viewer.stages": "plan", "jaxsph.trade.sweep": "make_plan", "jaxsph.sequence.task": "make_plan"}
 DEPTHS = 200  # along a ray, between which a surface is looked for
 BOUND = 0.003  # of the error of what was asked for with a tolerance
 
@@ -26,7 +30,7 @@ BOUND = 0.003  # of the error of what was asked for with a tolerance
 class Roomy:
     """A plan that has room for everything."""
 
-    choices = None
+    choices, bytes = None, 1
 
     def serves(self, _: Any) -> bool:
         return True
@@ -40,8 +44,9 @@ def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, 
     plainly = dataclasses.replace(settings, tolerance=None)
     image = _surface(scene, camera) if scene.surface is not None else js.reference.render(scene, camera, plainly)
     certified = {} if settings.tolerance is None else {"error_bound": np.full(image.shape, BOUND), "certified": True}
-    seconds = {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}
-    return dataclasses.replace(image, stats={"seconds": seconds, **image.stats}, **certified)
+    seconds = dict.fromkeys(("plan", "compile", "grid", "adapt", "cast", "image"), 1.0)
+    told = metadata_of(with_depths(camera, scene), settings, settings.tolerance is not None)
+    return dataclasses.replace(image, stats=image.stats | {"seconds": seconds}, metadata=told, **certified)
 
 
 def _surface(scene: Any, camera: Any) -> js.Image:
@@ -58,12 +63,12 @@ def _surface(scene: Any, camera: Any) -> js.Image:
 
 @contextlib.contextmanager
 def pictures_by_reference() -> Iterator[None]:
-    """Those of `jaxsph.render`, as users and commands call it, and of an interactive view."""
-    with (
-        mock.patch.object(js, "render", render),
-        mock.patch.object(stages, "render", render),
-        mock.patch.object(stages, "plan", lambda *_, **__: Roomy()),
-    ):
+    """Those of `jaxsph.render`, as users, commands, views, sequences and sweeps call it."""
+    with contextlib.ExitStack() as patched:
+        for name in RENDER:
+            patched.enter_context(mock.patch.object(importlib.import_module(name), "render", render))
+        for name, verb in PLAN.items():
+            patched.enter_context(mock.patch.object(importlib.import_module(name), verb, lambda *_, **__: Roomy()))
         yield
 
 
