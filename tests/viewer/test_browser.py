@@ -92,8 +92,8 @@ def shown(page):
 
 def rendered(page):
     """What `jaxsph.render` makes of the same view, by the code that the page tells, (H, W, 3)."""
-    page.ask("document.querySelector('button[title=\"Python and command\"]').click()")
-    code = page.until("document.querySelector('.code').textContent").partition("\n\n")[2]
+    page.ask("document.querySelector('button[title=\"Python\"]').click()")
+    code = page.until("document.querySelector('.code').textContent")
     page.ask("document.querySelector('dialog[open] button').click(), document.querySelector('.code').textContent = ''")
     space = {}
     exec(code.replace('image.save("view.png")', ""), space)
