@@ -1,14 +1,12 @@
-"""Measurement: one row of a sweep's table, what it was made of and on what, and the files that the table is kept in.
+"""Measurement: one row of a sweep's table, what it was made of and on what, and the file that the table is kept in.
 
-Flow: scene, camera, settings -> sweep -> [measurement] -> sweep.jsonl, sweep.csv -> figures.
+Flow: scene, camera, settings -> sweep -> [measurement] -> sweep.csv -> figures.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import dataclasses
-import json
 import os
 import platform
 import subprocess
@@ -19,17 +17,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.io.damage import regular_file
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.replace import written_whole
 from jaxsph.model import Camera, Scene, Settings
 from jaxsph.numerics.version import __version__
 
-JOURNAL, TABLE = "sweep.jsonl", "sweep.csv"
-"""Names in a sweep's folder: one JSON object a line, appended as it is measured; and the same as comma-separated values."""
-
-KEY = ("scene", "frame", "fingerprint", "method", "tolerance", "repeats", "integral", "dtype", "device", "jaxsph")
-"""What makes two measurements the same: a sweep does not measure again what its folder holds."""
+TABLE = "sweep.csv"
+"""Name in a sweep's folder."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -111,11 +105,6 @@ class Measurement:
     python: str
     commit: str | None
 
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """What tells this measurement from others."""
-        return tuple(getattr(self, name) for name in KEY)
-
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Measurement))
 
@@ -146,55 +135,6 @@ def _commit() -> str | None:
         return git("describe", "--always", "--dirty", "--exclude", "*")
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def read_journal(path: str | Path) -> list[Measurement]:
-    """The measurements in a journal, oldest first; none where there is no file. A last line without its end is left out.
-
-    Lines from before the light integral was taken are of 0 pixels of it.
-
-    Raises:
-        ValueError: no regular file, or a line that is not a measurement of this version.
-    """
-    path = Path(path)
-    if not path.exists():
-        return []
-    *lines, _ = regular_file(path).read_text(encoding="utf-8").split("\n")
-    return [_parsed(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.strip()]
-
-
-def _parsed(line: str, where: str) -> Measurement:
-    try:
-        return Measurement(**json.loads(line))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where} is not a measurement of this version of jaxsph; give another folder, or move it") from error
-
-
-def append(path: str | Path, measurement: Measurement) -> None:
-    """Add a line to a journal that does not hold this measurement yet, and see it written; one process at a time.
-
-    What an interrupted write left at its end is cut off first.
-    """
-    line = json.dumps(dataclasses.asdict(measurement), allow_nan=False) + "\n"
-    with open(path, "ab+") as file:
-        _lock(file)
-        if measurement.key in {row.key for row in read_journal(path)}:  # another process was faster
-            return
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)
-        file.write(line.encode())
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _lock(file: Any) -> None:
-    """Wait until no other process adds to a file, until it is closed; where disks or systems have no locks, go on."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return
-    with contextlib.suppress(OSError):
-        fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def write_table(path: str | Path, measurements: Iterable[Measurement]) -> None:

@@ -37,7 +37,7 @@ from jaxsph.trade.contenders import (
     layers_of,
     scaled_up,
 )
-from jaxsph.trade.measurement import JOURNAL, KEY, TABLE, Measurement, append, of_frame, of_this_run, read_journal, write_table
+from jaxsph.trade.measurement import TABLE, Measurement, of_frame, of_this_run, write_table
 
 STAGES = ("grid", "adapt", "cast", "image")
 
@@ -67,10 +67,6 @@ class _Frame:
     scene: Scene
     camera: Camera
     shared: dict[str, Any]
-
-    def key(self, setting: Contender) -> tuple[Any, ...]:
-        found = self.shared | {"method": setting.method, "tolerance": setting.tolerance}
-        return tuple(found[name] for name in KEY)
 
 
 def sweep(
@@ -104,8 +100,7 @@ def sweep(
             `"segments"` is `"segments/1"`; `"size/K"`, an image K times smaller each way, scaled up bilinearly.
         name: of the scene, for the table.
         frames: a number for each frame; default 0, 1, ... of a sequence.
-        folder: where the table is kept, as `sweep.jsonl` (a line as soon as it is measured) and `sweep.csv`; made if need
-            be. What it holds already is not measured again. `None` keeps nothing.
+        folder: where the table is kept, as `sweep.csv` (a row as soon as it is measured); made if need be. `None` keeps nothing.
         progress: called as `progress(done, total)` after every image.
         effort: `repeats` and `converged`, at least 1, default 3 and 8; and `integral`, at how many pixels to take the light
             integral (`jaxsph.reference.integral`, which knows no `media`), default 1000; 0: none.
@@ -115,7 +110,7 @@ def sweep(
 
     Raises:
         TypeError: an argument that there is not.
-        ValueError: arguments out of range, scenes and cameras that do not pair, a folder that holds something else.
+        ValueError: arguments out of range, scenes and cameras that do not pair, a folder that cannot be made.
 
     References:
         Hochstetter, Orthmann & Kolb 2016, section 7, tables 2 and 3, figures 11 and 12.
@@ -126,6 +121,7 @@ def sweep(
     asked = record_of(Effort, effort, "sweep")
     views = _views(scene, camera, frames)
     groups = contenders(settings, tolerances, estimators_of((one for _, one, _ in views), estimators), baselines)
+    groups = [group for group in groups if group]
     shared = {"scene": name} | dataclasses.asdict(asked) | of_this_run()
     each = [
         _Frame(one, view, shared | of_frame(one, view, settings, asked.converged) | {"frame": number})
@@ -141,28 +137,24 @@ def _rows(
     folder: str | os.PathLike[str] | None,
     progress: Progress | None,
 ) -> list[Measurement]:
-    """The table: what the folder holds of it, and what is measured now."""
-    journal = None if folder is None else _journal(folder)
-    held = {} if journal is None else {row.key: row for row in read_journal(journal)}
-    tasks = [(frame, [[setting for setting in group if frame.key(setting) not in held] for group in groups]) for frame in frames]
-    truths = 2 + bool(effort.integral)
-    turns = [[[one for one in group if one.method != FULL_RATE] for group in missing if group] for _, missing in tasks]
-    total = sum(truths * bool(each) + sum(len(one) + effort.repeats * (1 + len(one)) for one in each) for each in turns)
+    """The table; in a folder as far as it is measured."""
+    path = None if folder is None else _made(folder) / TABLE
+    turns = [[one for one in group if one.method != FULL_RATE] for group in groups]
+    images = 2 + bool(effort.integral) + sum(len(one) + effort.repeats * (1 + len(one)) for one in turns)
     plans: Plans = {}
     done = itertools.count(1)
 
     def tick() -> None:
         if progress is not None:
-            progress(next(done), total)
+            progress(next(done), images * len(frames))
 
-    for frame, missing in tasks:
-        for row in _measure(frame, groups[0][0], missing, plans, tick):
-            held[row.key] = row
-            if journal is not None:
-                append(journal, row)
-    if journal is not None:
-        write_table(journal.with_name(TABLE), held.values())
-    return [held[frame.key(setting)] for frame, _ in tasks for group in groups for setting in group]
+    rows: list[Measurement] = []
+    for frame in frames:
+        for row in _measure(frame, groups, plans, tick):
+            rows.append(row)
+            if path is not None:
+                write_table(path, rows)
+    return rows
 
 
 def _views(
@@ -181,12 +173,9 @@ def _views(
     return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
 
 
-def _measure(
-    frame: _Frame, full: Contender, missing: list[list[Contender]], plans: Plans, tick: Callable[[], None]
-) -> Iterable[Measurement]:
-    """Rows of what is missing of a frame, as soon as each group has taken its turns."""
-    if not any(missing):
-        return
+def _measure(frame: _Frame, groups: list[list[Contender]], plans: Plans, tick: Callable[[], None]) -> Iterable[Measurement]:
+    """Rows of a frame, as soon as each group has taken its turns."""
+    full = groups[0][0]
     finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
     converged = _First.of(frame, Contender("converged", finer), plans).layers
     tick()
@@ -195,13 +184,13 @@ def _measure(
     integral = IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"])
     if frame.shared["integral"]:
         tick()
-    for group in missing:
+    for group in groups:
         firsts = [of_full]
         for setting in group:
             if setting is not full:
                 firsts.append(_First.of(frame, setting, plans))
                 tick()
-        times = _in_turns(frame, firsts, frame.shared["repeats"], tick) if group else []
+        times = _in_turns(frame, firsts, frame.shared["repeats"], tick)
         for first, turns in zip(firsts, times, strict=False):
             if first.setting in group:
                 found = _compared(first, of_full, converged, integral) | _medians(turns)
@@ -299,10 +288,9 @@ def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: Int
     return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
 
 
-def _journal(folder: str | os.PathLike[str]) -> Path:
-    """Path of the journal; its folder is made."""
+def _made(folder: str | os.PathLike[str]) -> Path:
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"`folder` {os.fspath(folder)} cannot be made ({error.strerror}); give another one") from error
-    return Path(folder) / JOURNAL
+    return Path(folder)

@@ -1,4 +1,4 @@
-"""The Python and the command that make a view again.
+"""The Python that makes a view again.
 
 Flow: state, source -> [code] -> text for people to paste.
 """
@@ -6,36 +6,16 @@ Flow: state, source -> [code] -> text for people to paste.
 from __future__ import annotations
 
 import dataclasses
-import shlex
 from typing import Any
 
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.particles.surface import Surface
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer import cut
 from jaxsph.viewer.pose import Pose
-
-LOOK_FILE = "look.json"
-REPLACED = (
-    "--eye",
-    "--target",
-    "--up",
-    "--fov",
-    "--view",
-    "--center",
-    "--width",
-    "--clip",
-    "--size",
-    "--port",
-    "--range",
-    "--preset",
-)
-LOOKS = ("--colormap", "--norm", "--range", "--preset", "--transfer", "--exposure", "--optical-depth")
-FLAGS = ("--no-browser", "--picture-all", "--quiet", "--verbose", "-q", "-v")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,14 +24,10 @@ class Source:
 
     Attributes:
         python: lines that make `scene`; where they are not known, a line that says so.
-        file: on the command line, FILE or scene:NAME; empty where there is none.
-        words: options that it was opened with.
-        whole: whether look and camera are to be said, too, as they are those of a sequence.
+        whole: whether look and camera are to be said, too, as those lines do not make them.
     """
 
     python: str = "# scene: as it was given to js.view"
-    file: str = ""
-    words: tuple[str, ...] = ()
     whole: bool = False
 
 
@@ -76,53 +52,6 @@ def python_of(
         lines.append("scene = dataclasses.replace(scene, transfer=transfer)")
     lines += [f"image = js.render(scene, camera, js.{settings!r})", 'image.save("view.png")']
     return "\n".join(lines)
-
-
-def command_of(
-    source: Source,
-    camera: Camera,
-    pose: Pose | None,
-    edited: bool,
-    settings: Settings,
-    surface: Surface | None = None,
-    within: Clip | None = None,
-) -> str:
-    """The command that makes the picture again, with a pose by clips of `within`; else why there is none, as of parallel rays."""
-    if not source.file:
-        return "# a scene of Python's has no command"
-    if pose is not None and not pose.perspective:
-        return "# a parallel view that has moved or is cut has no command; use the Python"
-    words = _kept(source.words, drop_look=edited, drop_view=pose is not None)
-    if pose is not None:
-        for name, place in (("--eye", pose.eye), ("--target", pose.target), ("--up", pose.axes[1])):
-            words.append(f"{name}={','.join(f'{value:.9g}' for value in place)}")
-        words.append(f"--fov={2 * np.degrees(np.arctan(pose.tangent)):.9g}")
-        words += [f"--clip={clip}" for clip in cut.words_of(within)]
-    words.append(f"--size={camera.width}x{camera.height}")
-    if edited:
-        words.append(f"--transfer={LOOK_FILE}")
-    said = {word.partition("=")[0] for word in words}
-    if surface is not None and "--surface" not in said:  # else a transfer function shows a medium
-        words.append(f"--surface={float(surface.level):.9g}")
-    if settings.tolerance is not None:
-        chosen = {"--integrator": settings.integrator, "--tolerance": f"{settings.tolerance:g}"}
-        words += [f"{name}={value}" for name, value in chosen.items() if name not in said]
-    return shlex.join(["jaxsph", "render", source.file, *words, "-o", "view.png"])
-
-
-def _kept(words: tuple[str, ...], *, drop_look: bool, drop_view: bool) -> list[str]:
-    """Options, each with its value in one word, without those that the view has said anew."""
-    gone = {"--port", "--size", *(LOOKS if drop_look else ()), *(REPLACED if drop_view else ())}
-    kept: list[str] = []
-    skip = False
-    for word in words:
-        name = word.partition("=")[0]
-        if skip and not word.startswith("--"):
-            continue
-        skip = name in gone
-        if not skip and word not in FLAGS:
-            kept.append(word)
-    return kept
 
 
 def _camera(camera: Camera, pose: Pose) -> str:

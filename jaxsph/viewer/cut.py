@@ -1,6 +1,6 @@
 """What of a scene is cut away while one looks around: a plane across the view, a box, or a sphere.
 
-Flow: message, Pose -> [cut] -> Clip of the scene; JSON of a page; words of Python and of the command line.
+Flow: message, Pose -> [cut] -> Clip of the scene; JSON of a page; words of Python.
 
 A cut is measured from a middle, in shares of a reach: what the view turned about, and half of its visible height, when it was
 chosen. To move it moves arrays of a clip, and compiles nothing; its kind is static.
@@ -110,18 +110,6 @@ def read(told: Any) -> Cut | None:
         raise InputError("`axis` of a cut must have a direction")
     reach, share = number(said, "reach", 1e-30, 1e30), number(said, "share", *SHARES[kind][:2])
     return Cut(kind, vectors[0], reach, share, vectors[1], told.get("follows") is True, told.get("outside") is True)
-
-
-def words_of(clip: Clip | None) -> list[str]:
-    """Values of `--clip` that together are a clip as the command line makes them."""
-    if clip is None:
-        return []
-    if isinstance(clip, Both):
-        return [*words_of(clip.first), *words_of(clip.second)]
-    if isinstance(clip, Outside):
-        return [f"~{one}" for one in words_of(clip.clip)]
-    numbers = ",".join(f"{value:.9g}" for given in _given(clip) for value in np.ravel(given))
-    return [f"{type(clip).__name__.lower()}:{numbers}"]
 
 
 def python_of(clip: Clip) -> str:

@@ -159,7 +159,7 @@ class Session:
         return self._state.path
 
     def code(self) -> dict[str, str]:
-        """The Python and the command that make the newest state again."""
+        """The Python that makes the newest state again."""
         with self._lock:
             line = self._timeline
             return self._state.code(self._source if line is None else line.frames[line.number].source, self.settings)

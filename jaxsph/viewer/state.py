@@ -19,7 +19,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.viewer.code import Source, command_of, python_of
+from jaxsph.viewer.code import Source, python_of
 from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking
 from jaxsph.viewer.cut import Cut, asked, read
 from jaxsph.viewer.inputs import KNOWN_EDITS, MOTIONS, InputError, edit
@@ -114,15 +114,10 @@ class State:
         }
 
     def code(self, source: Source, settings: Settings) -> dict[str, str]:
-        """The Python and the command that make it again."""
+        """The Python that makes it again."""
         moved, edited = self.moved or source.whole, self.edited or source.whole
-        pose, camera = self.pose if moved else None, self.camera
-        look = self.transfer if edited else None
-        placed = self.pose if self.cut is not None else pose  # as clips have a say in where a command looks from
-        return {
-            "python": python_of(source, camera, pose, look, settings, self.scene.within),
-            "command": command_of(source, camera, placed, edited, settings, self._base.surface, self.scene.within),
-        }
+        pose, look = self.pose if moved else None, self.transfer if edited else None
+        return {"python": python_of(source, self.camera, pose, look, settings, self.scene.within)}
 
     def do(self, message: dict[str, Any], seen: Seen) -> None:
         """Do what a message asks for, see `inputs`; also `OTHERS`.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxsph.model.scene import Scene
@@ -99,18 +98,17 @@ class Timeline:
         return None
 
 
-def timeline_of(snapshots: Snapshots, source: Callable[[Path, float], Source] = lambda *_: Source()) -> tuple[Scene, Timeline]:
-    """The first frame of a sequence that can be read, and all of them; `source` of a file and its time."""
+def timeline_of(snapshots: Snapshots, source: Callable[[float], Source] = lambda _: Source()) -> tuple[Scene, Timeline]:
+    """The first frame of a sequence that can be read, and all of them; `source` of a time."""
     frames = tuple(_frames(snapshots, source))
     first = next(number for number, frame in enumerate(frames) if frame.time is not None)
     return frames[first].scene(), Timeline(frames, first)
 
 
-def _frames(snapshots: Snapshots, source: Callable[[Path, float], Source]) -> Iterator[Frame]:
+def _frames(snapshots: Snapshots, source: Callable[[float], Source]) -> Iterator[Frame]:
     files, unread = iter(snapshots.survey.files), {file.why: file.path for file in snapshots.survey.unread}
     for one in snapshots.each():
         if isinstance(one, Moment):
-            path = next(files).path
-            yield Frame(path.name, one.time, one, source(path, one.time))
+            yield Frame(next(files).path.name, one.time, one, source(one.time))
         else:
             yield Frame(unread[one.why].name, None, one, Source())

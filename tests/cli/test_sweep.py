@@ -1,12 +1,13 @@
 """`jaxsph sweep`: what `js.sweep` measures, as a table and figures in a folder."""
 
+import csv
 import sys
 
 import pytest
 from commanded import run
 
 import jaxsph as js
-from jaxsph.trade.measurement import JOURNAL, TABLE, read_journal
+from jaxsph.trade.measurement import TABLE
 
 pytestmark = pytest.mark.usefixtures("by_reference")
 
@@ -25,13 +26,14 @@ def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, caps
     pytest.importorskip("matplotlib")
     code, out, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "new" / "out", "--moments", "0,2", *LEAST_WORK)
     assert (code, err) == (0, [])
-    names = ("sweep.jsonl", "sweep.csv", "error.png", "pareto.png", "integral.png", "frames.png")
+    names = ("sweep.csv", "error.png", "pareto.png", "integral.png", "frames.png")
     assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == sorted(names)
     assert all(name in out for name in names) and "samples/2" in out and "frame 2" in out
-    found = read_journal(tmp_path / "new" / "out" / JOURNAL)
-    assert [(row.frame, row.method) for row in found] == [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
-    assert {row.max_error for row in found[1::2]} == {rows[1].max_error}  # it does not move
-    assert all(0 < row.integral_mean <= row.integral_max and row.integral == 10 for row in found) and "to integral" in out
+    found = list(csv.DictReader((tmp_path / "new" / "out" / TABLE).open()))
+    wanted = [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
+    assert [(float(row["frame"]), row["method"]) for row in found] == wanted and "to integral" in out
+    assert {float(row["max_error"]) for row in found[1::2]} == {rows[1].max_error}  # it does not move
+    assert all(0 < float(row["integral_mean"]) <= float(row["integral_max"]) and row["integral"] == "10" for row in found)
 
 
 def test_without_matplotlib_the_command_says_so_before_the_work(tmp_path, capsys, monkeypatch):
@@ -86,5 +88,5 @@ def test_a_surface_has_no_tolerances_to_compare(tmp_path, capsys):
         js.sweep(shown, camera, js.Settings(samples=SAMPLES), estimators=("pilot",))
     code, out, err = run(capsys, "sweep", *words, *LEAST_WORK[1:])
     assert (code, err) == (0, []) and "samples/2" in out
-    found = read_journal(tmp_path / "out" / JOURNAL)
-    assert [row.method for row in found] == ["full rate", "samples/2"]
+    found = csv.DictReader((tmp_path / "out" / TABLE).open())
+    assert [row["method"] for row in found] == ["full rate", "samples/2"]

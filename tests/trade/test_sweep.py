@@ -1,9 +1,8 @@
-"""The sweep: errors are those of the images, the table is kept and never measured twice, the figures are drawn."""
+"""The sweep: errors are those of the images, the table is kept, the figures are drawn."""
 
 import csv
 import dataclasses
 import importlib
-import json
 import types
 
 import numpy as np
@@ -13,7 +12,7 @@ import jaxsph as js
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade import measurement
 from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
-from jaxsph.trade.measurement import COLUMNS, JOURNAL, TABLE, append, read_journal, write_table
+from jaxsph.trade.measurement import COLUMNS, TABLE, write_table
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -88,20 +87,6 @@ def test_stages_add_up_and_compiling_is_apart(rows):
         assert row.deviation == 0 and row.bytes > 0
 
 
-def test_what_a_folder_holds_is_not_measured_again(view, rows, folder, monkeypatch):
-    before = (folder / JOURNAL).read_text()
-    steps = []
-    settings = SETTINGS
-    more = {"name": "radial", "folder": folder, "progress": lambda done, total: steps.append((done, total))}
-    assert js.sweep(*view, settings, **CHOSEN, **ONCE, **more) == rows
-    assert not steps and (folder / JOURNAL).read_text() == before
-    found = js.sweep(*view, settings, **CHOSEN | {"tolerances": (0.02, 0.1), "estimators": ("interval",)}, **ONCE, **more)
-    assert [row.tolerance for row in found[2:]] == [0.02, 0.1] and found[:3] == rows[:3]
-    added = (folder / JOURNAL).read_text().removeprefix(before).splitlines()
-    assert [json.loads(line)["tolerance"] for line in added] == [0.1]
-    assert steps == [(done, 5) for done in range(1, 6)]  # two truths, the new setting, and its turn with full rate
-
-
 def test_estimators_are_those_that_suit_full_rate():
     assert suitable(SETTINGS) == tuple(ESTIMATORS)
     assert suitable(js.Settings(integrator="segments")) == ("segments",)
@@ -163,7 +148,7 @@ def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_
     assert segments.over_tolerance == (full > 0.01).mean() > 0 and segments.over_bound == (full > 0).mean()
     assert steps[-1][0] == steps[-1][1] == len(steps)
     without = js.sweep(scene, camera, POINTS_8, **chosen)[-1]
-    assert without.integral_max is without.over_tolerance is without.over_bound is None and without.key != segments.key
+    assert without.integral_max is without.over_tolerance is without.over_bound is None
 
 
 def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
@@ -192,10 +177,7 @@ def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp
 
     with pytest.raises(KeyboardInterrupt):
         js.sweep(scene, camera, POINTS_4, **chosen, progress=stop)
-    assert [row.method for row in read_journal(tmp_path / JOURNAL)] == ["full rate"]
-    by_reference.clear()
-    rows = js.sweep(scene, camera, POINTS_4, **chosen)
-    assert [row.method for row in rows] == ["full rate", "pilot"] and len(by_reference) == 2 + 1 + 2
+    assert [row["method"] for row in csv.DictReader((tmp_path / TABLE).open())] == ["full rate"]
 
 
 def test_other_data_is_another_measurement(view):
@@ -209,33 +191,6 @@ def test_other_data_is_another_measurement(view):
     variants += [(scene, camera, dataclasses.replace(SETTINGS, merge=False), 8)]
     digests = [measurement.of_frame(*variant)["fingerprint"] for variant in variants]
     assert len(set(digests)) == len(variants) and digests[0] == measurement.of_frame(*view, settings, 8)["fingerprint"]
-
-
-def test_a_line_that_was_cut_short_is_measured_again_and_the_others_are_kept(rows, tmp_path):
-    path = tmp_path / JOURNAL
-    append(path, rows[0])
-    with open(path, "a") as file:
-        file.write('{"scene": "rad')
-    assert read_journal(path) == [rows[0]]
-    append(path, rows[1])
-    assert read_journal(path) == rows[:2]
-    path.write_text('{"scene": "radial"}\n')
-    with pytest.raises(ValueError, match=r"line 1 is not a measurement.*another folder"):
-        read_journal(path)
-
-
-def test_two_processes_that_measured_the_same_leave_one_line_of_it(rows, tmp_path):
-    path = tmp_path / JOURNAL
-    for row in (rows[0], rows[1], rows[0], rows[1]):
-        append(path, row)
-    assert read_journal(path) == rows[:2]
-
-
-def test_lines_from_before_there_was_an_integral_are_read(rows, tmp_path):
-    new = {name: getattr(rows[1], name) for name in COLUMNS}
-    old = {name: value for name, value in new.items() if not name.startswith("integral")}
-    (tmp_path / JOURNAL).write_text(json.dumps(old) + "\n")
-    assert read_journal(tmp_path / JOURNAL) == [dataclasses.replace(rows[1], integral=0)]
 
 
 def test_the_csv_is_the_same_table(rows, tmp_path):

@@ -89,8 +89,8 @@ def shown(page):
 
 def rendered(page):
     """What is made of the same view by the code that the page tells, (H, W, 3)."""
-    page.ask("document.querySelector('button[title=\"Python and command\"]').click()")
-    code = page.until("document.querySelector('.code').textContent").partition("\n\n")[2]
+    page.ask("document.querySelector('button[title=\"Python\"]').click()")
+    code = page.until("document.querySelector('.code').textContent")
     page.ask("document.querySelector('dialog[open] button').click(), document.querySelector('.code').textContent = ''")
     space = {}
     with by_reference.pictures_by_reference():

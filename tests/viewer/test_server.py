@@ -16,6 +16,7 @@ import threading
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
@@ -28,7 +29,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import jaxsph as js
+from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.commands import view as command
+from jaxsph.cli.options import values
 from jaxsph.viewer.server import MAX_MESSAGE, MAX_RECEIVED, MAX_TABS, Server
 from jaxsph.viewer.session import Session
 
@@ -288,3 +291,17 @@ def test_settings_of_the_command():
     assert made(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
     assert made(command.View(integrator="samples")).tolerance is None
     assert made(command.View(), fluid).tolerance is None  # a surface has none
+
+
+def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    position = np.random.default_rng(0).normal(size=(60, 3))
+    np.savez("a.npz", position=position, support=np.full(60, 0.8), heat=position[:, 0])
+    words = {"exposure": 1.0, "support": 0.9, "range": (-1.0, 2.0), "fov_degrees": 30.0, "where": "heat > -1"}
+    asked = command.View(source="a.npz", clip=(values.clip("~sphere:0,0,0,0.5"),), size=(12, 8), **words)
+    opened, seen, _ = cli_scene.scene_of(asked)
+    space = {"js": js}
+    exec(command._source(asked).python, space)
+    for one, other in zip(*(jax.tree.leaves(made) for made in ((opened, seen), (space["scene"], space["camera"]))), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert "points" in command._source(dataclasses.replace(asked, points=("stars",), words=("a.npz", "--points=stars"))).python

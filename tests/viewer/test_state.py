@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.viewer.cut import words_of
+from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.state import State
 
@@ -97,8 +97,8 @@ def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene()
     there.do({"do": "cut", "kind": "box", "share": 0.3, "outside": True}, nowhere)
     told = json.loads(json.dumps(there.told()))
     here.do({"do": "restore", "pose": told["pose"], "points": None, "cut": told["cut"]}, nowhere)
-    assert words_of(here.scene.within) == words_of(there.scene.within)
-    assert [word.partition(":")[0] for word in words_of(here.scene.within)] == ["sphere", "~box"]
+    assert python_of(here.scene.within) == python_of(there.scene.within)
+    assert [word.partition("(")[0] for word in python_of(here.scene.within)[1:].split(" & ")] == ["js.Sphere", "~js.Box"]
     here.do({"do": "restore", "pose": told["pose"], "cut": None}, nowhere)
     assert here.scene.within is scene.within
 

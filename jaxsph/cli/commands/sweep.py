@@ -22,7 +22,7 @@ from jaxsph.cli.voice import say
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade import contenders
-from jaxsph.trade.measurement import JOURNAL, TABLE, Measurement
+from jaxsph.trade.measurement import TABLE, Measurement
 from jaxsph.trade.sweep import sweep as measured
 
 
@@ -96,7 +96,7 @@ SWEEP = Sweep()
 
 
 def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, asked: Sweep = SWEEP) -> None:
-    """Sweep, write, and say: append to DIR/sweep.jsonl what it does not hold yet, and write sweep.csv and figures."""
+    """Sweep, write DIR/sweep.csv and figures, and say."""
     options = dataclasses.replace(asked, source=file)
     if options.surface is None:  # of a liquid tolerances are compared, which its surface does not have
         options = dataclasses.replace(options, surface=False)
@@ -121,7 +121,7 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
     voice.result(f"{'method':17s} tolerance max error  mean error  to integral      bound  evaluations  seconds  of full rate")
     voice.result("\n".join(map(_line, rows)))
     voice.report(rows=[dataclasses.asdict(row) for row in rows])
-    written = [options.output / JOURNAL, options.output / TABLE]
+    written = [options.output / TABLE]
     if not options.no_figures:
         written += figures.draw(rows, options.output)
     for path in written:

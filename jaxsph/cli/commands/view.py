@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import shlex
 import warnings
 import webbrowser
 from pathlib import Path
@@ -23,9 +24,11 @@ from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
 from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.opening import read_scene as opening
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.code import Source
+from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
@@ -106,40 +109,28 @@ def _settings(options: Any, scene: Scene) -> Settings:
 
 
 def _source(options: Any) -> Source:
-    """How the scene is opened in Python, and by the command."""
+    """How the scene is opened in Python."""
     width, height = options.size
+    if any(getattr(options, name) not in (None, ()) for name in ("points", "volume", "iso", "mix")):
+        return Source(f"# scene: as it was opened by {shlex.join(['jaxsph', 'view', *options.words])}", whole=True)
+    fields = [field for group in opening.GROUPS for field in dataclasses.fields(group) if field.name != "size"]
+    given = {field.name: getattr(options, field.name) for field in fields if getattr(options, field.name) != field.default}
     if options.source.startswith(SCENE):
         name, behind = values.file_and_options(options.source)
         more = "".join(f"{key}={value}, " for key, value in behind.items())
-        more += f"width={width}, height={height}"
-        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more})"
+        python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more}width={width}, height={height})"
         if options.surface not in (None, False):
             python += f"\nscene = dataclasses.replace(scene, surface=js.Surface({options.surface!r}))"
-    else:
-        names = (
-            "color_by",
-            "opacity_by",
-            "center",
-            "width",
-            "view",
-            "where",
-            "colormap",
-            "norm",
-            "range",
-            "preset",
-            "surface",
-            "surface_of",
-            "eye",
-            "target",
-        )
-        given = {name: getattr(options, name) for name in names}
-        said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
-        python = f"scene, camera = js.io.read_scene({options.source!r}{said}, size=({width}, {height}))"
-    return Source(python, options.source, tuple(word for word in options.words if word != options.source))
+        return Source(python, whole=bool(given.keys() - {"surface"}))
+    said = {name: repr(str(value) if isinstance(value, Path) else value) for name, value in given.items()}
+    if options.clips:
+        said["clips"] = f"[{', '.join(map(python_of, options.clips))}]"
+    more = "".join(f", {name}={value}" for name, value in said.items())
+    return Source(f"scene, camera = js.io.read_scene({options.source!r}{more}, size=({width}, {height}))")
 
 
-def _source_of_frame(options: Any, snapshots: Snapshots, path: Path, time: float) -> Source:
-    """How a frame of a sequence is made in Python, and by the command where its box is not moved."""
+def _source_of_frame(options: Any, snapshots: Snapshots, time: float) -> Source:
+    """How a frame of a sequence is made in Python."""
     survey = snapshots.survey
     chosen = {"color_by": survey.quantity, "opacity_by": survey.report.opacity_by}
     names = (*chosen, "support", "kernel", "part_type", "where", "share", "center")
@@ -149,10 +140,4 @@ def _source_of_frame(options: Any, snapshots: Snapshots, path: Path, time: float
         said += f", surface=js.Surface({float(snapshots.surface.level)!r}, {snapshots.surface.of!r})"
     files = [str(file.path) for file in survey.files]
     python = f"snapshots = js.sequence.Snapshots.from_files({files}{said}, gaps=True)\nscene = snapshots.at({time!r})"
-    words = [word for word in options.words if word not in options.source]
-    told = {word.partition("=")[0] for word in words}
-    for name, value in chosen.items():
-        option = f"--{name.replace('_', '-')}"
-        told_otherwise = option in told or (name == "opacity_by" and options.surface_of is not None)
-        words += [f"{option}={value}"] * (value is not None and not told_otherwise)
-    return Source(python, "" if snapshots.center is not None else str(path), tuple(words), whole=True)
+    return Source(python, whole=True)

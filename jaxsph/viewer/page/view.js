@@ -48,7 +48,7 @@ export function mount(root, link) {
     made("table", {}, ...KEYS.map(([keys, does]) => made("tr", {}, made("th", { scope: "row" }, keys), made("td", {}, does)))),
     made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots. A surface is opaque: its bars are where rays met it, and its points have colours alone."), closing());
   const files = link.files ? [made("a", { class: "button", href: "view.exr", download: "view.exr" }, "EXR"), made("a", { class: "button", href: "look.json", download: "look.json" }, "Look")] : [];
-  const keep = section("Keep", made("div", { class: "row" }, button("PNG", "save the picture (s)", save), ...files, button("Code", "Python and command", () => send({ do: "code" })), button("Help", "help (?)", () => help.showModal())));
+  const keep = section("Keep", made("div", { class: "row" }, button("PNG", "save the picture (s)", save), ...files, button("Code", "Python", () => send({ do: "code" })), button("Help", "help (?)", () => help.showModal())));
   const path = made("a", { class: "button", href: "keys.json", download: "keys.json", title: "for jaxsph movie --camera", hidden: true }, "Keys");
   const kept = made("output", { class: "value" }), paths = section("Movie", made("div", { class: "row" },
     button("Keep view", "keep this view as a key frame (g)", () => send({ do: "key" })), button("Forget", "forget the last key frame (b)", () => send({ do: "unkey" })), path), kept);
@@ -158,7 +158,7 @@ export function mount(root, link) {
     else if (message.is === "picked") pick(message);
     else if (message.is === "error") complain(message.text);
     else if (message.is === "code") {
-      code.textContent = `${message.command}\n\n${message.python}`;
+      code.textContent = message.python;
       texts.showModal();
     } else if (message.is === "unlinked") {
       chip.textContent = "lost";
