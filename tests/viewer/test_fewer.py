@@ -10,7 +10,7 @@ from views import SETTINGS, camera, scene
 
 import jaxsph as js
 from jaxsph.model.particles.kernels import evaluate
-from jaxsph.viewer import fewer as module
+from jaxsph.viewer import stages as module
 from jaxsph.viewer.picture import described
 from jaxsph.viewer.stages import stages_of
 
