@@ -22,23 +22,6 @@ MARGIN = 1.35  # times the largest share, for its number beside it
 
 def figure_of(made: Any, quantity: str, title: str) -> Any:
     """Of an `Explanation`; see `Explanation.figure`."""
-    figure, halves = _halves(made, title)
-    _draw_ray(made, halves[0].subplots(3, 1, sharex=True), quantity)
-    upper, lower = halves[1].subplots(2, 1, height_ratios=(1, 2))
-    _draw_budget(made, upper)
-    most = np.argsort(-made.added, kind="stable")[:PARTICLES]
-    shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
-    told = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
-    _draw_bars(lower, told, shares, PARTICLES)
-    return figure
-
-
-def _halves(made: Any, title: str) -> tuple[Any, Any]:
-    """A figure with its title, and its two halves.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
     require("matplotlib", "figures of a pixel", "color")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -48,29 +31,14 @@ def _halves(made: Any, title: str) -> tuple[Any, Any]:
     row, column = made.pixel
     words = f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}"
     figure.suptitle(words, x=0.01, ha="left", fontsize="medium")
-    return figure, figure.subfigures(1, 2, width_ratios=SHARES)
-
-
-def surface_figure(made: Any, quantity: str, title: str) -> Any:
-    """Of a `SurfaceExplanation`; see `SurfaceExplanation.figure`."""
-    figure, (left, right) = _halves(made, title)
-    upper, lower = left.subplots(2, 1, sharex=True)
-    upper.plot(made.depth, made.coverage, color=DARK, linewidth=1.2)
-    upper.axhline(made.level, color=RED, linewidth=0.8, label=f"level {made.level:g}")
-    lower.plot(made.depth, made.quantity, color=BLUE, linewidth=1.2)
-    for axes, label in ((upper, made.field), (lower, quantity)):
-        axes.set_ylabel(label)
-        if np.isfinite(made.surface_depth):
-            axes.axvline(made.surface_depth, color=GRAY, linewidth=0.8, linestyle=":", label="surface")
-    upper.legend(frameon=False, fontsize="small")
-    lower.set_xlabel("depth")
-    lower.set_xlim(made.depth[0], made.depth[-1])
-    most = np.argsort(-made.shares, kind="stable")[:PARTICLES]
-    shares = [(f"{made.particles[which]}", float(made.shares[which])) for which in most]
-    told = (
-        f"{len(made.particles):,} particles reach the surface;\nof its {made.field} these have most" if shares else "no surface"
-    )
-    _draw_bars(right.subplots(), told, shares, PARTICLES)
+    halves: Any = figure.subfigures(1, 2, width_ratios=SHARES)
+    _draw_ray(made, halves[0].subplots(3, 1, sharex=True), quantity)
+    upper, lower = halves[1].subplots(2, 1, height_ratios=(1, 2))
+    _draw_budget(made, upper)
+    most = np.argsort(-made.added, kind="stable")[:PARTICLES]
+    shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
+    told = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
+    _draw_bars(lower, told, shares, PARTICLES)
     return figure
 
 

@@ -6,17 +6,14 @@ Flow: scene, camera, settings, pixel -> render; coverage along the ray -> [surfa
 from __future__ import annotations
 
 import dataclasses
-import os
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.analysis.at_places import ParticleField
-from jaxsph.analysis.explanation.figure import surface_figure
 from jaxsph.analysis.explanation.words import surface_table
 from jaxsph.engine.render import render
-from jaxsph.io.replace import write_figure
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene, widened
@@ -83,18 +80,6 @@ class SurfaceExplanation:
 
     def __str__(self) -> str:
         return surface_table(self)
-
-    def figure(self, quantity: str = "quantity", title: str = "") -> Any:
-        """Coverage and quantity over depth, with the level, and who makes the surface beside: a figure of matplotlib's.
-
-        Raises:
-            ImportError: matplotlib is not installed.
-        """
-        return surface_figure(self, quantity, title)
-
-    def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
-        """Write the figure: `.png`, `.pdf` or `.svg`."""
-        write_figure(self.figure(quantity, title), os.fspath(path))
 
 
 class _Ray:

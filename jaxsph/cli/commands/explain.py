@@ -54,11 +54,13 @@ def explain(
     if options.output is not None:
         cli_look.require_figure(options.output)
     scene, camera, labels = cli_scene.scene_of(options)
+    if options.output is not None and scene.surface is not None:
+        raise UsageError("-o draws a ray through media, and this one meets a surface; leave out -o, or add --surface none")
     say("camera", camera_line(camera, options))
     made = explained(scene, camera, settings, pixel=options.pixel)
     voice.result(str(made))
     voice.report(**_values(made))
-    if options.output is not None:
+    if options.output is not None and isinstance(made, Explanation):
         made.save(options.output, labels.quantity, str(options.source or ""))
         voice.written(options.output)
 

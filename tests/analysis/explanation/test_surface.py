@@ -66,10 +66,3 @@ def test_what_the_picture_passed_without_finding_it_is_told(monkeypatch):
     made = js.explain(surfaced(), camera(), SETTINGS, pixel=MIDDLE)
     assert made.missed == pytest.approx(found.surface_depth, abs=1e-5) and np.isinf(found.missed)
     assert "thinner than a sample, at depth" in str(made)
-
-
-def test_a_figure_is_written(tmp_path):
-    pytest.importorskip("matplotlib")
-    for pixel in (MIDDLE, (0, 0)):
-        js.explain(surfaced(), camera(), SETTINGS, pixel=pixel).save(tmp_path / "pixel.png", "speed", "drop.ply")
-        assert (tmp_path / "pixel.png").read_bytes()[:4] == b"\x89PNG"
