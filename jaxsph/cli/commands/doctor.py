@@ -21,17 +21,7 @@ from jaxsph.cli.voice import say
 from jaxsph.numerics.version import __version__
 
 NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
-WANTED = {
-    "h5py": "HDF5 snapshots",
-    "matplotlib": "figures, more colour maps",
-    "unyt": "names of units",
-    "tqdm": "progress bars",
-    "imageio-ffmpeg": "movies",
-    "nibabel": "NIfTI volumes",
-    "pynrrd": "NRRD volumes",
-    "distributed": "movies by several processes",
-    "xarray": "labelled arrays",
-}
+WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -64,9 +54,7 @@ def doctor(*, asked: Doctor = OPTIONS) -> None:
     say("versions", ", ".join(f"{name} {found[name] or 'MISSING'}" for name in NEEDED))
     there = [f"{name} {found[name]}" for name in WANTED if found[name]]
     say("optional", ", ".join(there) or "none")
-    for name, what in WANTED.items():
-        if not found[name]:
-            say("absent", f"{name}: {what}")
+    say("absent", ", ".join(name for name in WANTED if not found[name]) or "none")
     say("devices", ", ".join(devices))
     say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
     kept.say_kept()
