@@ -138,7 +138,12 @@ def _rows(
     progress: Progress | None,
 ) -> list[Measurement]:
     """The table; in a folder as far as it is measured."""
-    path = None if folder is None else _made(folder) / TABLE
+    path = None if folder is None else Path(folder) / TABLE
+    if path is not None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"`folder` {path.parent} cannot be made ({error.strerror}); give another one") from error
     turns = [[one for one in group if one.method != FULL_RATE] for group in groups]
     images = 2 + bool(effort.integral) + sum(len(one) + effort.repeats * (1 + len(one)) for one in turns)
     plans: Plans = {}
@@ -286,11 +291,3 @@ def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: Int
         error, bound = integral.errors(first.layers), integral.at(bound)
     over, beyond = float((error > tolerance).mean()), float((error > bound).mean())
     return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
-
-
-def _made(folder: str | os.PathLike[str]) -> Path:
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"`folder` {os.fspath(folder)} cannot be made ({error.strerror}); give another one") from error
-    return Path(folder)
