@@ -3,7 +3,7 @@
 Flow: file -> [load] -> Loaded -> [staged: look, exposure, view] -> Opened: Scene, Camera, Labels, what was chosen.
 
 The look comes first, with the extinction of typical columns; then the view is framed by what that look lights up; then extinction
-is fitted to the picture itself (`jaxsph.model.preview.exposure`).
+is fitted to the picture itself (`jaxsph.model.preview.glimpse`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.preview.exposure import exposure
-from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume

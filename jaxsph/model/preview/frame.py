@@ -17,8 +17,7 @@ from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import corners_of
-from jaxsph.model.preview.exposure import typical_exposure
-from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.preview.glimpse import glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of

@@ -1,6 +1,6 @@
 r"""A coarse picture of a scene's particles and volumes, in NumPy: a lattice of rays, jittered samples along each, no programs.
 
-Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from -> exposure, frame.
+Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from, exposure -> frame, opening.
 
 Samples are even in depth, each ray with an offset of its own, so that what is thinner than a step is met as often as it should.
 The field at a sample is $Q = \sum_j q_j V_j W_j / \sum_j V_j W_j$, as everywhere. It is an estimate, for choosing a look and a
@@ -28,6 +28,12 @@ RAYS, STEPS = 40, 48
 PAIRS = 1 << 21
 """Particles times rays that are looked at in one go."""
 SEED = 0
+BRIGHT, ALPHA = 99.0, 0.95
+"""Percentile of the pixels that is to have this alpha."""
+LIT, LEAST_LIT = 0.12, 0.3
+"""A channel from which a pixel is not dark, and the share of the pixels that have anything at all that is to be lit."""
+MOST = 64.0
+"""Factor by which the share of lit pixels may brighten what the brightest alone ask for."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,6 +69,32 @@ class Glimpse:
     def picture(self, scale: float = 1.0) -> Float[np.ndarray, "rows columns 3"]:
         """The colours of the pixels, over black."""
         return (self.weights(scale)[..., None] * self.color).sum(2)
+
+
+def exposure(seen: Glimpse) -> float:
+    """A factor of the extinction, > 0, at which the 99th percentile of alpha is 0.95, and of all pixels that meet anything three
+    in ten are lit; 1 where nothing is met.
+    """
+    depth = seen.optical_depth
+    meets = depth > 0
+    if not meets.any():
+        return 1.0
+    brightest = float(np.percentile(depth, BRIGHT)) or float(depth.max())
+    scale = -np.log1p(-ALPHA) / brightest
+    limit = scale * MOST
+    while scale < limit and (seen.picture(scale).max(-1) > LIT)[meets].mean() < LEAST_LIT:
+        scale *= 2**0.25
+    return float(scale)
+
+
+def typical_exposure(seen: Glimpse) -> float:
+    r"""A factor of the extinction, > 0, at which what is most opaque has an alpha of 0.95, however small it is in the picture.
+
+    That is the mean optical depth weighted by itself, $\sum \tau^2 / \sum \tau$; 1 where nothing is met.
+    """
+    depth = seen.optical_depth
+    total = float(depth.sum())
+    return float(-np.log1p(-ALPHA) * total / (depth**2).sum()) if total > 0 else 1.0
 
 
 def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) -> Glimpse:

@@ -4,8 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.model.preview.exposure import ALPHA, LEAST_LIT, exposure
-from jaxsph.model.preview.glimpse import Glimpse
+from jaxsph.model.preview.glimpse import ALPHA, LEAST_LIT, Glimpse, exposure
 
 SIDE, STEPS = 20, 4
 

@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.exposure import exposure
 from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
-from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.preview.glimpse import exposure, glimpse
 
 OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
 LIT = 24 / 255
