@@ -32,12 +32,7 @@ class Source:
 
 
 def python_of(
-    source: Source,
-    camera: Camera,
-    pose: Pose | None,
-    edited: TransferFunction | None,
-    settings: Settings,
-    within: Clip | None = None,
+    source: Source, camera: Camera, pose: Pose | None, edited: TransferFunction | None, settings: Settings, within: Clip | None
 ) -> str:
     """Python that makes the picture again; `pose` is None where the camera is as it was given, `within` is what is shown."""
     lines = ["import dataclasses", "import jaxsph as js", "", source.python]

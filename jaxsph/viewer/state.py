@@ -137,7 +137,9 @@ class State:
                 raise InputError("this scene has no transfer function to edit")
             self._edit(self._steps, message)
         elif name == "fit":
-            lower, upper = self._bounds()
+            if not self._base.parts:
+                raise InputError("this scene does not say how large it is")
+            lower, upper = BoundingBox.around(self._base.parts).bounds()
             self._move(self.pose.fitted(lower, upper, self._given.width / self._given.height))
         elif name == "home":
             self._move(self._first)
@@ -197,8 +199,3 @@ class State:
     def _looked(self) -> Scene:
         look = None if self._steps is None else self._steps.look.transfer()
         return looking(dataclasses.replace(self._base, within=self._within()), look)
-
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        if not self._base.parts:
-            raise InputError("this scene does not say how large it is")
-        return BoundingBox.around(self._base.parts).bounds()
