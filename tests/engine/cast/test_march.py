@@ -10,7 +10,7 @@ import pytest
 import jaxsph as js
 
 
-def test_how_many_slabs_a_batch_has_changes_no_bit(frames):
+def test_how_many_slabs_a_batch_has_changes_no_bit(frames, quick_programs):
     rng = np.random.default_rng(3)
     scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
     images = []

@@ -24,7 +24,11 @@ SLAB_SAMPLES = [4, 8, 16]
 merge = jax.jit(merged_levels, static_argnums=2)
 unions = jax.jit(coarser_windows, static_argnums=1, compiler_options=QUICKLY)
 
-costs = jax.jit(evaluations_of_levels, static_argnums=(1, 2, 3), compiler_options=QUICKLY)
+
+@functools.partial(jax.jit, static_argnums=1, compiler_options=QUICKLY)
+def costs(windows, slab_samples):
+    """Of levels whose cells are merged, and of those whose cells are alone."""
+    return [evaluations_of_levels(windows, CELLS, slab_samples, merged) for merged in (True, False)]
 
 
 @functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
@@ -37,7 +41,7 @@ def evaluated(windows, levels, slab_samples, past):
 @pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
 def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
     found = unions(windows_of(slab_samples), slab_samples)
-    merged, alone = (costs(found, CELLS, slab_samples, merge) for merge in (True, False))
+    merged, alone = costs(found, slab_samples)
     for level in range(MAX_LEVEL + 1):
         share = 1 << max(level - fits(slab_samples), 0)  # cells that share a slab
         whole = CELLS // share * share

@@ -88,7 +88,7 @@ def test_sets_of_any_usual_size_share_a_plan_where_the_host_makes_lists(plans):
 def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans, monkeypatch):
     monkeypatch.setattr(FrameShape, "in_common", lambda shape: shape)
     scene, camera = snapshot(1000)
-    js.render(scene, camera, SETTINGS)
+    plans.for_frame(Request.of(scene, camera, SETTINGS), Clock())
     (kept,) = plans._kept
     assert plans._similar(shape_of(Request.of(scene, camera, SETTINGS))).num_particles == kept.num_particles
     smaller = snapshot(kept.num_particles // 2)[0]
@@ -101,14 +101,15 @@ def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(pla
 def test_the_oldest_plans_are_let_go(monkeypatch):
     monkeypatch.setattr("jaxsph.engine.planning.fit.MAX_KEPT", 2)
     plans = Plans()
-    made = [js.plan(*snapshot(100, width=width), SETTINGS) for width in (20, 30, 40)]
+    plan = js.plan(*snapshot(100), SETTINGS)
+    made = [dataclasses.replace(plan, num_particles=plan.num_particles + more) for more in range(3)]
     for plan in (*made[:2], made[0], made[2]):
         plans._keep(plan)
     assert plans._kept == [made[0], made[2]]
 
 
 def test_like_grows_a_plan_and_gives_it_back_where_it_has_room():
-    small, large = snapshot(500), snapshot(2000, seed=1)
+    small, large = snapshot(700), snapshot(3000, seed=1)
     plan = js.plan(*small, SETTINGS)
     assert js.plan(*small, SETTINGS, like=plan) is plan
     grown = js.plan(*large, SETTINGS, like=plan)
