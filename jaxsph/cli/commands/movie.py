@@ -143,7 +143,8 @@ def _checked(options: Any) -> Path:
     """The output, once options make sense."""
     if not options.source:
         raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
-    output: Path = options.output or Path(f"{_stem(options.source[0])}.mp4")
+    source = options.source[0]
+    output: Path = options.output or Path(f"{stem_of(source) if source.startswith(SCENE) else Path(source).stem}.mp4")
     require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
     if not 0 < options.fps <= io.images.movie.MAX_FPS:
         raise UsageError(f"--fps must lie in (0, {io.images.movie.MAX_FPS:g}], got {options.fps:g}")
@@ -161,10 +162,6 @@ def _checked(options: Any) -> Path:
     if options.camera is not None:
         refuse(options, cli_where.PLACED, "and --camera exclude each other; KEYS.json places the camera")
     return output
-
-
-def _stem(source: str) -> str:
-    return stem_of(source) if source.startswith(SCENE) else Path(source).stem
 
 
 @contextlib.contextmanager

@@ -38,6 +38,7 @@ class CastPlan:
         batch_slabs: slabs whose light is held before it is composited; a multiple of `chunk`.
         doublings: how often the samples of a slab can be doubled, for a tolerance.
         tuning: for the kind of machine that marches.
+        crowded: whether some slabs hold so many more particles than others that the fullest of a chunk have a loop of their own.
     """
 
     chunk: int
@@ -45,6 +46,7 @@ class CastPlan:
     batch_slabs: int
     tuning: Tuning = CPU
     doublings: int = 0
+    crowded: bool = False
 
     def __post_init__(self) -> None:
         require_sizes(self, zero=("doublings",))
@@ -174,7 +176,8 @@ class Batches:
         depth, border = self._depths(entry, slab, self.half_steps)
         u, v = self.packets.u[:, packet].T, self.packets.v[:, packet].T
         bundle = packet if self.packets.list_id is None else self.packets.list_id[packet]
-        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective, self.packets.scattered, self.between)
+        how = self.perspective, self.packets.scattered, self.between
+        return SlabTask(entry, slab, bundle, u, v, depth, border, *how, crowded=self.plan.crowded)
 
     def borders(self, items: Int[Array, " some"]) -> Float[Array, "some samples_and_one"]:
         """Depths of the borders of items' samples."""

@@ -27,13 +27,17 @@ from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 16  # particles unrolled in the inner loop
+PARTS = {False: (), True: (8,)}  # of the slabs of a task, that have loops of their own where they are crowded
 
 
 def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows."""
     zero = jnp.zeros((*task.depth.shape, task.v.shape[1], task.u.shape[1]), task.depth.dtype)
     sums = sums_of([zero] * (1 + len(quantities_of(ordered))))
-    return lax.fori_loop(0, task.blocks(BLOCK).max(), functools.partial(_add, ordered, rank, task, kernel), sums)
+    for turns in task.turns(BLOCK, PARTS[task.crowded]):
+        add = functools.partial(_add, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
+    return sums
 
 
 def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Int
 
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch, quantities_of
-from jaxsph.engine.field.gather import BLOCK
+from jaxsph.engine.field.gather import BLOCK, PARTS
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
@@ -29,7 +29,9 @@ from jaxsph.numerics.fusion import fusion_barrier
 def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, 1, rays) at every sample of slabs, from all particles of their windows."""
     sums = sums_of([jnp.zeros(task.shape, task.depth.dtype)] * (1 + len(quantities_of(ordered))))
-    sums = lax.fori_loop(0, task.blocks(BLOCK).max(), functools.partial(_add, ordered, rank, task, kernel), sums)
+    for turns in task.turns(BLOCK, PARTS[task.crowded]):
+        add = functools.partial(_add, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
     return jax.tree.map(lambda value: value[:, :, None], sums)
 
 

@@ -86,7 +86,7 @@ class Part(NamedTuple):
     share: Float[Array, "tasks intervals rays"]
 
 
-@tree(static=("perspective", "scattered", "between", "measured"))
+@tree(static=("perspective", "scattered", "between", "measured", "crowded"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -100,6 +100,7 @@ class SlabTask:
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether what is asked for are means of the intervals between samples, which then lie on borders.
         part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
+        crowded: whether some slabs hold many times as many particles as others, see `turns`.
         measured: whether how much of rays supports cover is measured too, to tell what intervals miss of it.
     """
 
@@ -115,6 +116,7 @@ class SlabTask:
     between: bool = False
     part: Part | None = None
     measured: bool = False
+    crowded: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -170,10 +172,6 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
-    def blocks(self, block: int) -> Int[Array, " tasks"]:
-        """How many blocks of `block` spheres the windows of each slab hold."""
-        return (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
-
     def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[Turns]:
         """All blocks of `block` spheres of all slabs, in order for each slab; of `parts` 4 is the first quarter of the slabs.
 
@@ -181,7 +179,7 @@ class SlabTask:
         times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
         only a part of them has anything left, then that part alone, and so on. Out of order it takes longer.
         """
-        blocks = self.blocks(block)
+        blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
         tasks = blocks.shape[0]
         numbers = [tasks, *(tasks // part for part in parts if tasks >= FEWEST), 0]
         begin = jnp.int32(0)
@@ -227,7 +225,9 @@ class SlabTask:
         slab, bundle, depth, border = (
             jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
         )
-        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, scattered=True)
+        return SlabTask(
+            entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True, crowded=self.crowded
+        )
 
 
 class Turns(NamedTuple):

@@ -243,7 +243,8 @@ def pull_look_up(
     inverse = 1 / jnp.where(inside, weight, 1)
     of_optics = [jnp.where(inside, value, 0) for value in cotangents]
     of_weight, of_weighted, looks = jnp.zeros_like(weight), [], []
-    for weighted, reference, segments, channels in zip(several, task.entry.references, parts, _channels(parts), strict=True):
+    looked_up = (range(4),) if len(parts) == 1 else (range(3), range(3, 4))  # of red, green, blue, extinction by each quantity
+    for weighted, reference, segments, channels in zip(several, task.entry.references, parts, looked_up, strict=True):
         ratio = jnp.where(inside, weighted * inverse, 0)
         quantity = reference[:, None, None] + ratio
         slopes = jax.jvp(functools.partial(look_up, segments), (quantity,), (jnp.ones_like(quantity),))[1]
@@ -253,11 +254,6 @@ def pull_look_up(
         of_weight = of_weight - ratio * of_weighted[-1]
         looks.append(LookUpCotangents(own, of_quantity, quantity))
     return SampleCotangents([of_weight, *of_weighted], tuple(looks))
-
-
-def _channels(parts: tuple[Segments, ...]) -> tuple[range, ...]:
-    """Which of red, green, blue and extinction are looked up by each quantity."""
-    return (range(4),) if len(parts) == 1 else (range(3), range(3, 4))
 
 
 def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Float[Array, "5 points"]:

@@ -125,7 +125,8 @@ def _between(scene: Scene, integrator: str) -> bool:
 
 def measured(seen: Seen, asked: Request, shape: FrameShape) -> Measures:
     """What there is to be marched, counted."""
-    return measure(seen.viewed, asked.camera, shape.samples, _stride_of(asked.along))
+    stride = asked.along.leaf_pixels // 2 if asked.along.screen == "quadtree" else 1
+    return measure(seen.viewed, asked.camera, shape.samples, stride)
 
 
 def sorted_and_measured(seen: Seen, asked: Request, shape: FrameShape) -> tuple[Seen, Measures]:
@@ -201,11 +202,6 @@ class Plans:
 
 
 PLANS = Plans()
-
-
-def _stride_of(settings: Settings) -> int:
-    """Pixels between the rays of the first lattice; 1 where every pixel has its own."""
-    return settings.leaf_pixels // 2 if settings.screen == "quadtree" else 1
 
 
 def shape_of(asked: Request) -> FrameShape:

@@ -38,6 +38,7 @@ MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
+CROWDED = 4.0  # times as many particles around one as in a tile: of slabs that differ so much the fullest are a loop apart
 COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 
@@ -100,6 +101,7 @@ class Plan:
             self.cast.slab_samples,
             self.control.nodes if isinstance(self.control, PilotPlan) else None,
             self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
+            self.cast.crowded,
         )
 
     @property
@@ -156,8 +158,8 @@ class Plan:
                 one,
                 num_particles=1,
                 num_classes=1,
-                lists=_without_room(one.lists),
-                control=_roomless(one.control),
+                lists=dataclasses.replace(one.lists, tile_capacity=1, list_capacity=1, runs=1),
+                control=dataclasses.replace(one.control, room=None) if isinstance(one.control, PilotPlan) else one.control,
                 quadtree=None if one.quadtree is None else one.quadtree.with_room(1, 1),
             )
             for one in (self, needed)
@@ -198,11 +200,13 @@ class Choices:
         slab_samples: samples of a cell that share a window of particles.
         nodes: of the pilot's lattice; None without.
         coverage_subdivisions: sub-rectangles on each side of a footprint, for error bounds; None without.
+        crowded: whether particles are clustered, see `CastPlan`.
     """
 
     slab_samples: int
     nodes: Spacing | None
     coverage_subdivisions: int | None
+    crowded: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,7 +265,9 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     slab_samples = slab_samples or _choose_slab_samples(measures.depth_extent)
     kind = _kind(settings)
     nodes = _choose_nodes(measures.depth_extent, measures.diameter, slab_samples) if kind is PilotPlan else None
-    return Choices(slab_samples, nodes, _choose_subdivisions(measures.diameter) if isinstance(kind, ControlPlan) else None)
+    fine = 2 if measures.diameter >= FINE_DIAMETER else 4  # a support covers what is a few times narrower
+    subdivisions = fine if isinstance(kind, ControlPlan) else None
+    return Choices(slab_samples, nodes, subdivisions, measures.crowding > CROWDED)
 
 
 def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices) -> Plan:
@@ -334,7 +340,7 @@ def in_bands(
     cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
     batch = cast.batch_slabs // OPAQUE_BATCHES if batch is None and shape.opaque else batch
     held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
-    cast = dataclasses.replace(cast, batch_slabs=held, doublings=DOUBLINGS if settings.is_refined else 0)
+    cast = dataclasses.replace(cast, batch_slabs=held, doublings=DOUBLINGS if settings.is_refined else 0, crowded=choices.crowded)
     room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
@@ -400,19 +406,6 @@ def _described(kind: ControlPlan | type[PilotPlan] | None) -> str:
         return "`estimator='pilot'`"
     chosen = f"super_pixels={kind.super_pixels}, merge={kind.merge}, allocation={kind.allocation!r}"
     return f"`estimator='interval'` with {chosen}"
-
-
-def _without_room(lists: ListPlan) -> ListPlan:
-    return dataclasses.replace(lists, tile_capacity=1, list_capacity=1, runs=1)
-
-
-def _roomless(control: ControlPlan | PilotPlan | None) -> ControlPlan | PilotPlan | None:
-    return dataclasses.replace(control, room=None) if isinstance(control, PilotPlan) else control
-
-
-def _choose_subdivisions(diameter: float) -> int:
-    """A sub-rectangle is covered only by a support a few times as wide as itself."""
-    return 2 if diameter >= FINE_DIAMETER else 4
 
 
 def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:

@@ -139,7 +139,7 @@ def staged(
     look, view = look or Look(), view or View()
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
-    transfer, called = look_of(colored, loaded.quantity, look, by_log=_is_log(loaded.opacity_by))
+    transfer, called = look_of(colored, loaded.quantity, look, by_log=(loaded.opacity_by or "").lower().startswith(LOG_PREFIX))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
     if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
@@ -184,10 +184,6 @@ def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Sce
     looks = ((shown, transfer), *more.volumes)
     volumes, transfers = zip(*looks, strict=True)
     return dataclasses.replace(more, volume=tuple(volumes), volume_transfer=tuple(transfers))
-
-
-def _is_log(name: str | None) -> bool:
-    return name is not None and name.lower().startswith(LOG_PREFIX)
 
 
 def _rows(loaded: Loaded, source: Source | None, view: View) -> ParticleTable | None:
