@@ -80,10 +80,10 @@ def everywhere(inputs, rng):
     """A direction in which all that floats moves, and the camera turns as cameras do."""
     camera = inputs[1]
     x, y, z = rng.normal(size=3)
-    turn = jnp.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ camera.axes
+    turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ np.asarray(camera.axes)
 
     def any_way(leaf, none):
-        return none if none.dtype == jax.dtypes.float0 else jnp.asarray(rng.normal(size=leaf.shape))
+        return none if none.dtype == jax.dtypes.float0 else rng.normal(size=leaf.shape)
 
     scene, pose = jax.tree.map(any_way, inputs, still(inputs))
     return scene, dataclasses.replace(pose, axes=turn)
@@ -92,7 +92,7 @@ def everywhere(inputs, rng):
 def along(gradient, move):
     """The slope in a direction, and how large its terms are."""
     terms = [
-        np.ravel(a * b)
+        np.ravel(np.asarray(a) * np.asarray(b))
         for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(move), strict=True)
         if a.dtype != jax.dtypes.float0
     ]
@@ -102,7 +102,7 @@ def along(gradient, move):
 def figures(row, frames):
     """How far both modes are apart, and from differences, of the size of the slope; and what an empty view has."""
     plan, settings, rng = row.plan(frames), row.settings, np.random.default_rng(row.seed + 100)
-    inputs, cotangent = row.inputs(frames), jnp.asarray(rng.normal(size=(HEIGHT, WIDTH, 4)))
+    inputs, cotangent = jax.tree.map(np.asarray, row.inputs(frames)), rng.normal(size=(HEIGHT, WIDTH, 4))
     at = jax.jit(slopes, static_argnames="plan", compiler_options=QUICKLY)
     move = everywhere(inputs, rng)
     _, pushed, gradient = at(inputs, move, cotangent, settings, plan=plan)
@@ -120,7 +120,7 @@ def figures(row, frames):
         "difference": abs(float(ahead - behind) / (2 * STEP) - pulled) / size,
         "size": size,
         "empty": float(nothing) - float(cotangent[..., 3].sum()),
-        "finite": all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(flat) if leaf.dtype != jax.dtypes.float0),
+        "finite": all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(flat) if leaf.dtype != jax.dtypes.float0),
     }
 
 
@@ -148,20 +148,21 @@ def ways(row, frames):
     bad = batch(_stacked(both[0], (scene, dataclasses.replace(camera, half_height=jnp.nan * camera.half_height))))
     return {
         "jit": _apart(one, eager[0]),
-        "vmap": max(_apart(jax.tree.map(lambda leaf, nth=nth: leaf[nth], together), eager[nth]) for nth in (0, 1)),
+        "vmap": max(_apart(jax.tree.map(lambda leaf, nth=nth: np.asarray(leaf)[nth], together), eager[nth]) for nth in (0, 1)),
         "shown": float(np.ptp(eager[0].color)),
         "alone": int(bad.faults[0]) == 0 and bool(bad.certified[0]) == eager[0].certified,
-        "disclaimed": int(bad.faults[1]) != 0 and not bad.certified[1] and bool((bad.error_bound[1] == 1).all()),
-        "still finite": bool(np.isfinite(bad.color).all()),
+        "disclaimed": int(bad.faults[1]) != 0 and not bad.certified[1] and bool((np.asarray(bad.error_bound)[1] == 1).all()),
+        "still finite": bool(np.isfinite(np.asarray(bad.color)).all()),
     }
 
 
 def _stacked(first, second):
-    return jax.tree.map(lambda a, b: jnp.stack([jnp.asarray(a), jnp.asarray(b)]), first, second)
+    return jax.tree.map(lambda a, b: np.stack([a, b]), first, second)
 
 
 def _apart(image, other):
-    return max(float(np.abs(getattr(image, name) - getattr(other, name)).max()) for name in ("color", "transmittance"))
+    pairs = [[np.asarray(getattr(one, name)) for one in (image, other)] for name in ("color", "transmittance")]
+    return max(float(np.abs(one - two).max()) for one, two in pairs)
 
 
 @pytest.mark.parametrize("row", rows(ALL_WAYS))

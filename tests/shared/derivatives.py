@@ -52,18 +52,18 @@ def valued(inputs, cotangent, settings, plan):
 def still(inputs):
     """A direction in which nothing moves."""
     floating = functools.partial(jnp.issubdtype, arg2=jnp.floating)
-    return jax.tree.map(lambda x: jnp.zeros_like(x) if floating(x.dtype) else np.zeros(x.shape, jax.dtypes.float0), inputs)
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype if floating(x.dtype) else jax.dtypes.float0), inputs)
 
 
 def along(gradient, move):
     """Slope in the direction `move`, and the sum of its terms' sizes."""
     pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(move), strict=True)
-    terms = [np.asarray(a * b).ravel() for a, b in pairs if a.dtype != jax.dtypes.float0]
+    terms = [(np.asarray(a) * np.asarray(b)).ravel() for a, b in pairs if a.dtype != jax.dtypes.float0]
     return float(sum(t.sum() for t in terms)), float(sum(np.abs(t).sum() for t in terms))
 
 
 def stepped(inputs, move, step):
-    return jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else x + step * d, inputs, move)
+    return jax.tree.map(lambda x, d: x if d.dtype == jax.dtypes.float0 else np.asarray(x) + step * np.asarray(d), inputs, move)
 
 
 def differ(inputs, move, cotangent, settings, plan):
@@ -74,15 +74,15 @@ def differ(inputs, move, cotangent, settings, plan):
 
 
 def weights(rng, frames):
-    return jnp.asarray(rng.normal(size=(frames.height, frames.width, 4)))
+    return rng.normal(size=(frames.height, frames.width, 4))
 
 
 def filled(frames, rng, dtype=np.float64):
     """A frame without empty space, where colours would jump as a support's edge passes a sample."""
     scene, camera = frames.scene(rng, dtype=dtype), frames.camera(rng, dtype=dtype)
     particles = scene.particles
-    position, support = particles.position.at[0].set(0), particles.support.at[0].set(20)
-    volume = particles.volume.at[0].set(1e3)
+    position, support, volume = (np.array(column) for column in (particles.position, particles.support, particles.volume))
+    position[0], support[0], volume[0] = 0, 20, 1e3
     particles = dataclasses.replace(particles, position=position, support=support, volume=volume)
     return dataclasses.replace(scene, particles=particles), camera
 
@@ -90,7 +90,7 @@ def filled(frames, rng, dtype=np.float64):
 def anyhow(*names):
     def move(inputs, rng):
         parts = {**vars(inputs[0].particles), **vars(inputs[0].transfer), **vars(inputs[1])}
-        return {name: jnp.asarray(rng.normal(size=parts[name].shape)) for name in names}
+        return {name: rng.normal(size=parts[name].shape) for name in names}
 
     return move
 

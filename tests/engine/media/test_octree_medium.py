@@ -77,7 +77,7 @@ def test_step_doubling_may_ask_for_points_of_its_own():
 def test_a_constant_is_rendered_as_that_constant():
     found = dataclasses.replace(particles(), quantity=jnp.full_like(particles().quantity, 0.37))
     image = js.render(in_octree(found), camera(), SETTINGS)
-    color, _ = transfer()(jnp.float32(0.37))
+    color, _ = jax.jit(js.TransferFunction.__call__)(transfer(), np.float32(0.37))
     np.testing.assert_allclose(image.color, np.asarray(color) * np.asarray(image.alpha)[..., None], atol=2e-7)
 
 
