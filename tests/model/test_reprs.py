@@ -11,6 +11,8 @@ import jaxsph as js
 from jaxsph.model.projection import Projection
 from jaxsph.sequence.task import FrameFile
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 POSITION = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 PARTICLES = js.Particles.from_arrays(POSITION, [0.5, 0.5, 1.0], [1.0, 2.0, 4.0])
 LOOK = js.TransferFunction.from_points([0.0, 1.0, 5.0], np.ones((3, 3)), [0.0, 1.0, 2.0])

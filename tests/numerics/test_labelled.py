@@ -6,6 +6,8 @@ import pytest
 import jaxsph as js
 from jaxsph.numerics.labelled import places
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 PARTICLES = js.Particles.from_arrays([[0.2, 0.3, 0.0], [-0.4, -0.2, 0.1]], 0.5, [1.0, 2.0], kernel="cubic_spline")
 CAMERA = js.Camera.orthographic((0, 0, 3.0), (0, 0, 0), view_height=2.0, width=6, height=4, near=1, far=5)
 

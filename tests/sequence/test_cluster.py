@@ -15,6 +15,8 @@ from jaxsph.sequence.cluster import Share, local_client, share_of
 
 distributed = pytest.importorskip("distributed")
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=16)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=24, height=16, near=2, far=6)
 LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])

@@ -87,7 +87,7 @@ def test_sources_are_made_one_at_a_time_when_it_is_their_turn():
     assert len(list(frames)) == 2 and made == [0, 1, 2]
 
 
-def test_files_that_are_there_are_left_alone_and_others_are_made(tmp_path):
+def test_files_that_are_there_are_left_alone_and_others_are_made(tmp_path, by_reference):
     scenes = [cloud(shown=number) for number in range(4)]
     render = lambda settings=SETTINGS: list(js.render_frames(scenes, CAMERA, settings, output=tmp_path / "frames"))  # noqa: E731
     first = render()
@@ -112,7 +112,7 @@ def test_frames_may_be_exr_by_a_pattern(tmp_path):
     assert [frame.rendered for frame in js.render_frames(cloud(), CAMERA, SETTINGS, output=pattern)] == [False]
 
 
-def test_anything_that_a_picture_depends_on_makes_another_frame(tmp_path):
+def test_anything_that_a_picture_depends_on_makes_another_frame(tmp_path, by_reference):
     scene = cloud()
     hotter = dataclasses.replace(scene, transfer=js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 1, 1)], [1.0, 4.0]))
     kernel = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, kernel="wendland_c2"))
@@ -161,7 +161,7 @@ def test_calls_that_make_no_sense_are_refused_at_once(given, said):
         js.render_frames(settings=SETTINGS, **given)
 
 
-def test_an_iterable_that_ends_too_early_is_told_of_after_its_frames():
+def test_an_iterable_that_ends_too_early_is_told_of_after_its_frames(by_reference):
     frames = js.render_frames((cloud() for _ in range(2)), itertools.repeat(CAMERA), SETTINGS)
     next(frames), next(frames)
     with pytest.raises(ValueError, match="more `cameras` than the 2 `sources`"):

@@ -8,6 +8,8 @@ import pytest
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SAMPLES = 96
 ROUNDING = 1e-6
 WAYS = {
@@ -38,7 +40,6 @@ def explained(scene, camera, settings, number=3):
     return image, [js.explain(scene, camera, settings, pixel=(row, column)) for row, column in (*most, *more)]
 
 
-@pytest.mark.usefixtures("quick_programs")
 @pytest.mark.parametrize("name", MARKED)
 @pytest.mark.filterwarnings("ignore:.*too long for the tolerance")
 def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board, name):
@@ -90,7 +91,6 @@ def test_of_several_bands_the_own_one_is_drawn_and_tells_the_same(board):
         assert one.alpha == 1 - float(image.transmittance[pixel]) and one.half_depth == float(image.depth[pixel])
 
 
-@pytest.mark.usefixtures("quick_programs")
 def test_where_nothing_is_estimated_the_note_says_why(board):
     scene, camera = board
     one = js.explain(scene, camera, js.Settings(samples=SAMPLES, integrator="segments"), pixel=(20, 30))
@@ -132,7 +132,6 @@ def test_a_figure_is_drawn_and_saved(board, tmp_path):
         assert (tmp_path / f"{pixel[0]}.png").stat().st_size > 5000
 
 
-@pytest.mark.usefixtures("quick_programs")
 def test_of_two_quantities_both_are_told_and_drawn(board):
     pytest.importorskip("matplotlib")
     scene, camera = board

@@ -14,6 +14,8 @@ from jaxsph.model.scene import widened
 from jaxsph.reference.chords import rays_of
 from jaxsph.reference.where import to_world
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 LEVEL = 5.0
 MIDDLE = HEIGHT // 2, WIDTH // 2
 

@@ -1,9 +1,11 @@
 """Means of columns over pixels against quadrature."""
 
+import functools
+
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 from jaxsph.analysis.projection import columns
 from jaxsph.analysis.projection.columns import pixel_shares
@@ -12,6 +14,26 @@ from jaxsph.numerics.fusion import barriers
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+
+def of_all(x, y):
+    """Shares by all kernels."""
+    return {name: pixel_shares(name, x, y) for name in NAMES}
+
+
+shares = jax.jit(of_all, compiler_options=QUICKLY)
+
+
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def without_barriers(x, y):
+    with barriers(False):
+        return of_all(x, y)
+
+
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def gradients(x, y):
+    """Of the share of the first pixel, where edges across move."""
+    return {name: jax.grad(lambda shift, name=name: pixel_shares(name, x + shift, y)[0, 0])(0.0) for name in NAMES}
 
 
 def by_quadrature(name, x, y):
@@ -34,7 +56,7 @@ def test_shares_are_good_to_1e_4_of_the_peak_and_add_up(name, pixel):
     rng = np.random.default_rng(3)
     number = int(2.4 / pixel) + 3
     x, y = ((np.arange(number + 1) - number / 2 + rng.uniform()) * pixel for _ in range(2))
-    found = np.asarray(pixel_shares(name, jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)), np.float64)
+    found = np.asarray(shares(x.astype(np.float32), y.astype(np.float32))[name], np.float64)
     truth = by_quadrature(name, x, y)
     assert np.abs(found - truth).max() <= 1e-4 * columns.whole_column(name, 0.0, np) * min(pixel**2, 1)
     assert abs(found.sum() - 1) < 3e-5 and found.min() >= 0
@@ -42,14 +64,13 @@ def test_shares_are_good_to_1e_4_of_the_peak_and_add_up(name, pixel):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_lies_outside_has_nothing(name):
-    edges = jnp.linspace(0.8, 3.0, 4)
-    assert float(pixel_shares(name, edges, edges).sum()) == 0
+    edges = np.linspace(0.8, 3.0, 4, dtype=np.float32)
+    assert np.asarray(shares(edges, edges)[name]).sum() == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_are_what_crosses_the_edges(name, x64):
-    x, y = jnp.asarray([-3.0, 0.3, 3.0]), jnp.asarray([-3.0, 3.0])
-    slope = jax.grad(lambda shift: pixel_shares(name, x + shift, y)[0, 0])(0.0)
+    slope = gradients(np.array([-3.0, 0.3, 3.0]), np.array([-3.0, 3.0]))[name]
     at = np.linspace(-1, 1, 4001)
     crossing = np.trapezoid(columns.whole_column(name, 0.09 + at**2, np), at)
     assert abs(slope - crossing) < 1e-3
@@ -57,8 +78,6 @@ def test_gradients_are_what_crosses_the_edges(name, x64):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_shares_are_the_same_with_and_without_barriers(name):
-    edges = jnp.linspace(-1.2, 1.1, 40)
-    found = pixel_shares(name, edges, edges)
-    with barriers(False):
-        other = pixel_shares(name, edges, edges)
-    np.testing.assert_allclose(found, other, atol=2e-5 * float(other.max()))
+    edges = np.linspace(-1.2, 1.1, 40, dtype=np.float32)
+    found, other = (np.asarray(shown(edges, edges)[name]) for shown in (shares, without_barriers))
+    np.testing.assert_allclose(found, other, atol=2e-5 * other.max())

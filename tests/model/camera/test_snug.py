@@ -10,6 +10,8 @@ import jaxsph as js
 from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.model.camera.snug import snug, with_depths
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 RNG = np.random.default_rng(4)
 POSITION = RNG.uniform(-0.5, 0.5, (40, 3))
 PARTICLES = js.Particles.from_arrays(POSITION, 0.3, POSITION[:, 2])

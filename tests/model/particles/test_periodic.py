@@ -15,6 +15,8 @@ from jaxsph.model.particles.periodic import _unfolded as unfolded
 from jaxsph.model.particles.periodic import num_ghosts, with_ghosts
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SIDES = np.array([1.0, 1.5, 0.8])
 
 

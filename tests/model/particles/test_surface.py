@@ -13,6 +13,8 @@ from jaxsph.model.particles import kernels
 from jaxsph.model.particles.surface import coverage_at_centers
 from jaxsph.model.scene import widened
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 SETTINGS = js.Settings(samples=12)
 
 

@@ -5,6 +5,7 @@ import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from lookups import look_up
 
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
 from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, default_transfer, opacity_by_second, value_range
@@ -91,9 +92,9 @@ def test_colours_of_any_function_are_kept_where_extinction_is_by_the_second():
 
 
 def test_ramps_are_even_rising_or_steep_and_nothing_else():
-    low, high = (float(default_transfer(block(), ramp="even")(np.array([end]))[1][0]) for end in (0.1, 0.9))
+    low, high = (float(look_up(default_transfer(block(), ramp="even"), np.array([end]))[1][0]) for end in (0.1, 0.9))
     assert low == pytest.approx(high) and low > 0
     steep = default_transfer(block(), ramp="steep")
-    assert float(steep(np.array([0.0]))[1][0]) == 0
+    assert float(look_up(steep, np.array([0.0]))[1][0]) == 0
     with pytest.raises(ValueError, match="even, rising, steep"):
         default_transfer(block(), ramp="falling")
