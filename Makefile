@@ -50,8 +50,11 @@ SUITE = compiled=$$($(VENV)/bin/python tests/shared/kept_programs.py $(COMPILED)
 ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--hold-programs=tests/programs.json))
 
 # Linters run beside the tests.
-check test: $(VENV)/.installed-test
-	@$(MAKE) --no-print-directory -j2 lint suite-of-$@
+check: $(VENV)/.installed-test
+	@$(MAKE) --no-print-directory -j2 lint suite-of-check
+
+test: $(VENV)/.installed-test
+	@$(MAKE) --no-print-directory -j2 lint suite-of-test
 
 .PHONY: suite-of-check suite-of-test
 suite-of-check:
