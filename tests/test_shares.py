@@ -27,7 +27,7 @@ NAMES = {f"{file}::test_{number}" for file, count in FILES.items() for number in
 
 def pytest_on(folder, *arguments, plugin="share"):
     """Run pytest by itself, with one of our plugins."""
-    environment = os.environ | {"PYTHONPATH": str(SHARED)}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"} | {"PYTHONPATH": str(SHARED)}
     command = [sys.executable, "-m", "pytest", "-p", plugin, "-p", "no:cacheprovider", "-p", "no:hypothesispytest", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
