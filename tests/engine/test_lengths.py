@@ -29,6 +29,7 @@ def same(image, other, digits):
     np.testing.assert_array_equal(image.depth, np.asarray(times(other.depth, digits)))
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_a_frame_in_any_unit_of_length_is_the_same_bit_for_bit(frames, projection):
     scene, camera = frame(frames, projection=projection)
@@ -41,6 +42,7 @@ def test_a_frame_in_any_unit_of_length_is_the_same_bit_for_bit(frames, projectio
         assert dict(of_unit.metadata)["jaxsph.camera"] == seen.describe()
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("length", [1e-24, 1e-20, 1e19, 1e24])
 def test_frames_of_lengths_beyond_those_of_float32_are_right(frames, length):
     scene, camera = frame(frames, length=length)

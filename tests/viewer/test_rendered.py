@@ -31,6 +31,7 @@ def session(began):
     as_it_began(began[1])
 
 
+@pytest.mark.core
 def test_the_last_picture_of_a_view_is_that_of_render_bit_for_bit(session, first):
     picture = session.wait(seconds=SECONDS)
     assert picture.final and picture.stage == FULL and picture.image.shape == (HEIGHT, WIDTH)

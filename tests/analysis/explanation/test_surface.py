@@ -24,6 +24,7 @@ def surfaced(**more):
     return dataclasses.replace(scene(), surface=js.Surface(LEVEL, smoothing=1.1), **more)
 
 
+@pytest.mark.core
 def test_place_light_and_shares_are_those_of_the_picture():
     made, image = js.explain(surfaced(), camera(), SETTINGS, pixel=MIDDLE), js.render(surfaced(), camera(), SETTINGS)
     assert isinstance(made, SurfaceExplanation) and made.surface_depth == float(image.depth[MIDDLE])

@@ -65,6 +65,7 @@ def layers(scene, camera):
     return color.reshape(*shape, 3), number.reshape(shape), normal.reshape(*shape, 3), sure.reshape(shape)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("projection", "settings", "within"),
     [
