@@ -84,7 +84,7 @@ class Session:
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
         self._timeline = timeline
         self._state = State(scene, camera)
-        self._version, self._failed, self._changed = 1, 0, 0.0
+        self._version, self._drawn, self._failed, self._changed = 1, 0, 0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
         self._histogram: Any = None
@@ -276,16 +276,15 @@ class Session:
 
     def _draft(self) -> None:
         """A draft of every state that is still the newest when the one before is done."""
-        stage, drawn = self.stages[0], 0
-        while (state := self._next(drawn)) is not None:
-            drawn = state.version
-            self._show(stage, state, lambda: False)
+        while (state := self._next(self._drawn)) is not None:
+            self._show(self.stages[0], state, lambda: False)
+            with self._lock:
+                self._drawn = state.version
+                self._lock.notify_all()
 
     def _finish(self) -> None:
-        """All after the draft, of states that stand still."""
+        """All after the draft, which comes sooner alone, of states that stand still."""
         done = 0
-        with self._lock:  # the first draft comes sooner alone
-            self._lock.wait_for(lambda: self._closed or self._pictures or self.told)
         while (state := self._next(done, rest=True)) is not None:
             moved = self._is_old(state)
             for stage in self.stages[1:]:
@@ -312,13 +311,14 @@ class Session:
         self._send(self.state())
 
     def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
-        """The newest state as soon as there is one after `done`, and it rests if it has to; None at the end."""
+        """The newest state as soon as there is one after `done`, and it rests and is drafted if it has to; None at the end."""
         with self._lock:
             while not self._closed:
                 still = REST_SECONDS - (time.monotonic() - self._changed) if rest else 0.0
-                if self._version > done and still <= 0:
+                ready = self._version > done and (self._drawn == self._version or not rest)
+                if ready and still <= 0:
                     return self.snapshot()
-                self._lock.wait(still if self._version > done else None)
+                self._lock.wait(still if ready else None)
         return None
 
     def _is_old(self, state: Snapshot) -> Callable[[], bool]:
