@@ -23,7 +23,7 @@ from jaxsph.engine.access.slab_windows import CELL_SAMPLES, coarser_windows
 from jaxsph.engine.field.fetch import Block, fetch, quantities_of
 from jaxsph.engine.field.interpolation import spread_subsamples
 from jaxsph.engine.field.lattice import GAP, REACH, Lattice, Region, node_at
-from jaxsph.engine.field.schedule import SUBSAMPLE
+from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.camera.camera import Camera
@@ -72,7 +72,8 @@ def sum_at_nodes(
     chunk = min(cells_at_once, -(-cells * bundles // 16) * 16)
     order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
-    shape = REACH + cells * layers + GAP, *(across * number + GAP for number in (region.rows, region.columns))
+    widest = ((1 << MAX_SPACING_LEVEL) - 1) * slab_samples // spacing.samples  # layers that a stencil reads past a slab's own
+    shape = REACH + cells * layers + widest + GAP, *(across * number + GAP for number in (region.rows, region.columns))
     deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (layers, across, across))
 
     def march(step: Array, sums: tuple[Array, ...]) -> tuple[Array, ...]:
