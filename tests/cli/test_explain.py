@@ -65,11 +65,8 @@ def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, sai
     assert code == 2 and len(err) == 1 and said in err[0]
 
 
-def test_a_pixel_of_a_picture_of_a_surface_is_explained_as_one(by_reference, capsys):
-    more = ["--color-by", "heat", "--surface", "0.2", "--size", "24x16", "--samples", 16]
-    code, out, _, wrong = apart(capsys, "explain", "a.npz", *more, "--pixel", 8, 12, "--json")
-    told = json.loads(out)
-    scene, camera = js.io.read_scene("a.npz", color_by="heat", surface=0.2, size=(24, 16))
-    made = js.explain(scene, camera, js.Settings(samples=16), pixel=(8, 12))
-    assert (code, wrong) == (0, []) and told["surface_depth"] == made.surface_depth and told["level"] == 0.2
-    assert told["particles"] == made.particles.tolist() and told["total"] is None
+def test_a_picture_of_a_surface_is_not_explained_as_that_of_a_medium(capsys):
+    code, _, err = run(capsys, "explain", "a.npz", "--surface", "0.2", *TINY, "--pixel", 1, 1)
+    assert code == 2 and "--surface none explains them" in err[-1]
+    with pytest.raises(ValueError, match=r"`surface` is unknown to `explain`"):
+        js.explain(*js.io.read_scene("a.npz", surface=0.2, size=(24, 16)), pixel=(8, 12))

@@ -21,7 +21,6 @@ from jaxsph.engine.frame.images import metadata_of
 from jaxsph.model.camera.snug import with_depths
 
 RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task")
-RENDER += ("jaxsph.analysis.explanation.surface",)
 PLAN = {"jaxsph.viewer.stages": "plan", "jaxsph.trade.sweep": "make_plan", "jaxsph.sequence.task": "make_plan"}
 DEPTHS = 200  # along a ray, between which a surface is looked for
 BOUND = 0.003  # of the error of what was asked for with a tolerance

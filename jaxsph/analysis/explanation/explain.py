@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.analysis.explanation.figure import figure_of
-from jaxsph.analysis.explanation.surface import SurfaceExplanation, explain_surface
 from jaxsph.analysis.explanation.words import note_of, table_of
 from jaxsph.engine.frame.budget import budget_of
 from jaxsph.engine.planning.plan import Plan
@@ -114,21 +113,21 @@ class Explanation:
 
 def explain(
     scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int], plan: Plan | None = None
-) -> Explanation | SurfaceExplanation:
+) -> Explanation:
     """Explain a pixel of `jaxsph.render(scene, camera, settings)`: its error bound by source, and its ray (host side).
 
     The bound is that of the image, whose pixels are drawn for it (at least those in rows about it), by its plans and compiled
-    programs. The ray is looked at in float64 by the formulas of the reference, whatever the settings leave out. Of a scene with a
-    surface it is a `SurfaceExplanation`: where the ray meets it, which way it faces there, and which particles make it.
+    programs. The ray is looked at in float64 by the formulas of the reference, whatever the settings leave out.
 
     Args:
         scene: particles, volumes and points.
         camera, settings: as for `jaxsph.render`.
         pixel: row and column, both from 0; negative ones are refused, as they are by `jaxsph.reference.integral`.
-        plan: as for `jaxsph.render`; not of a surface.
+        plan: as for `jaxsph.render`.
 
     Raises:
-        ValueError: a pixel that the image does not have, traced arguments, a scene with `media`; as `jaxsph.render`.
+        ValueError: a pixel that the image does not have, traced arguments, a scene with `media` or a surface of particles;
+            as `jaxsph.render`.
         CapacityError: as `jaxsph.render`.
 
     Warns:
@@ -138,8 +137,7 @@ def explain(
     if is_traced(scene, camera, settings):
         raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
     row, column = pixel_of(pixel, camera.width, camera.height)
-    if scene.surface is not None:
-        return explain_surface(scene, camera, settings, row, column)
+    scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
     truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
     budget = budget_of(scene, camera, settings, row, column, plan)

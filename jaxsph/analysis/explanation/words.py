@@ -46,32 +46,6 @@ def table_of(made: Any) -> str:
     return "\n".join(lines)
 
 
-def surface_table(made: Any) -> str:
-    """A `SurfaceExplanation` as a table."""
-    row, column = made.pixel
-    seen = " ".join(f"{float(channel):.3f}" for channel in made.color)
-    lines = [f"pixel {row} {column}: colour {seen}, alpha {made.alpha:.4f}"]
-    if np.isfinite(made.surface_depth):
-        place = " ".join(f"{value:.5g}" for value in made.position)
-        near = "" if np.isnan(made.off) else f"; in float64 it is {made.off:.2g} from there"
-        lines.append(_line("surface", f"depth {made.surface_depth:.6g}, at {place}; {made.field} {made.level:g}{near}"))
-        angle = np.degrees(np.arccos(min(made.facing, 1.0)))
-        lines.append(_line("normal", f"{short.vector(made.normal)}, {angle:.3g} degrees from the ray"))
-        lines.append(_line("quantity", f"{made.surface_quantity:.6g}"))
-    else:
-        met = f"the ray meets a {made.field} of {short.span(made.coverage)}, and the level is {made.level:g}"
-        lines.append(_line("surface", f"none: {met}"))
-    if np.isfinite(made.missed):
-        lines.append(_line("missed", f"what is thinner than a sample, at depth {made.missed:.6g}; more samples find it"))
-    lines.append(_line("error", "a surface has no bound: it lies there to rounding, but for what is thinner than a sample"))
-    if len(made.particles):
-        order = np.argsort(-made.shares, kind="stable")
-        half = int(np.searchsorted(np.cumsum(made.shares[order]), 0.5)) + 1
-        lines.append(_line("particles", f"{len(order):,} reach the place, half of its {made.field} is by {half:,}"))
-        lines += [_line(f"  {made.particles[which]}", f"adds {made.shares[which]:.1%}") for which in order[:MOST]]
-    return "\n".join(lines)
-
-
 def _line(what: str, text: str) -> str:
     return f"{what:<16}{text}"
 

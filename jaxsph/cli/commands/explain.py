@@ -11,9 +11,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from jaxsph.analysis.explanation.explain import Explanation, pixel_of
 from jaxsph.analysis.explanation.explain import explain as explained
-from jaxsph.analysis.explanation.surface import SurfaceExplanation
+from jaxsph.analysis.explanation.explain import pixel_of
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
@@ -54,18 +53,12 @@ def explain(
     if options.output is not None:
         cli_look.require_figure(options.output)
     scene, camera, labels = cli_scene.scene_of(options)
-    if options.output is not None and scene.surface is not None:
-        raise UsageError("-o draws a ray through media, and this one meets a surface; leave out -o, or add --surface none")
+    if scene.surface is not None:
+        raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
     say("camera", camera_line(camera, options))
     made = explained(scene, camera, settings, pixel=options.pixel)
     voice.result(str(made))
-    voice.report(**_values(made))
-    if options.output is not None and isinstance(made, Explanation):
+    voice.report(**{field.name: getattr(made, field.name) for field in dataclasses.fields(made)}, off_integral=made.off_integral)
+    if options.output is not None:
         made.save(options.output, labels.quantity, str(options.source or ""))
         voice.written(options.output)
-
-
-def _values(made: Explanation | SurfaceExplanation) -> dict[str, Any]:
-    """All that is known, for a program."""
-    known = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
-    return known if isinstance(made, SurfaceExplanation) else known | {"off_integral": made.off_integral}
