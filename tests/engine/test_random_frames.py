@@ -21,6 +21,7 @@ from examples import EXAMPLES
 from rows import CLIPS, MEDIA
 
 import jaxsph as js
+from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model.particles.kernels import KERNELS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -138,6 +139,8 @@ def each_frame(kind, adversary):
         frame = scene, camera, settings = drawn(kind, nth, adversary)
         check(kind, js.render(scene, camera, settings), (), frame)
         scene, camera, settings = frame = drawn(kind, EACH + nth, adversary)
+        if reachable(scene, settings) is not scene:  # octrees are built on the host: refused under `jit`, by name
+            continue
         plan = js.plan(scene, camera, settings, like=plan, headroom=4)
         try:
             found = traced((scene, camera), settings, plan=plan, derived=derived)
