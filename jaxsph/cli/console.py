@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxsph.cli.voice import OPTIONS, UsageError, report, result, say, tell
 from jaxsph.io import ParticleTable, Report
+from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, Image, Settings, registry
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
@@ -51,6 +52,8 @@ def require_writable(path: Path, must_be: str, suffixes: Sequence[str]) -> None:
         raise ValueError(f"{path}: there is no folder {path.parent} to write it to; make it first")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise ValueError(f"{path}: cannot be written; choose another place with -o")
+    with wrong_usage():
+        refuse_input(path)
 
 
 @contextlib.contextmanager

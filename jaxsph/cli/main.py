@@ -17,6 +17,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from cyclopts import Argument, ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
@@ -76,16 +77,25 @@ def _work(run: Callable[..., bool | None], options: Any, *, own_process: bool) -
     """Do what is asked for."""
     from jaxsph.cli import cache
     from jaxsph.cli.console import warnings_in_lines
+    from jaxsph.io.disk.files import with_parts
+    from jaxsph.io.replace import keeping
 
     if own_process:
         cache.begin(keep=not options.no_cache)
-    with warnings_in_lines(options.command, cache.mended):
+    with warnings_in_lines(options.command, cache.mended), keeping(with_parts(_read_by(run, options))):
         left = run(asked=options)
         voice.end(options.command)
     if left and own_process:  # threads that nothing can end: the interpreter would wait for them
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(DONE)
+
+
+def _read_by(run: Any, options: Any) -> list[Path]:
+    """The files and folders that a command reads, wherever they are named."""
+    beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
+    named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
+    return [path for path in (*map(Path, run.args), *beside, *named) if os.path.exists(path)]
 
 
 def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], Any]:

@@ -2,6 +2,8 @@
 
 A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
 that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
+
+What a command reads it does not replace, by whatever name (`keeping`).
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import secrets
 import socket
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,31 @@ STALE_SECONDS = 24 * 3600.0
 MAX_STEM = 40
 """Letters of a name that are kept in that of its temporary file, of at most 255 bytes."""
 MARK = re.compile(r"jaxsph-([0-9a-f]{8})-([0-9a-f]+)-[0-9a-f]{8}")
+_KEPT: dict[tuple[int, int], Path] = {}
+
+
+@contextlib.contextmanager
+def keeping(inputs: Iterable[Path]) -> Iterator[None]:
+    """Files, and folders with all in them, that nothing in the block replaces, even by links to them."""
+    before = dict(_KEPT)
+    _KEPT.update((_identity(path), path) for path in inputs)
+    try:
+        yield
+    finally:
+        _KEPT.clear()
+        _KEPT.update(before)
+
+
+def refuse_input(path: Path) -> None:
+    """Raise `ValueError` where `path` is kept, or is in a folder that is."""
+    for place in (path, *Path(os.path.realpath(path)).parents) if path.exists() and _KEPT else ():
+        if (kept := _KEPT.get(_identity(place))) is not None:
+            raise ValueError(f"cannot write {path}: {kept} is read, and would be lost; choose another name with -o")
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_dev, found.st_ino
 
 
 @contextlib.contextmanager
@@ -41,6 +68,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: the folder {path.parent} does not exist; make it first")
+    refuse_input(path)
     _sweep(path)
     temporary = path.with_name(f"{_before(path)}jaxsph-{_host()}-{os.getpid():x}-{secrets.token_hex(4)}{path.suffix}")
     try:

@@ -36,6 +36,7 @@ from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
 from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
@@ -126,6 +127,8 @@ def movie(
         say("camera", camera_line(cameras[0], options))
         voice.release()
         folder = output.with_name(f"{output.stem}_frames")
+        for frame in folder.glob(f"*.{options.frame_format}"):
+            refuse_input(frame)
         pattern = folder / f"{{:05d}}.{options.frame_format}"
         at_once = 1 if client is None else max(len(client.nthreads()), 1)
         rendered = render_frames(_moments(sources, frames), cameras, settings, client, output=pattern)

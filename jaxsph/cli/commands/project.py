@@ -19,7 +19,7 @@ from jaxsph.analysis.projection.plan import PIXELS, plan_projection
 from jaxsph.analysis.projection.project import project as projected
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, progress, refuse, say_notes, span, wrong_usage
+from jaxsph.cli.console import UsageError, progress, refuse, require_writable, say_notes, span, wrong_usage
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE
@@ -122,6 +122,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     """
     options = _checked(dataclasses.replace(asked, source=file))
     output = options.output or Path(Path(options.source).stem + ".exr")
+    require_writable(output, "a projection must be", SUFFIXES)
     table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     which: dict[str, Any] = {"box": options.box, "where": options.where, "share": options.share}

@@ -19,6 +19,7 @@ from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE, settings_of, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade import contenders
@@ -102,6 +103,7 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
         options = dataclasses.replace(options, surface=False)
     if options.output is None:
         raise UsageError("-o DIR is needed: where should table and figures go?")
+    refuse_input(options.output / TABLE)
     if options.surface is not False and options.estimators:
         raise UsageError("--surface and --estimators exclude each other: a surface has no tolerance; leave one of them out")
     settings, moments = settings_of(options), _moments(options)

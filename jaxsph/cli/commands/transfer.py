@@ -15,7 +15,7 @@ from jaxsph import io
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
-from jaxsph.cli.console import UsageError, refuse, span
+from jaxsph.cli.console import UsageError, refuse, require_writable, span
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OUTPUT, OWN, option, output
 from jaxsph.cli.voice import say
@@ -68,8 +68,8 @@ def _checked(options: Any) -> Path:
     stem = Path(str(options.source).split(":")[1] if str(options.source).startswith("scene:") else options.source).stem
     output: Path = options.output or Path(f"{stem}_transfer.png")
     cli_look.require_figure(output)
-    if options.save is not None and options.save.suffix.lower() != ".json":
-        raise UsageError(f"--save {options.save}: a transfer function is written as .json")
+    if options.save is not None:
+        require_writable(options.save, "--save: a transfer function is written as", (".json",))
     if options.rays < 1:
         raise UsageError(f"--rays must be at least 1, got {options.rays}")
     return output

@@ -11,7 +11,8 @@ import dataclasses
 import itertools
 import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,15 @@ def files_of(path: Path, number: int) -> list[Path] | None:
         more = f" and {num_missing - NAMED} more" if num_missing > NAMED else ""
         raise DataError(f"{path}: is one of {number} files of a snapshot; beside it {', '.join(named)}{more} cannot be found")
     return [path.with_name(f"{match[1]}{nth}{match[3] or ''}") for nth in range(number)]
+
+
+def with_parts(files: Iterable[Path]) -> list[Path]:
+    """Files, and those beside them that are called alike but for their number, as parts of one snapshot are."""
+    files = list(files)
+    alike = {(file.parent, match[1], match[3] or ""): file for file in files if (match := PART.fullmatch(file.name))}
+    for (folder, before, after), file in alike.items():
+        files += [folder / f"{before}{nth}{after}" for nth in _numbers_beside(file, before, after, sys.maxsize)]
+    return files
 
 
 def _numbers_beside(path: Path, before: str, after: str, number: int) -> set[int]:
