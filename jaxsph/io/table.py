@@ -47,6 +47,7 @@ class ParticleTable:
         units: of positions and columns, and the moment, as far as the file states them.
         part_type: number of the type of particles that was read, where the format has types.
         num_files: how many files the snapshot has, of which this may be one.
+        announced: how many particles of that type the whole snapshot has, as the file says, which counts up to 2^32.
         kernel: name of the smoothing kernel that the file states, or that its code has unless told otherwise; `None` where the
             format says nothing of kernels.
 
@@ -67,6 +68,7 @@ class ParticleTable:
     units: FileUnits = NO_UNITS
     part_type: int | None = dataclasses.field(default=None, kw_only=True)
     num_files: int = dataclasses.field(default=1, kw_only=True)
+    announced: int | None = dataclasses.field(default=None, kw_only=True)
     kernel: str | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:

@@ -24,6 +24,9 @@ from jaxsph.io.table import ParticleTable
 NAMED = 3
 """Missing files that are named at most."""
 PART = re.compile(r"(.*\.)(\d+)(\.[A-Za-z]\w*)?")
+COUNTED = 2**32
+"""Up to which headers count."""
+STRANGERS = "these are not the files of one snapshot; copy all of them again, into a folder of their own"
 Reader = Callable[[Path, int | None], ParticleTable]
 
 
@@ -38,7 +41,10 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
         ValueError: a file is missing or damaged (which), or files have different columns.
     """
     if table.num_files == 1:
-        return table
+        if is_all(len(table), table):
+            return table
+        note = f"its header says {table.announced} particles of this type, and the file has {len(table)}: is it a part of another?"
+        return dataclasses.replace(table, conventions=(*table.conventions, note))
     files = files_of(path, table.num_files)
     if files is None:
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
@@ -46,7 +52,34 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
     chosen = min(found.part_type for found in tables if found.part_type is not None)
     of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
-    return concatenated([found for found in of_type if found is not None], len(files))
+    parts = [found for found in of_type if found is not None]
+    refuse_strangers(parts, sum(map(len, parts)))
+    return concatenated(parts, len(files))
+
+
+def is_all(count: int, table: ParticleTable) -> bool:
+    """Whether so many particles are all that the snapshot announces, if it does."""
+    return not table.announced or (count - table.announced) % COUNTED == 0
+
+
+def refuse_strangers(parts: Sequence[ParticleTable], count: int) -> None:
+    """Refuse files that are not parts of one snapshot, or not all: by their headers, and as two have the same positions.
+
+    Args:
+        parts: of each file, from its first row on.
+        count: of the particles of all files.
+    """
+    first, seen = parts[0], dict[bytes, ParticleTable]()
+    for part in parts:
+        for name in ("num_files", "announced", "time", "box_size"):
+            own, other = getattr(part, name), getattr(first, name)
+            if own != other:
+                raise DataError(f"{part.path}: has {name} = {own}, and {first.path} {other}: {STRANGERS}")
+        twin = seen.setdefault(part.position[:1].tobytes(), part) if len(part) else part
+        if twin is not part and np.array_equal(twin.position, part.position):
+            raise DataError(f"{part.path}: has the particles of {twin.path} once more: {STRANGERS}")
+    if not is_all(count, first):
+        raise DataError(f"{first.path}: announces {first.announced} particles, and its files have {count}: {STRANGERS}")
 
 
 def files_of(path: Path, number: int) -> list[Path] | None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.disk.files import files_of
+from jaxsph.io.disk.files import files_of, refuse_strangers
 from jaxsph.io.libraries import require
 from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_links import PURPOSE, holds, member, opened
@@ -58,6 +58,9 @@ class Snapshot:
         self.part_type: int = first.part_type
         self.files = tuple(files_of(path, first.num_files) or (path,)) if first.num_files > 1 else (path,)
         self.first = first
+        begins = (dataclasses.replace(self.read(n, slice(0, RUN), ()), path=str(file)) for n, file in enumerate(self.files))
+        if len(self.files) > 1 and (filled := [begin for begin in begins if len(begin)]):
+            refuse_strangers(filled, len(self))
 
     def __len__(self) -> int:
         return sum(end - begin for _, begin, end in self.runs())

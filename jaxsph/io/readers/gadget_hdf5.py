@@ -81,7 +81,8 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     count = group["Coordinates"].shape[0]
     header = file["Header"].attrs if "Header" in file else {}
     _refuse_other_count(header, chosen, count)
-    said = [f"particles of PartType{chosen}", *others_held(_counts(header, present), chosen)]
+    counts = _counts(header, present)
+    said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
     swift = _is_swift(file)
     columns, dropped = {}, []
     for name, dataset in columns_of(group).items():
@@ -117,7 +118,7 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
-    more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
+    more |= {"part_type": chosen, "announced": counts[chosen], "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
     return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 

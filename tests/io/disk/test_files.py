@@ -1,6 +1,7 @@
 """Snapshots in several files are read as one."""
 
 import os
+import shutil
 
 import h5py
 import numpy as np
@@ -109,3 +110,72 @@ def test_what_is_no_regular_file_is_no_file_of_a_snapshot(tmp_path):
     (tmp_path / "snap_002.2.hdf5.bak").touch()
     with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: is a named pipe"):
         js.io.read_table(files[0])
+
+
+STRANGERS = {
+    "a part of a later moment": ("Time", 0.75, "time = 0.75"),
+    "a part of another box": ("BoxSize", 3.0, r"box_size = \(3.0, 3.0, 3.0\)"),
+    "a part of a snapshot of other files": ("NumFilesPerSnapshot", 4, "num_files = 4"),
+    "a part of a snapshot of more particles": ("NumPart_Total", [90, 6, 0, 0, 0, 0], "announced = 90"),
+}
+
+
+@pytest.mark.parametrize("read", [js.io.read_table, Snapshot])
+@pytest.mark.parametrize("what", STRANGERS)
+def test_parts_of_two_snapshots_are_not_joined(read, what, tmp_path):
+    name, value, said = STRANGERS[what]
+    files = snapshot(tmp_path)
+    with h5py.File(files[2], "a") as file:
+        file["Header"].attrs[name] = value
+    with pytest.raises(ValueError, match=rf"snap_002\.2\.hdf5: has {said}, and .*snap_002\.0\.hdf5 .* one snapshot"):
+        read(files[0])
+
+
+@pytest.mark.parametrize("read", [js.io.read_table, Snapshot])
+def test_the_same_part_twice_is_refused(read, tmp_path):
+    files = snapshot(tmp_path, (5, 6, 7))
+    shutil.copy(files[0], files[2])
+    with pytest.raises(ValueError, match=r"snap_002\.2\.hdf5: has the particles of .*snap_002\.0\.hdf5 once more"):
+        read(files[1])
+
+
+@pytest.mark.parametrize("read", [js.io.read_table, Snapshot])
+def test_parts_are_all_that_their_header_announces(read, tmp_path):
+    files = snapshot(tmp_path)
+    for total, right in ((12, True), (2**32 + 12, True), (13, False)):
+        for path in files:
+            with h5py.File(path, "a") as file:
+                file["Header"].attrs["NumPart_Total"] = np.array([total, 6, 0, 0, 0, 0], np.uint64)
+        if right:
+            read(files[0])
+            continue
+        with pytest.raises(ValueError, match="announces 13 particles, and its files have 12"):
+            read(files[0])
+
+
+@pytest.mark.parametrize(("total", "notes"), [(0, 0), (5, 0), (77, 1)])
+def test_a_file_alone_that_announces_others_says_so(total, notes, tmp_path):
+    write(tmp_path / "alone.hdf5", 0, 1, 5)
+    with h5py.File(tmp_path / "alone.hdf5", "a") as file:
+        file["Header"].attrs["NumPart_Total"] = [total, 0, 0, 0, 0, 0]
+    said = [one for one in js.io.read_table(tmp_path / "alone.hdf5").conventions if "77" in one and "has 5" in one]
+    assert len(said) == notes
+
+
+def test_parts_of_gadget_binary_belong_together_too(samples, tmp_path):
+    paths = [tmp_path / f"snap.{number}" for number in range(2)]
+
+    def write_both(total, time):
+        for number, path in enumerate(paths):
+            samples.write_gadget_binary(path, samples.particles(seed=number), form=1)
+            content = bytearray(path.read_bytes())
+            content[4 + 72 : 4 + 80] = np.float64(time * number + 1).tobytes()
+            content[4 + 96 : 4 + 100], content[4 + 124 : 4 + 128] = total.to_bytes(4, "little"), (2).to_bytes(4, "little")
+            path.write_bytes(content)
+
+    write_both(14, 0)
+    assert len(js.io.read_table(paths[0])) == 14
+    for total, time, said in ((15, 0, "announces 15 particles, and its files have 14"), (14, 1, "time = 2.0")):
+        write_both(total, time)
+        with pytest.raises(ValueError, match=said):
+            js.io.read_table(paths[0])
