@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import lzma
+import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import IO, Any
@@ -45,10 +46,13 @@ def numbers(tokens: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndar
     Each is converted on its own, as an array of words would be as wide as the longest of them.
 
     Raises:
-        ValueError: a token that is no number.
+        ValueError: a token that is no number; Python's `1_000` is none.
         OverflowError: an integer that `dtype` cannot hold.
     """
-    native = dtype.newbyteorder("=")
+    native, mark = dtype.newbyteorder("="), b"_" if tokens and isinstance(tokens[0], bytes) else "_"
+    wrong = next((token for token in tokens if mark in token), None)  # type: ignore[operator]
+    if wrong is not None:
+        raise DataError(f"has {wrong[:40]!r} where a number should be; it is damaged: copy it again")
     return np.fromiter(map(int if native.kind in "iu" else float, tokens), native, len(tokens))
 
 
@@ -109,6 +113,7 @@ def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompress
             raise DataError(f"unpacks to more than the {need} bytes that {what} need, so it is damaged; write it again")
         if not stream.eof:
             raise DataError(f"is cut short inside {what}: a compressed block does not end; copy it again")
+        refuse_leftover(len(stream.unused_data), what)
         parts.append(part)
         left -= len(part)
     return b"".join(parts)
@@ -122,10 +127,10 @@ def read_up_to(stream: IO[bytes], size: int, begin: bytes = b"") -> bytearray:
     return content
 
 
-def count_rest(stream: IO[bytes]) -> int:
-    """How many bytes follow in a stream, none of which is kept: at its end, gzip compares its check sum."""
+def count_rest(stream: IO[bytes], most: float = math.inf) -> int:
+    """How many bytes follow in a stream, or more than `most`; none is kept. At its end, gzip compares its check sum."""
     left = 0
-    while part := stream.read(CHUNK_BYTES):
+    while left <= most and (part := stream.read(CHUNK_BYTES)):
         left += len(part)
     return left
 

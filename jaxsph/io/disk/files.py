@@ -43,7 +43,7 @@ def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader
     if table.num_files == 1:
         if is_all(len(table), table):
             return table
-        note = f"its header says {table.announced} particles of this type, and the file has {len(table)}: is it a part of another?"
+        note = f"its header says {table.announced} particles of this type, and it has {len(table)}: is it a part of another?"
         return dataclasses.replace(table, conventions=(*table.conventions, note))
     files = files_of(path, table.num_files)
     if files is None:

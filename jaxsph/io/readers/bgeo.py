@@ -9,6 +9,7 @@ Source: the Houdini 11 GEO/BGEO format, as implemented by Disney's Partio.
 from __future__ import annotations
 
 import gzip
+import math
 import struct
 from pathlib import Path
 from typing import IO, cast
@@ -42,7 +43,7 @@ def read(path: Path) -> ParticleTable:
         stop = start + count * record.itemsize
         content = read_up_to(stream, count * record.itemsize, begin[start:stop])
         refuse_missing(count, len(content) // record.itemsize, "points")
-        rest = max(len(begin) - stop, 0) + count_rest(stream)
+        rest = max(len(begin) - stop, 0) + count_rest(stream, len(END) if is_alone else math.inf)
         if is_alone:
             refuse_leftover(rest - len(END), f"{count} points")
         points = np.frombuffer(content, dtype=record, count=count)

@@ -72,8 +72,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         said += notes
         said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
         more: dict[str, Any] = {"box_size": box_size, "time": time_of(header["time"]), "num_files": max(int(header["files"]), 1)}
-        more |= {"conventions": tuple(said), "part_type": chosen, "announced": int(header["total"][chosen]), "kernel": "cubic_spline"}
-        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
+        more |= {"conventions": tuple(said), "part_type": chosen, "announced": int(header["total"][chosen])}
+        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, kernel="cubic_spline", **more)
 
 
 def looks_like(start: bytes) -> bool:

@@ -118,8 +118,8 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
-    more |= {"part_type": chosen, "announced": counts[chosen], "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
-    return ParticleTable(position, columns, support, None, box_size, source, **more)
+    more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
+    return ParticleTable(position, columns, support, None, box_size, source, announced=counts[chosen], **more)
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:

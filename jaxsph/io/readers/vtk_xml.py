@@ -86,15 +86,7 @@ def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, di
     position = np.zeros((0, 3)) if points is None else decoder.array(points, count, 3)
     if position is None or position.shape != (count, 3):
         raise DataError("has points that are not three numbers each; write it again")
-    columns = {}
-    for array in piece.iterfind("PointData/DataArray"):
-        name = array.get("Name", "unnamed")
-        values = decoder.array(array, count, 1)
-        if name in columns:
-            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
-        if values is not None:
-            columns[name] = values
-    return position, columns
+    return position, decoder.point_data(piece, count)
 
 
 class Decoder:
@@ -112,6 +104,18 @@ class Decoder:
         self.appended = memoryview(appended)
         self.appended_is_text = b"base64" in tag
         self.words: list[str] = []
+
+    def point_data(self, piece: ElementTree.Element, count: int) -> dict[str, np.ndarray]:
+        """(count, width) numbers of each array of a piece's points, by name; those of words are left out."""
+        columns: dict[str, np.ndarray] = {}
+        for element in piece.iterfind("PointData/DataArray"):
+            name = element.get("Name", "unnamed")
+            values = self.array(element, count, 1)
+            if name in columns:
+                raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
+            if values is not None:
+                columns[name] = values
+        return columns
 
     def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:
         """(count, width) numbers of one `DataArray`, or `None` where it holds words."""

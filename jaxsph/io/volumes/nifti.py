@@ -54,5 +54,5 @@ def _whole(library: Any, path: Path) -> tuple[Any, np.ndarray]:
             raise DataError(f"is cut short: its header announces {need} bytes, its {room} can be no more; copy it again")
         values = np.asanyarray(data)
         stream.seek(need)
-        refuse_leftover(count_rest(cast(IO[bytes], stream)), f"{data.shape} of {data.dtype}")
+        refuse_leftover(count_rest(cast(IO[bytes], stream), 0), f"{data.shape} of {data.dtype}")
     return image, values

@@ -5,7 +5,12 @@ Source: the NRRD file format, teem.sourceforge.net/nrrd/format.html.
 
 from __future__ import annotations
 
+import bz2
+import functools
+import io as memory_io
+import math
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +18,14 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, regular_file
 from jaxsph.io.libraries import require
-from jaxsph.io.parsing import refuse_leftover
+from jaxsph.io.parsing import Decompressor, numbers, refuse_leftover, refuse_missing, unpack_blocks
+from jaxsph.io.readers.hdf5_links import inside
 from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
 
 SOURCE = "NRRD"
+TEXTS = "ASCII", "ascii", "text", "txt"
+_GZIP = functools.partial(zlib.decompressobj, zlib.MAX_WBITS | 16)
+UNPACKING: dict[str, Decompressor] = {"gzip": _GZIP, "gz": _GZIP, "bzip2": bz2.BZ2Decompressor, "bz2": bz2.BZ2Decompressor}
 
 
 def read(path: Path) -> VolumeTable:
@@ -30,6 +39,7 @@ def read(path: Path) -> VolumeTable:
     with explained(path, SOURCE):
         values, header = _whole(library, path)
         directions = header.get("space directions")
+        said: list[str] = []
         spatial = _spatial_axes(header, values.ndim)
         if len(spatial) != 3 or values.ndim > 4:
             raise DataError(f"has {values.ndim} axes of which {len(spatial)} are space; write the three of one volume")
@@ -39,36 +49,64 @@ def read(path: Path) -> VolumeTable:
             if any(row.shape != (3,) for row in rows):
                 raise DataError(f"has directions of {rows[0].size} numbers; write it in a space of three dimensions")
             steps = np.stack(rows, 1)
+            first = np.zeros(3)
         else:
-            spacing = np.asarray(header.get("spacings", np.ones(values.ndim)), np.float64)[spatial]
-            steps = np.diag(np.where(np.isnan(spacing), 1.0, spacing))
-        origin = np.nan_to_num(np.asarray(header.get("space origin", np.zeros(3)), np.float64))
-        said = (f"coordinates are those of its space, {header['space']}",) if "space" in header else ()
-        return along_axes({"values": values}, origin, steps, SOURCE, said)
+            first, steps, said = _place(header, spatial, np.array(values.shape[:3]))
+        origin = np.nan_to_num(np.asarray(header.get("space origin", first), np.float64))
+        said += [f"coordinates are those of its space, {header['space']}"] if "space" in header else []
+        return along_axes({"values": values}, origin, steps, SOURCE, tuple(said))
 
 
 def _whole(library: Any, path: Path) -> tuple[np.ndarray, Any]:
-    """Values and header; nothing may be left over behind the values, where pynrrd does not look."""
+    """Values and header. pynrrd reads no data: it looks neither behind the values nor where the file of them lies."""
     with path.open("rb") as file:
         header = library.read_header(file)
-        beside = header.get("data file", header.get("datafile"))
-        stored = path if beside is None else regular_file(path.parent / beside)
-        start = file.tell() if beside is None else 0
-        values = library.read_data(header, file, str(path), index_order="F")
+        start = file.tell()
+    beside = header.get("data file", header.get("datafile"))
+    if beside is not None:
+        folders = path.absolute().parent, path.resolve().parent
+        path, start = inside(regular_file(folders[0] / beside), folders, f"has its data in `{beside}`"), 0
+    sizes, encoding = header["sizes"].tolist(), header["encoding"]
     lines, skipped = (int(header.get(f"{what} skip", header.get(f"{what}skip", 0))) for what in ("line", "byte"))
-    size = skipped + values.nbytes
-    with stored.open("rb") as file:
-        if skipped >= 0 and header["encoding"] == "raw":  # pynrrd refuses no more than whole numbers of bytes
-            file.seek(start)
-            for _ in range(lines):
-                file.readline()
-            refuse_leftover(os.path.getsize(stored) - file.tell() - size, f"{size} bytes of values")
-        elif skipped >= 0 and header["encoding"] in ("gzip", "gz"):  # what follows it, or its end lacks, is not looked at
-            file.seek(-4, os.SEEK_END)
-            if int.from_bytes(file.read(), "little") != size % 2**32:
-                lacks = "it is cut short, or something follows"
-                raise DataError(f"does not end with its length of {size} bytes, as gzip does: {lacks}")
-    return values, header
+    if min(sizes) < 1 or len(sizes) != header["dimension"] or lines < 0 or skipped < (-1 if encoding == "raw" else 0):
+        raise DataError(f"has sizes {sizes}, and skips {lines} lines and {skipped} bytes; it is damaged: write it again")
+    nothing = {"type": header["type"], "endian": header.get("endian", "little"), "encoding": "raw", "dimension": 1}
+    dtype = library.read_data({**nothing, "sizes": np.zeros(1, int)}, memory_io.BytesIO()).dtype
+    count = math.prod(sizes)
+    with path.open("rb") as file:
+        file.seek(start)
+        for _ in range(lines):
+            file.readline()
+        if skipped < 0:
+            file.seek(-count * dtype.itemsize, os.SEEK_END)
+        content, behind = file.read(), max(skipped, 0)
+    need = behind + count * dtype.itemsize
+    if encoding in UNPACKING:
+        content = unpack_blocks([content], UNPACKING[encoding], need, "its values")
+    if encoding in TEXTS:
+        values = numbers(content[behind:].split(), dtype)
+        refuse_leftover(len(values) - count, f"{count} values", "numbers")
+    else:
+        refuse_leftover(len(content) - need, f"{need} bytes of values")
+        values = np.frombuffer(content, dtype, min(count, (len(content) - behind) // dtype.itemsize), behind)
+    refuse_missing(count, len(values), "values")
+    return values.reshape(sizes, order="F"), header
+
+
+def _place(header: Any, spatial: list[int], sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """The first point and steps where there are no directions, and a note: of cells unless said of nodes, as teem takes them."""
+
+    def of(name: str) -> np.ndarray:
+        given = header.get(name, header.get(name.replace(" ", "")))
+        return np.full(3, np.nan) if given is None else np.asarray(given, np.float64)[spatial]
+
+    lower, upper, spacing = of("axis mins"), of("axis maxs"), of("spacings")
+    centered = header.get("centerings") or header.get("centers", "").split() or [""] * len(header["sizes"])
+    half = np.array([0.0 if centered[axis] == "node" else 0.5 for axis in spatial])
+    steps = np.where(np.isnan(spacing), (upper - lower) / np.maximum(sizes - 1 + 2 * half, 1), spacing)
+    steps = np.where(np.isnan(steps), 1.0, steps)
+    note = f"placed by `axis mins` and `axis maxs`, of {'cells' if half.any() else 'nodes'}"
+    return np.where(np.isnan(lower), 0.0, lower + half * steps), np.diag(steps), [] if np.isnan([lower, upper]).all() else [note]
 
 
 def _spatial_axes(header: Any, axes: int) -> list[int]:

@@ -6,7 +6,7 @@ Source: VTK File Formats, Kitware, "XML File Formats", ImageData.
 
 from __future__ import annotations
 
-import collections
+import math
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,6 +17,9 @@ from jaxsph.io.readers.vtk_xml import TYPES, Decoder, parsed
 from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
 
 SOURCE = "VTK XML image"
+Part = tuple[tuple[slice, ...], np.ndarray]
+"""Where in the whole grid values belong, and the values, (nx, ny, nz, components)."""
+MAX_INDEX = 2**31
 NAMES = {kind: name for name, kind in TYPES.items()}
 
 
@@ -32,16 +35,14 @@ def read(path: Path) -> VolumeTable:
         if image is None:
             raise DataError("has no ImageData, so it is cut short or damaged; copy it again")
         whole = _extent(image.get("WholeExtent"))
-        shape = tuple(whole[:, 1] - whole[:, 0] + 1)
-        arrays: dict[str, np.ndarray] = {}
-        filled: collections.Counter[str] = collections.Counter()
+        shape = tuple((whole[:, 1] - whole[:, 0] + 1).tolist())
+        parts: dict[str, list[Part]] = {}
         for piece in image.iter("Piece"):
-            filled.update(_put(piece, whole, shape, decoder, arrays))
-        if not arrays:
+            for name, part in _parts(piece, whole, decoder).items():
+                parts.setdefault(name, []).append(part)
+        if not parts:
             raise DataError("holds no values of points; turn values of cells into values of points, or copy the file again")
-        for name, points in filled.items():
-            if points < np.prod(shape):
-                raise DataError(f"has {points} points of `{name}` in its pieces, but a grid of {np.prod(shape)}; copy it again")
+        arrays = {name: _joined(name, found, shape) for name, found in parts.items()}
         arrays = {name: values[..., 0] if values.shape[3] == 1 else values for name, values in arrays.items()}
         spacing = _numbers(image.get("Spacing", "1 1 1"), 3)
         steps = _numbers(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3) * spacing
@@ -49,29 +50,35 @@ def read(path: Path) -> VolumeTable:
         return along_axes(arrays, _numbers(image.get("Origin", "0 0 0"), 3) + steps @ whole[:, 0], steps, SOURCE, said)
 
 
-def _put(
-    piece: ElementTree.Element, whole: np.ndarray, shape: tuple[int, ...], decoder: Decoder, arrays: dict[str, np.ndarray]
-) -> dict[str, int]:
-    """Put a piece's values where they belong, and tell how many points each of its arrays has."""
+def _parts(piece: ElementTree.Element, whole: np.ndarray, decoder: Decoder) -> dict[str, Part]:
+    """A piece's values by name, with where they belong."""
     own = _extent(piece.get("Extent"))
     size = own[:, 1] - own[:, 0] + 1
     if (own[:, 0] < whole[:, 0]).any() or (own[:, 1] > whole[:, 1]).any():
         raise DataError(f"has a piece of extent {own.tolist()} outside of the whole, {whole.tolist()}; it is damaged")
     place = tuple(slice(low, low + points) for low, points in zip(own[:, 0] - whole[:, 0], size, strict=True))
-    found = {}
-    for element in piece.iterfind("PointData/DataArray"):
-        values = decoder.array(element, int(np.prod(size)), 1)
-        if values is None:
-            continue
-        name = element.get("Name", "unnamed")
-        grid = values.reshape(*size[::-1], -1).transpose(2, 1, 0, 3)
-        if (size == shape).all():
-            arrays[name] = grid
-        else:
-            into = arrays.setdefault(name, np.zeros((*shape, grid.shape[3]), grid.dtype))
-            into[place] = grid
-        found[name] = int(np.prod(size))
-    return found
+    columns = decoder.point_data(piece, math.prod(size.tolist()))
+    return {name: (place, values.reshape(*size[::-1], -1).transpose(2, 1, 0, 3)) for name, values in columns.items()}
+
+
+def _joined(name: str, parts: list[Part], shape: tuple[int, ...]) -> np.ndarray:
+    """The array of all pieces, which are of one type, agree where they meet, and leave no point out."""
+    kinds = {f"{grid.dtype}, {grid.shape[3]} a point" for _, grid in parts}
+    if len(kinds) > 1:
+        raise DataError(f"has `{name}` as {' and as '.join(sorted(kinds))} in its pieces; write it again as one of them")
+    if len(parts) == 1 and parts[0][1].shape[:3] == shape:
+        return parts[0][1]
+    left = math.prod(shape) - sum(math.prod(grid.shape[:3]) for _, grid in parts)
+    if left <= 0:
+        values, there = np.zeros((*shape, parts[0][1].shape[3]), parts[0][1].dtype), np.zeros(shape, bool)
+        for place, grid in parts:
+            if not np.array_equal(values[place][there[place]], grid[there[place]], equal_nan=grid.dtype.kind == "f"):
+                raise DataError(f"has two values of `{name}` at one point, in two of its pieces; write it again")
+            values[place], there[place] = grid, True
+        left = int((~there).sum())
+    if left:
+        raise DataError(f"has `{name}` in its pieces, but not for {left} points of a grid of {math.prod(shape)}; copy it again")
+    return values
 
 
 def write(path: Path, values: np.ndarray, lower: np.ndarray, spacing: np.ndarray, name: str) -> None:
@@ -95,10 +102,10 @@ def write(path: Path, values: np.ndarray, lower: np.ndarray, spacing: np.ndarray
 
 def _extent(text: str | None) -> np.ndarray:
     """First and last index along x, y and z, (3, 2)."""
-    extent = _numbers(text or "", 6).astype(np.int64).reshape(3, 2)
-    if (extent[:, 1] < extent[:, 0]).any():
-        raise DataError(f"has the extent {text!r}, which is empty; write it again")
-    return extent
+    extent = _numbers(text or "", 6).reshape(3, 2)
+    if (extent[:, 1] < extent[:, 0]).any() or (extent % 1 != 0).any() or abs(extent).max() > MAX_INDEX:
+        raise DataError(f"has the extent {text!r}, which is empty, or is not of whole numbers; write it again")
+    return extent.astype(np.int64)
 
 
 def _numbers(text: str, count: int) -> np.ndarray:

@@ -158,7 +158,7 @@ def test_a_file_alone_that_announces_others_says_so(total, notes, tmp_path):
     write(tmp_path / "alone.hdf5", 0, 1, 5)
     with h5py.File(tmp_path / "alone.hdf5", "a") as file:
         file["Header"].attrs["NumPart_Total"] = [total, 0, 0, 0, 0, 0]
-    said = [one for one in js.io.read_table(tmp_path / "alone.hdf5").conventions if "77" in one and "has 5" in one]
+    said = [one for one in js.io.read_table(tmp_path / "alone.hdf5").conventions if "77" in one and "it has 5" in one]
     assert len(said) == notes
 
 

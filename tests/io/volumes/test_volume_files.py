@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
+import itertools
 
 import numpy as np
 import pytest
@@ -132,3 +134,121 @@ def test_other_files_are_refused_by_name(tmp_path):
         js.io.write_volume(tmp_path / "v.nrrd", js.Volume.from_array(FLOATS))
     with pytest.raises(ValueError, match="spacing of"):
         along_axes({"values": FLOATS}, np.zeros(3), np.diag([1.0, 0.0, 1.0]), "test")
+
+
+def image(path, pieces, whole="0 2 0 1 0 1"):
+    """A VTI of pieces: extent, type and values of `rho`, or of several arrays of that name."""
+    text = f'<VTKFile type="ImageData" byte_order="LittleEndian"><ImageData WholeExtent="{whole}" Origin="0 0 0" Spacing="1 1 1">'
+    for extent, kind, *arrays in pieces:
+        each = (f'<DataArray type="{kind}" Name="rho" format="ascii">{" ".join(map(str, one))}</DataArray>' for one in arrays)
+        text += f'<Piece Extent="{extent}"><PointData>{"".join(each)}</PointData></Piece>'
+    path.write_text(text + "</ImageData></VTKFile>")
+    return path
+
+
+LEFT, RIGHT, ALL = "0 1 0 1 0 1", "1 2 0 1 0 1", "0 2 0 1 0 1"
+WRONG = {
+    "a piece missing": ([(LEFT, "Int16", range(8))], "not for 4 points of a grid of 12"),
+    "a piece twice": ([(LEFT, "Int16", range(8)), (LEFT, "Int16", range(8))], "not for 4 points of a grid of 12"),
+    "a piece twice, and the other": (
+        [(LEFT, "Int16", range(8)), (RIGHT, "Int16", [1, 1, 3, 3, 5, 5, 7, 7]), (LEFT, "Int16", range(1, 9))],
+        "two values of `rho` at one point",
+    ),
+    "the whole twice": ([(ALL, "Int16", range(12)), (ALL, "Int16", range(1, 13))], "two values of `rho` at one point"),
+    "two types": (
+        [(LEFT, "Int16", range(8)), (RIGHT, "Float64", [1, 1.5, 3, 3.5, 5, 5.5, 7, 7.5])],
+        "as float64, 1 a point and as int16, 1 a point",
+    ),
+    "two arrays of a name": ([(ALL, "Int16", range(12), range(1, 13))], "the array `rho` twice"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_pieces_that_leave_points_out_or_disagree_are_refused(what, tmp_path):
+    pieces, said = WRONG[what]
+    with pytest.raises(ValueError, match=rf"v\.vti: has .*{said}"):
+        js.io.read_volume(image(tmp_path / "v.vti", pieces))
+
+
+@pytest.mark.parametrize("whole", ["0 2.5 0 1 0 1", "0.5 2.5 0 1 0 1", "0 1e300 0 1 0 1"])
+def test_extents_are_whole_numbers(whole, tmp_path):
+    with pytest.raises(ValueError, match=r"v\.vti: has the extent .* not of whole numbers"):
+        js.io.read_volume(image(tmp_path / "v.vti", [(ALL, "Int16", range(12))], whole))
+
+
+def test_pieces_that_claim_a_huge_grid_take_no_memory(tmp_path, measured):
+    path = image(tmp_path / "v.vti", [("0 0 0 0 0 0", "Int16", [1])], "0 3000 0 3000 0 3000")
+    with measured() as memory, pytest.raises(ValueError, match="not for 27027009000 points"):
+        js.io.read_volume(path)
+    assert memory.peak < 2**22
+
+
+def nrrd_file(path, fields, content=b""):
+    header = {"type": "short", "dimension": 3, "sizes": "4 5 6", "encoding": "raw", "endian": "big", **fields}
+    lines = "".join(f"{name}: {value}\n" for name, value in header.items())
+    path.write_bytes(f"NRRD0004\n{lines}\n".encode() + content)
+    return path
+
+
+STORED = BYTES.astype(">i2").tobytes(order="F")
+PACKED = {"gzip": gzip.compress, "bzip2": bz2.compress}
+
+
+@pytest.mark.parametrize("encoding", PACKED)
+def test_packed_values_end_where_their_stream_ends(encoding, tmp_path):
+    packed = PACKED[encoding](b"skip" + STORED)
+    path = nrrd_file(tmp_path / "v.nrrd", {"encoding": encoding, "byte skip": 4}, packed)
+    np.testing.assert_array_equal(js.io.read_volume(path).values, BYTES)
+    for content in (packed[:-5], packed + b"behind", PACKED[encoding](STORED), PACKED[encoding](b"skip" + STORED + b"1")):
+        with pytest.raises(ValueError, match=r"v\.nrrd: "):
+            js.io.read_volume(nrrd_file(path, {"encoding": encoding, "byte skip": 4}, content))
+
+
+@pytest.mark.parametrize("encoding", PACKED)
+def test_no_more_is_unpacked_than_the_header_announces(encoding, tmp_path, measured):
+    bomb = PACKED[encoding](bytes(2**26))
+    with measured() as memory, pytest.raises(ValueError, match=r"v\.nrrd: unpacks to more than the 240 bytes"):
+        js.io.read_volume(nrrd_file(tmp_path / "v.nrrd", {"encoding": encoding}, bomb))
+    assert memory.peak < 2**23
+
+
+def test_lines_and_bytes_before_values_are_skipped(tmp_path):
+    for skipped, begin in itertools.product((0, 3, -1), (0, 2)):
+        before = b"a line\n" * begin + b"xyz"[: 3 * (skipped != 0)]
+        fields = {"line skip": begin, "byte skip": skipped}
+        path = nrrd_file(tmp_path / "v.nrrd", fields, before + STORED)
+        np.testing.assert_array_equal(js.io.read_volume(path).values, BYTES)
+    text = " ".join(map(str, BYTES.ravel(order="F"))).encode()
+    np.testing.assert_array_equal(js.io.read_volume(nrrd_file(path, {"encoding": "ascii"}, text)).values, BYTES)
+    for wrong in (text[:-5], text + b" 3", text.replace(b" 1", b" 1_0", 1)):
+        with pytest.raises(ValueError, match=r"v\.nrrd: "):
+            js.io.read_volume(nrrd_file(path, {"encoding": "ascii"}, wrong))
+
+
+def test_values_beside_a_header_lie_in_its_folder(tmp_path):
+    (tmp_path / "sub").mkdir()
+    for place in ("v.raw", "sub/v.raw"):
+        (tmp_path / place).write_bytes(STORED)
+        path = nrrd_file(tmp_path / "v.nhdr", {"data file": place})
+        np.testing.assert_array_equal(js.io.read_volume(path).values, BYTES)
+    for place in ("../v.raw", tmp_path / "v.raw"):
+        path = nrrd_file(tmp_path / "sub" / "v.nhdr", {"data file": place})
+        with pytest.raises(ValueError, match=r"v\.nhdr: has its data in .*, which .* not opened"):
+            js.io.read_volume(path)
+
+
+@pytest.mark.parametrize(
+    ("fields", "lower", "spacing"),
+    [
+        ({"centerings": "node node node"}, (1, -2, 0), (3, 2, 0.2)),
+        ({"centers": "cell cell cell"}, (2.125, -1.2, 1 / 12), (2.25, 1.6, 1 / 6)),
+        ({}, (2.125, -1.2, 1 / 12), (2.25, 1.6, 1 / 6)),
+        ({"spacings": "2.25 NaN nan", "centerings": "cell node node"}, (2.125, -2, 0), (2.25, 2, 0.2)),
+    ],
+)
+def test_a_volume_lies_between_the_ends_of_its_axes(fields, lower, spacing, tmp_path):
+    path = nrrd_file(tmp_path / "v.nrrd", {"axis mins": "1 -2 0", "axis maxs": "10 6 1", **fields}, STORED)
+    volume = js.io.read_volume(path)
+    np.testing.assert_allclose(volume.bounds()[0], lower, atol=1e-6)
+    np.testing.assert_allclose(volume.spacing, spacing, rtol=1e-6)
+    assert "axis mins" in " ".join(js.io.read_volume_table(path).conventions)
