@@ -1,12 +1,15 @@
-"""PLY point sets, ASCII and binary of both byte orders: the `vertex` element; faces are not read.
+"""PLY point sets, ASCII and binary of both byte orders: the `vertex` element; others, as faces, are skipped by their sizes.
 
 Source: G. Turk, The PLY Polygon File Format, 1994.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 import re
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +18,8 @@ from jaxsph.io.parsing import gather_vectors, refuse_leftover, refuse_missing
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "PLY"
+VERTEX = "vertex"
+INDICES = "vertex_indices", "vertex_index"
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8",
@@ -26,33 +31,75 @@ END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
 """A line of its own: a comment may hold the word, too."""
 
 
+class Element(NamedTuple):
+    """A table of the file: its rows, and the words of each property, `float x` or `list uchar int vertex_indices`."""
+
+    name: str
+    rows: int
+    properties: list[list[str]]
+
+
 def read(path: Path) -> ParticleTable:
     """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns.
 
     Raises:
-        ValueError: damaged, cut short, longer than its header says, or other elements first.
+        ValueError: damaged, cut short, or longer than its header says.
     """
     with explained(path, SOURCE):
         content = path.read_bytes()
-        encoding, count, record, start, others = _header(content)
+        encoding, elements, start = _header(content)
+        place = [element.name for element in elements].index(VERTEX)
+        count, order = elements[place].rows, BYTE_ORDERS[encoding]
+        record = np.dtype([(name, order + TYPES[kind]) for kind, name in elements[place].properties])
         if encoding == "ascii":
-            points = _ascii_points(content[start:], count, record, others)
+            points = _ascii_points(content[start:], elements, place, record)
         else:
-            refuse_missing(count, (len(content) - start) // record.itemsize, "vertices")
-            if not others:
-                refuse_leftover(len(content) - start - count * record.itemsize, f"{count} vertices")
-            points = np.frombuffer(content, record, count, start)
+            ends = list(itertools.accumulate(elements, functools.partial(_end, content, order, count), initial=start))
+            refuse_leftover(len(content) - ends[-1], f"{count} vertices")
+            points = np.frombuffer(content, record, count, ends[place])
         position, columns = gather_vectors({name: np.ascontiguousarray(points[name]) for name in record.names or ()})
         said = [UNENDED_NOTE] if encoding == "ascii" and not content.endswith(b"\n") else []
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
 
 
-def _ascii_points(content: bytes, count: int, record: np.dtype, others: int) -> np.ndarray:
-    """The first `count` lines that are not blank, each number read as its own type: an id has more digits than float64."""
+def _end(content: bytes, order: str, vertices: int, at: int, element: Element) -> int:
+    """Where an element ends that begins at a byte; rows whose lists are as long as in the first of them are taken at once.
+
+    Lists that begin at a wrong byte may end at the right one: so faces are of vertices that there are.
+    """
+    left = element.rows if element.properties else 0
+    run = 1 if any(kind == "list" for kind, *_ in element.properties) else left
+    while left:
+        fields: list[Any] = []
+        lengths: dict[str, int] = {}
+        for number, (kind, *words) in enumerate(element.properties):
+            fields.append((f"{number}", order + TYPES[words[0] if kind == "list" else kind]))
+            if kind == "list":
+                lengths[f"{number}"] = length = int(np.frombuffer(content, fields, 1, at)[f"{number}"][0])
+                fields.append((f"of {number}", order + TYPES[words[1]], (length,)))
+        row = np.dtype(fields)
+        rows = np.frombuffer(content, row, min(left, run, (len(content) - at) // row.itemsize), at)
+        if not len(rows):
+            refuse_missing(element.rows, element.rows - left, "vertices" if element.name == VERTEX else f"rows of {element.name}")
+        other = np.any([rows[name] != length for name, length in lengths.items()], axis=0) if lengths else np.zeros(1, bool)
+        taken = int(other.argmax()) if other.any() else len(rows)
+        for name in lengths if element.name == "face" else ():
+            corners = rows[f"of {name}"][:taken]
+            if element.properties[int(name)][-1] in INDICES and ((corners < 0) | (corners >= vertices)).any():
+                raise DataError(f"has faces of other than its {vertices} vertices, so its data is shifted; copy it again")
+        at, left, run = at + taken * row.itemsize, left - taken, 2 * run if taken == run else 1
+    return at
+
+
+def _ascii_points(content: bytes, elements: list[Element], place: int, record: np.dtype) -> np.ndarray:
+    """The lines of an element that are not blank, each number read as its own type: an id has more digits than float64."""
     filled = [row for row in content.split(b"\n") if row.strip()]
-    rows = filled[:count]
+    counts = [element.rows if element.properties else 0 for element in elements]
+    before, count, lines = sum(counts[:place]), counts[place], sum(counts)
+    rows = filled[before : before + count]
     refuse_missing(count, len(rows), "vertices")
-    refuse_leftover(len(filled) - count - others, f"{count} vertices", "lines")
+    refuse_missing(lines, len(filled), "lines behind the header")
+    refuse_leftover(len(filled) - lines, f"{count} vertices", "lines")
     if not rows:
         return np.zeros(0, record)
     width, num_properties = len(rows[0].split()), len(record.names or ())
@@ -70,8 +117,8 @@ def _ascii_points(content: bytes, count: int, record: np.dtype, others: int) -> 
     return points.astype(record)
 
 
-def _header(content: bytes) -> tuple[str, int, np.dtype, int, int]:
-    """Encoding, number of vertices, the record of one vertex, the offset of the first, and how many other entries follow."""
+def _header(content: bytes) -> tuple[str, list[Element], int]:
+    """Encoding, elements in their order, and the offset of the first."""
     if not content.startswith(b"ply"):
         raise DataError("does not begin with `ply`, so it is no PLY file")
     end = END_OF_HEADER.search(content)
@@ -81,19 +128,19 @@ def _header(content: bytes) -> tuple[str, int, np.dtype, int, int]:
     formats = [words[1] for words in lines if words[:1] == ["format"]]
     if not formats or formats[0] not in BYTE_ORDERS:
         raise DataError(f"has the PLY format {formats}, expected one of {', '.join(BYTE_ORDERS)}")
-    elements = [index for index, words in enumerate(lines) if words[:1] == ["element"]]
-    if not elements or lines[elements[0]][1] != "vertex":
-        raise DataError("does not have `vertex` as its first element; only points are read: save the vertices alone")
-    stop = elements[1] if len(elements) > 1 else len(lines)
-    properties = [words[1:] for words in lines[elements[0] : stop] if words[:1] == ["property"]]
-    if any(words[0] not in TYPES for words in properties):
+    elements: list[Element] = []
+    for words in lines:
+        if words[:1] == ["element"]:
+            elements.append(Element(words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            elements[-1].properties.append(words[1:])
+    vertices = [element for element in elements if element.name == VERTEX]
+    if len(vertices) != 1 or min(element.rows for element in elements) < 0:
+        told = ", ".join(f"{element.rows} {element.name}" for element in elements) or "nothing"
+        raise DataError(f"announces {told}, and must have one element `{VERTEX}` of particles; write it again")
+    kinds = [words[0] for words in vertices[0].properties]
+    if any(kind not in TYPES for kind in kinds):
         raise DataError("has vertex properties that are lists or of unknown type; save the vertices without them")
-    if not properties:
+    if not kinds:
         raise DataError("has vertices without properties, so there are no positions; write it again with x, y and z")
-    order = BYTE_ORDERS[formats[0]]
-    record = np.dtype([(name, order + TYPES[kind]) for kind, name in properties])
-    count = int(lines[elements[0]][2])
-    if count < 0:
-        raise DataError(f"announces {count} vertices, so its header is damaged")
-    others = sum(max(int(lines[index][2]), 0) for index in elements[1:])
-    return formats[0], count, record, end.end(), others
+    return formats[0], elements, end.end()

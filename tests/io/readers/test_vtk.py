@@ -93,3 +93,14 @@ def test_binary_data_that_does_not_end_with_its_line_is_refused(samples, tmp_pat
         (tmp_path / "a.vtk").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"a\.vtk: has no end of the line after points"):
             io.read_table(tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize("word", ["2_5", "_25", "25_"])
+@pytest.mark.parametrize("kind", ["int", "double"])
+def test_numbers_have_no_underscores(kind, word, tmp_path):
+    header = "# vtk DataFile Version 3.0\ntitle\nASCII\nDATASET POLYDATA\n"
+    for points, scalar in ((f"1 2 {word}", "7"), ("1 2 3", word)):
+        data = f"POINTS 1 float\n{points}\nPOINT_DATA 1\nSCALARS a {kind}\n{scalar}\n"
+        (tmp_path / "a.vtk").write_text(header + data)
+        with pytest.raises(ValueError, match=rf"a\.vtk: has b'{word}' where a number should be"):
+            io.read_table(tmp_path / "a.vtk")
