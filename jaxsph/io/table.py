@@ -47,6 +47,7 @@ class ParticleTable:
         units: of positions and columns, and the moment, as far as the file states them.
         part_type: number of the type of particles that was read, where the format has types.
         num_files: how many files the snapshot has, of which this may be one.
+        unusable: why supports that the file has cannot be used, where that is so: what needs none can be read all the same.
         announced: how many particles of that type the whole snapshot has, as the file says, which counts up to 2^32.
         kernel: name of the smoothing kernel that the file states, or that its code has unless told otherwise; `None` where the
             format says nothing of kernels.
@@ -68,6 +69,7 @@ class ParticleTable:
     units: FileUnits = NO_UNITS
     part_type: int | None = dataclasses.field(default=None, kw_only=True)
     num_files: int = dataclasses.field(default=1, kw_only=True)
+    unusable: str | None = dataclasses.field(default=None, kw_only=True)
     announced: int | None = dataclasses.field(default=None, kw_only=True)
     kernel: str | None = dataclasses.field(default=None, kw_only=True)
 
@@ -138,13 +140,23 @@ def table_from_columns(
             said.append(f"{role} = column `{stored}`")
         elif stored is not None and rest[stored].ndim == 2:
             said.append(f"column `{stored}` has {rest[stored].shape[1]} components and is not used as the {role}")
+    support, unusable = usable_supports(special.get("support"))
     smoothing = next((name for name in rest if plain(name) in map(plain, SMOOTHING_NAMES)), None)
     if smoothing is not None and "support" not in special:
         said.append(
             f"column `{smoothing}` looks like a smoothing length and is not used: the factor from it to the support "
             f"radius differs between codes; pass `support=` to set supports yourself"
         )
-    return ParticleTable(position, rest, special.get("support"), special.get("volume"), source=source, conventions=tuple(said))
+    more: dict[str, Any] = {"source": source, "conventions": tuple(said), "unusable": unusable}
+    return ParticleTable(position, rest, support, special.get("volume"), **more)
+
+
+def usable_supports(values: np.ndarray | None) -> tuple[np.ndarray | None, str | None]:
+    """Supports as a file has them, or why they cannot be used: they are no lengths."""
+    try:
+        return (None if values is None else _positive("support", values, len(values))), None
+    except DataError as error:
+        return None, str(error)
 
 
 def native(array: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from jaxsph.io.libraries import require
 from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_links import PURPOSE, holds, member, opened
 from jaxsph.io.readers.hdf5_storage import position_shape, read_dataset
+from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
 from jaxsph.io.table import ParticleTable, plain
 
@@ -117,7 +118,7 @@ def _cells(file: Any, name: str) -> np.ndarray | None:
     counts, offsets = (read_dataset(cells[part][name]).astype(np.int64) for part in ("Counts", "OffsetsInFile"))
     if "Files" in cells and name in cells["Files"]:  # of a snapshot in several files, those that lie in this one
         header = file["Header"].attrs if "Header" in file else {}
-        inside = read_dataset(cells["Files"][name]) == int(np.ravel(header.get("ThisFile", 0))[0])
+        inside = read_dataset(cells["Files"][name]) == int(number_of(header, "ThisFile") or 0)
         counts, offsets = counts[inside], offsets[inside]
     order = np.argsort(offsets, kind="stable")
     counts, offsets = counts[order], offsets[order]

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, others_held
-from jaxsph.io.table import ParticleTable, box_of, time_of
+from jaxsph.io.table import ParticleTable, box_of, time_of, usable_supports
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
@@ -68,12 +68,14 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         support = columns.pop("HSML", None)
         if support is not None:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
+        support, unusable = usable_supports(support)
         box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
         said += notes
         said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
         more: dict[str, Any] = {"box_size": box_size, "time": time_of(header["time"]), "num_files": max(int(header["files"]), 1)}
-        more |= {"conventions": tuple(said), "part_type": chosen, "announced": int(header["total"][chosen])}
-        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, kernel="cubic_spline", **more)
+        more |= {"conventions": tuple(said), "part_type": chosen, "kernel": "cubic_spline"}
+        more |= {"announced": int(header["total"][chosen]), "unusable": unusable}
+        return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
 
 def looks_like(start: bytes) -> bool:

@@ -5,7 +5,7 @@ What `SmoothingLength` means depends on the code:
 | code | support radius $H$ |
 |---|---|
 | GADGET, GIZMO | `SmoothingLength` itself |
-| SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel named in `HydroScheme` |
+| SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel and the dimension named in `HydroScheme` |
 
 Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
 `Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
@@ -26,21 +26,23 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import choose_type, others_held
 from jaxsph.io.readers.hdf5_links import holds, member
-from jaxsph.io.readers.hdf5_storage import columns_of, read_dataset, read_positions
-from jaxsph.io.readers.stated_units import number_of, of_gadget
-from jaxsph.io.table import ParticleTable, box_of, plain, time_of
+from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_positions
+from jaxsph.io.readers.stated_units import number_of, numbers_of, of_gadget
+from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.table import ParticleTable, box_of, plain, time_of, usable_supports
 
 SOURCE = "Gadget HDF5"
 SWIFT_SOURCE = "SWIFT HDF5"
 SWIFT_KERNELS = {
-    "Cubic spline (M4)": ("cubic_spline", 1.825742),
-    "Quartic spline (M5)": ("quartic_spline", 2.018932),
-    "Quintic spline (M6)": ("quintic_spline", 2.195775),
-    "Wendland C2": ("wendland_c2", 1.936492),
-    "Wendland C4": ("wendland_c4", 2.207940),
-    "Wendland C6": ("wendland_c6", 2.449490),
+    "Cubic spline (M4)": ("cubic_spline", (1.732051, 1.778002, 1.825742)),
+    "Quartic spline (M5)": ("quartic_spline", (1.936492, 1.977173, 2.018932)),
+    "Quintic spline (M6)": ("quintic_spline", (2.121321, 2.158131, 2.195775)),
+    "Wendland C2": ("wendland_c2", (1.620185, 1.897367, 1.936492)),
+    "Wendland C4": ("wendland_c4", (1.936492, 2.171239, 2.207940)),
+    "Wendland C6": ("wendland_c6", (2.207940, 2.415230, 2.449490)),
 }
-"""Kernels, and support radius over smoothing length: SWIFT defines $h$ as twice the standard deviation of the kernel."""
+"""Kernels, and support radius over smoothing length in one, two and three dimensions: SWIFT defines $h$ as twice the standard
+deviation of the kernel; of one dimension, Wendland's are others."""
 GADGET4_KERNELS = {
     "CUBIC_SPLINE_KERNEL": "cubic_spline",
     "WENDLAND_C2_KERNEL": "wendland_c2",
@@ -65,6 +67,8 @@ MESH_NOTE = (
 )
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
+NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
+"""Columns whose absence would change supports or volumes."""
 
 
 def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
@@ -84,19 +88,9 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
     swift = _is_swift(file)
-    columns, dropped = {}, []
-    for name, dataset in columns_of(group).items():
-        if name == "Coordinates" or (only is not None and plain(name) not in only):
-            continue
-        if dataset.dtype.kind not in "fiub":
-            dropped.append(name)
-        elif dataset.shape[0] != count:
-            raise DataError(f"PartType{chosen}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
-        else:
-            columns[name] = read_dataset(dataset, rows)
-    if dropped:
-        said.append(f"left out {', '.join(dropped)}: not numbers")
-    masses = np.ravel(header.get("MassTable", ()))
+    columns, told = _columns(group, count, rows, only)
+    said += told
+    masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
         mass, where = float(masses[chosen]), "`MassTable` of its header; correct that number there"
         if not 0 <= mass < np.inf:
@@ -105,21 +99,37 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
             columns["Masses"] = np.full(len(position), mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
     smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
-    support = None
+    support = unusable = None
     if smoothing is not None:
-        support, sentence = _support(file, columns.pop(smoothing), smoothing, swift)
+        support, sentence = _support(file, columns[smoothing], smoothing, swift)
+        support, unusable = usable_supports(support)
+        if unusable is None:
+            del columns[smoothing]
         said.append(sentence)
-    if support is None and chosen == 0 and _is_moving_mesh(file, group):
+    if smoothing is None and chosen == 0 and _is_moving_mesh(file, group):
         said.append(MESH_NOTE)
     kernel, sentence = _kernel(file, header, swift)
     said.append(sentence)
-    edges = np.ravel(header.get("BoxSize", 0.0)).astype(np.float64)
+    edges = numbers_of(header, "BoxSize").astype(np.float64)
     box_size, notes = box_of(edges) if _is_periodic(file) and edges.any() else (None, [])
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
     more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
-    return ParticleTable(position, columns, support, None, box_size, source, announced=counts[chosen], **more)
+    more |= {"announced": counts[chosen], "unusable": unusable}
+    return ParticleTable(position, columns, support, None, box_size, source, **more)
+
+
+def _columns(group: Any, count: int, rows: slice | None, only: Container[str] | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns but positions, and sentences on those that are left out: of words, or packed by a filter that is not installed."""
+    found = {name: each for name, each in columns_of(group).items() if only is None or plain(name) in only}
+    found.pop("Coordinates", None)
+    words = [name for name, dataset in found.items() if dataset.dtype.kind not in "fiub"]
+    for name, dataset in found.items():
+        if name not in words and dataset.shape[0] != count:
+            raise DataError(f"{group.name[1:]}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
+    columns, packed = numeric_datasets(found, count, NEEDED, rows)
+    return columns, [*([f"left out {', '.join(words)}: not numbers"] if words else []), *packed]
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:
@@ -137,9 +147,8 @@ def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
     """How many particles of each type the whole snapshot has, as its header says; `None` of those `present` that it does not."""
     counts: dict[int, int | None] = dict.fromkeys(present)
     for name, factor in (("NumPart_Total", 1), ("NumPart_Total_HighWord", 2**32)):
-        told = np.ravel(np.asarray(header.get(name, ())))
-        for number, count in enumerate(told.tolist() if told.dtype.kind in "iu" else []):
-            counts[number] = (counts.get(number) or 0) + count * factor
+        for number, count in enumerate(numbers_of(header, name).tolist()):
+            counts[number] = (counts.get(number) or 0) + int(count) * factor
     return counts
 
 
@@ -157,8 +166,11 @@ def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[
             f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`); the support radius is known "
             f"for {', '.join(SWIFT_KERNELS)}"
         )
-    gamma = SWIFT_KERNELS[kernel][1]
-    return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {kernel} kernel)"
+    stated = (number_of(file[part].attrs, "Dimension") for part in ("HydroScheme", "Header") if part in file)
+    dimensions = next((int(number) for number in stated if number in (1, 2, 3)), 3)
+    gamma = SWIFT_KERNELS[kernel][1][dimensions - 1]
+    of = f"{kernel} kernel" + f" in {dimensions}-D" * (dimensions < 3)
+    return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {of})"
 
 
 def _swift_kernel(file: Any) -> str:
@@ -194,8 +206,8 @@ def _is_moving_mesh(file: Any, group: Any) -> bool:
 
 def _refuse_other_count(header: Any, chosen: int, count: int) -> None:
     """A file that was rewritten in part, or not to its end, says so here alone."""
-    told = np.ravel(np.asarray(header.get("NumPart_ThisFile", ())))
-    if chosen < len(told) and told.dtype.kind in "iuf" and told[chosen] != count:
+    told = numbers_of(header, "NumPart_ThisFile")
+    if chosen < len(told) and told[chosen] != count:
         raise DataError(
             f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g}; copy it again, "
             f"or correct that number if rows were added or left out on purpose"

@@ -14,9 +14,9 @@ from pathlib import Path
 from jaxsph.io.damage import DataError
 from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_links import opened
-from jaxsph.io.readers.hdf5_storage import numeric_datasets, read_positions
+from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_positions
 from jaxsph.io.readers.phantom import hdf5_dump
-from jaxsph.io.table import ParticleTable, plain, table_from_columns
+from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns
 
 SOURCE = "HDF5 points"
 POSITION_NAMES = ("coordinates", "position", "positions", "pos", "points", "xyz")
@@ -43,4 +43,6 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         position = read_positions(file[stored])
-        return table_from_columns(position, numeric_datasets(file, len(position), skip=(stored,)), source=SOURCE)
+        datasets = {name: each for name, each in columns_of(file).items() if name != stored}
+        columns, said = numeric_datasets(datasets, len(position), [*map(plain, (*SUPPORT_NAMES, *VOLUME_NAMES))])
+        return table_from_columns(position, columns, source=SOURCE, conventions=said)

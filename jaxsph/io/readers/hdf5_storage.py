@@ -10,9 +10,12 @@ looked at, as HDF5 reads what it does not find as the fill value.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib
 import math
 import os
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +25,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.libraries import require
 from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.readers.hdf5_links import PURPOSE, check_links, file_of, inside, member, members
+from jaxsph.io.table import plain
 
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
@@ -29,6 +33,10 @@ BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 MAX_PIECES = 2**24
 """Of a view: about as many as parts of a snapshot, squared at worst."""
 COPY = "write its numbers into one file"
+
+
+class FilterError(DataError):
+    """Data is packed by a filter that is not installed."""
 
 
 class Source(NamedTuple):
@@ -43,7 +51,7 @@ def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
     """All of an `h5py.Dataset`, or some of its rows.
 
     Raises:
-        ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold.
+        ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is missing.
     """
     if shape_of(dataset) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
@@ -74,13 +82,24 @@ def columns_of(group: Any) -> dict[str, Any]:
     return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
 
 
-def numeric_datasets(group: Any, count: int, skip: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
-    """The data sets of `group` with `count` rows of one or more numbers."""
-    return {
-        name: read_dataset(dataset)
-        for name, dataset in columns_of(group).items()
-        if name not in skip and dataset.shape[0] == count and dataset.dtype.kind in "fiub"
-    }
+def numeric_datasets(
+    datasets: Mapping[str, Any], count: int, needed: Container[str] = (), rows: slice | None = None
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Those with `count` rows of one or more numbers, and a sentence on each that a missing filter has packed.
+
+    Raises:
+        ValueError: such a filter of one that is `needed` (`plain`).
+    """
+    columns, said = {}, []
+    for name, dataset in datasets.items():
+        if dataset.shape[0] == count and dataset.dtype.kind in "fiub":
+            try:
+                columns[name] = read_dataset(dataset, rows)
+            except FilterError as error:
+                if plain(name) in needed:
+                    raise
+                said.append(f"left out {name}: {error}")
+    return columns, said
 
 
 def shape_of(dataset: Any) -> tuple[int, ...] | None:
@@ -123,12 +142,21 @@ def refuse_unwritten(dataset: Any) -> None:
 
 
 def _most_per_byte(dataset: Any) -> float:
-    """How many bytes one stored byte can become."""
-    pipeline = dataset.id.get_create_plist()
-    filters = {pipeline.get_filter(index)[0] for index in range(pipeline.get_nfilters())}
+    """How many bytes one stored byte can become. Raises `FilterError`: that cannot be, without what packed it."""
+    pipeline, available = dataset.id.get_create_plist(), require("h5py", PURPOSE).h5z.filter_avail
+    filters = {found[0]: found[3].decode(errors="replace") for found in map(pipeline.get_filter, range(pipeline.get_nfilters()))}
+    if not all(map(available, filters)):
+        with contextlib.suppress(ImportError):
+            importlib.import_module("hdf5plugin")  # brings those that are common
+    for number, name in filters.items():
+        if not available(number):
+            called = f"{number} ({name})" if name else f"{number}"
+            raise FilterError(
+                f"`{dataset.name}` is packed by the HDF5 filter {called}, which is not installed; `pip install hdf5plugin`"
+            )
     if not filters:
         return 1
-    return DEFLATE_RATIO if filters <= BOUNDED_FILTERS else math.inf
+    return DEFLATE_RATIO if filters.keys() <= BOUNDED_FILTERS else math.inf
 
 
 def _refuse_short_storage(dataset: Any, needed: int) -> None:
@@ -228,7 +256,7 @@ def _source_shape(source: Source, *_: int) -> tuple[int, ...]:
         try:
             refuse_unwritten(found)
         except DataError as error:
-            raise DataError(f"{source.said}: there {error}") from error
+            raise type(error)(f"{source.said}: there {error}") from error
         return tuple(found.shape)
 
 

@@ -209,12 +209,14 @@ def _gadget_time(holders: list[Any]) -> CodeUnit | None:
 
 def number_of(attributes: Any, name: str) -> float | None:
     """An attribute that is one number, or an array of one."""
-    if name not in attributes:
-        return None
-    stored = np.ravel(np.asarray(attributes[name]))
-    if len(stored) < 1 or stored.dtype.kind not in "iufb" or not np.isfinite(stored[0]):
-        return None
-    return float(stored[0])
+    stored = numbers_of(attributes, name)
+    return float(stored[0]) if len(stored) and np.isfinite(stored[0]) else None
+
+
+def numbers_of(attributes: Any, name: str) -> np.ndarray:
+    """An attribute as an array of its numbers; of what is none, as HDF5's `Empty`, an empty one."""
+    stored = np.ravel(np.asarray(attributes.get(name, ())))
+    return stored if stored.dtype.kind in "iufb" else np.zeros(0)
 
 
 def _dataset(group: Any, name: str) -> float | None:

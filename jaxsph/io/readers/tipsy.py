@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type, others_held, refuse_leftover
+from jaxsph.io.parsing import choose_type, numbers, others_held, refuse_leftover
 from jaxsph.io.readers.stated_units import units_beside
 from jaxsph.io.settle.stored import with_stored_lengths
 from jaxsph.io.table import ParticleTable
@@ -144,11 +144,11 @@ def _values(file: Path, counts: set[int]) -> tuple[np.ndarray | None, str]:
         if count in counts and size == 4 + 4 * count:
             return np.frombuffer(stored[4:], f"{order}f4").astype(np.float32), ""
     try:
-        first, *numbers = stored.split()
-        values = np.array(numbers, np.float64)
+        first, *rest = stored.split()
+        values = numbers(rest, np.dtype(np.float64))
         count = int(first)
     except ValueError:
         return None, "is neither text of numbers nor floats of four bytes"
     if count not in counts or len(values) != count:
         return None, f"states {count} numbers and has {len(values)}, but there are {max(counts)} particles"
-    return values.astype(np.float64), ""
+    return values, ""

@@ -258,6 +258,8 @@ def _supports(table: ParticleTable, support: float | np.ndarray | None, progress
     if table.support is not None:
         sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
         return table.support.astype(np.float64), sentence
+    if table.unusable is not None:
+        raise DataError(table.unusable)
     spacing = even_spacing(table.position, box=table.box_size)
     if spacing is not None:
         return np.full(len(table), SPACINGS * spacing), f"{SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"

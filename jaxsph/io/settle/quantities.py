@@ -112,7 +112,8 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     if role == "density" and density is not None:
         return density(), "density"
     known = available_quantities(table)
-    meant = did_you_mean(name, known)
+    left_out = "".join(f"; {said}" for said in table.conventions if said.startswith(f"left out {name}:"))
+    meant = left_out or did_you_mean(name, known)
     raise DataError(f"there is no quantity {name!r}; there are {', '.join(known)}, and `log10:` before any of them{meant}")
 
 

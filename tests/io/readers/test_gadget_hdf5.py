@@ -18,21 +18,35 @@ def test_the_smoothing_length_of_gadget_is_the_support(samples, tmp_path):
     assert any("support = SmoothingLength (Gadget convention" in sentence for sentence in table.conventions)
 
 
+@pytest.mark.parametrize("where", [("Header", [2]), ("HydroScheme", 2), ("HydroScheme", [1]), ("Header", 3), None])
 @pytest.mark.parametrize("kernel", list(SWIFT_KERNELS))
-def test_the_support_of_swift_is_gamma_smoothing_lengths_of_its_kernel(kernel, samples, tmp_path):
+def test_the_support_of_swift_is_gamma_smoothing_lengths_of_its_kernel_in_its_dimension(kernel, where, samples, tmp_path):
     samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel=kernel)
+    if where is not None:
+        with h5py.File(tmp_path / "a.hdf5", "a") as file:
+            file[where[0]].attrs["Dimension"] = where[1]
     table = io.read_table(tmp_path / "a.hdf5")
-    np.testing.assert_allclose(table.support, SWIFT_KERNELS[kernel][1] * 0.5)
+    gamma = SWIFT_KERNELS[kernel][1][2 if where is None else int(np.ravel(where[1])[0]) - 1]
+    np.testing.assert_allclose(table.support, gamma * 0.5)
     assert table.source == "SWIFT HDF5"
-    assert any(str(SWIFT_KERNELS[kernel][1]) in sentence and kernel in sentence for sentence in table.conventions)
+    assert any(str(gamma) in sentence and kernel in sentence for sentence in table.conventions)
 
 
-@pytest.mark.parametrize(("kernel", "gamma"), SWIFT_KERNELS.values())
-def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel, gamma):
+OF_ONE_DIMENSION = {
+    "wendland_c2": lambda q: (1 - q) ** 3 * (1 + 3 * q),
+    "wendland_c4": lambda q: (1 - q) ** 5 * (1 + 5 * q + 8 * q**2),
+    "wendland_c6": lambda q: (1 - q) ** 7 * (1 + 7 * q + 19 * q**2 + 21 * q**3),
+}
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+@pytest.mark.parametrize(("kernel", "gammas"), SWIFT_KERNELS.values())
+def test_gamma_is_the_support_over_twice_the_standard_deviation_of_the_kernel(kernel, gammas, dimension):
     q = np.linspace(0, 1, 100_001)
-    weight = kernels.KERNELS[kernel].norm * 4 * np.pi * kernels.KERNELS[kernel].of_square(q**2, np)
-    deviation = np.sqrt(np.trapezoid(weight * q**4, q) / 3)
-    assert gamma == pytest.approx(1 / (2 * deviation), rel=1e-6)
+    other = OF_ONE_DIMENSION.get(kernel) if dimension == 1 else None
+    weight = kernels.KERNELS[kernel].of_square(q**2, np) if other is None else other(q)
+    moments = [np.trapezoid(weight * q ** (dimension - 1 + power), q) for power in (0, 2)]
+    assert gammas[dimension - 1] == pytest.approx(0.5 / np.sqrt(moments[1] / moments[0] / dimension), rel=1e-6)
 
 
 STATED = [
@@ -244,3 +258,71 @@ def test_cells_of_a_moving_mesh_say_what_is_made_of_them(mark, samples, tmp_path
     particles, report = io.particles_from_table(table, box=None)
     np.testing.assert_allclose(particles.volume[:7], table.columns["Masses"] / table.columns["Density"], rtol=1e-6)
     assert "neighbour" in report.support
+
+
+@pytest.mark.parametrize("name", "MassTable BoxSize Time Redshift NumPart_ThisFile NumPart_Total Dimension Code".split())
+def test_attributes_without_a_value_say_nothing(name, samples, tmp_path):
+    path = with_header(tmp_path / "a.hdf5", samples, **{name: h5py.Empty("f8")})
+    assert len(io.read_table(path)) == 7
+    samples.write_gadget_hdf5(path, samples.particles(), swift_kernel="Wendland C2")
+    with h5py.File(path, "a") as file:
+        for group in ("Units", "Cosmology", "Parameters"):
+            file.create_group(group).attrs[name] = h5py.Empty("f8")
+        file["PartType0/Density"].attrs["U_M exponent"] = h5py.Empty("i4")
+        file["HydroScheme"].attrs["Dimension"] = h5py.Empty("i4")
+    np.testing.assert_allclose(io.read_table(path).support, 1.936492 * 0.5)
+
+
+BAD = np.array([0.5, 0.5, -0.5, 0.5, 0.0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("part_type", [0, 5])
+def test_supports_that_are_none_stop_nothing_that_needs_none(part_type, samples, tmp_path):
+    path = tmp_path / "a.hdf5"
+    samples.write_gadget_hdf5(path, samples.particles(), part_type)
+    with h5py.File(path, "a") as file:
+        file.pop(f"PartType{part_type}/SmoothingLength", None)
+        file[f"PartType{part_type}/SmoothingLength"] = BAD
+    assert len(io.read_points(path, part_type=part_type, radius=0.25).position) == 7
+    particles = io.read_particles(path, "z", 0.25, part_type=part_type)
+    np.testing.assert_array_equal(particles.to_numpy()["support"], np.full(7, 0.25))
+    for read in (io.read_particles, io.read_points):
+        with pytest.raises(ValueError, match=r"a\.hdf5: .* 2 of 7 .*are not, the first .*; remove these p"):
+            read(path, part_type=part_type)
+
+
+def packed(file, name, values):
+    """A data set by a filter that is none, as of a plugin that is not installed."""
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_chunk((len(values),))
+    layout.set_filter(32999, h5py.h5z.FLAG_OPTIONAL, (1,))
+    space = h5py.h5s.create_simple((len(values),))
+    one = h5py.h5d.create(file.id, name.encode(), h5py.h5t.IEEE_F64LE, space, layout)
+    one.write_direct_chunk((0,), np.asarray(values, "<f8").tobytes(), 0)
+
+
+MISSING = r"is packed by the HDF5 filter 32999.*not installed; `pip install hdf5plugin`"
+
+
+def test_a_column_by_a_filter_that_is_missing_is_left_out_by_name(samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    samples.write_points(tmp_path / "b.hdf5", samples.particles())
+    samples.write_phantom(tmp_path / "c.h5", samples.particles())
+    for name, column in (("a.hdf5", "PartType0/Dust"), ("b.hdf5", "Dust"), ("c.h5", "particles/Dust")):
+        with h5py.File(tmp_path / name, "a") as file:
+            packed(file, column, np.arange(7.0))
+        table = io.read_table(tmp_path / name)
+        assert len(table) == 7 and "Dust" not in table.columns and "density" in map(str.lower, table.columns)
+        assert sum("left out Dust" in said and "32999" in said for said in table.conventions) == 1
+        with pytest.raises(ValueError, match=rf"there is no quantity 'Dust'.*left out Dust.*{MISSING}"):
+            io.read_particles(tmp_path / name, "Dust")
+
+
+@pytest.mark.parametrize("column", ["Masses", "SmoothingLength", "Density"])
+def test_a_column_that_supports_and_volumes_need_is_not_left_out(column, samples, tmp_path):
+    samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file.pop(f"PartType0/{column}", None)
+        packed(file, f"PartType0/{column}", np.ones(7))
+    with pytest.raises(ValueError, match=rf"a\.hdf5: `/PartType0/{column}` {MISSING}"):
+        io.read_table(tmp_path / "a.hdf5")

@@ -12,7 +12,7 @@ Source: Price et al. 2018, PASA 35, e031, equation 4 and sections 2.1.5, 2.8.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ class Dump:
         hfact: smoothing length over mean distance of particles.
         masses: of particles of the types 1, 2, ...
         sinks: how many there are.
+        left_out: a sentence on each column that is.
     """
 
     source: str
@@ -51,6 +52,7 @@ class Dump:
     hfact: float
     masses: np.ndarray
     sinks: int
+    left_out: Sequence[str] = ()
 
     def table(self, part_type: int | None) -> ParticleTable:
         """The living particles of one type; without `part_type` gas, or the lowest other type there is.
@@ -65,7 +67,7 @@ class Dump:
                 f"smoothing lengths `h` must be numbers, but {int(unknown.sum())} of {len(h)} are NaN, the first at index "
                 f"{int(np.argmax(unknown))}; remove these particles, or dump it again"
             )
-        said, alive = [], h > 0
+        said, alive = [*self.left_out], h > 0
         if not alive.all():
             said.append(f"dropped {int((~alive).sum())} dead or accreted particles (h <= 0)")
         part_type = _choose(np.unique(self.kind[alive]), part_type, self.sinks)
@@ -96,10 +98,12 @@ class Dump:
         return ParticleTable(self.position[keep], columns, SUPPORT_OVER_H * h, volume, conventions=tuple(said), **more)
 
 
-def sinks_table(source: str, header: Mapping[str, Any], position: np.ndarray, columns: dict[str, np.ndarray]) -> ParticleTable:
+def sinks_table(
+    source: str, header: Mapping[str, Any], position: np.ndarray, columns: dict[str, np.ndarray], left_out: Sequence[str] = ()
+) -> ParticleTable:
     """The sinks of a dump, `m` among their columns; those of negative mass were merged with another and are left out."""
     columns = {"mass" if name == "m" else name: column for name, column in columns.items()}
-    said = ["sink particles; h is their accretion radius, and no support"]
+    said = ["sink particles; h is their accretion radius, and no support", *left_out]
     if "mass" in columns:
         there = ~(columns["mass"] < 0)
         if not there.all():

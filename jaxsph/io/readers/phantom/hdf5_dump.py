@@ -43,8 +43,8 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
         if values.shape != (count,):
             raise DataError(f"has {count} positions, but `{name}` has the shape {values.shape}; dump it again")
     masses, hfact = np.ravel(read_dataset(header["massoftype"])), float(read_dataset(header["hfact"]))
-    columns = numeric_datasets(group, count, skip=("xyz",))
-    return Dump(SOURCE, header, position, columns, h, kind, hfact, masses, _num_sinks(sinks)).table(part_type)
+    columns, said = _columns(group, count)
+    return Dump(SOURCE, header, position, columns, h, kind, hfact, masses, _num_sinks(sinks), said).table(part_type)
 
 
 def _num_sinks(sinks: Any) -> int:
@@ -55,6 +55,10 @@ def _num_sinks(sinks: Any) -> int:
 def _sinks(header: Any, sinks: Any) -> ParticleTable:
     if not _num_sinks(sinks):
         refuse_no_sinks()
-    columns_of(sinks)
     position = read_positions(sinks["xyz"])
-    return sinks_table(SOURCE, header, position, numeric_datasets(sinks, len(position), skip=("xyz",)))
+    return sinks_table(SOURCE, header, position, *_columns(sinks, len(position)))
+
+
+def _columns(group: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns but positions, and a sentence on each that is left out."""
+    return numeric_datasets({name: each for name, each in columns_of(group).items() if name != "xyz"}, count)
