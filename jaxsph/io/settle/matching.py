@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
 
-ID_NAMES = ("id", "ids", "idp", "pid", "particleid", "particleids", "particle_id", "particle_ids")
+ID_NAMES = ("id", "ids", "idp", "pid", "particleid", "particleids", "particle_id", "particle_ids", "iorig")
 MIN_MATCHED = 0.5
 """Share of the smaller snapshot that must be found in the other: with fewer, ids are numbers of something else."""
 MAX_MISSED = 0.5

@@ -260,7 +260,10 @@ def test_cells_of_a_moving_mesh_say_what_is_made_of_them(mark, samples, tmp_path
     assert "neighbour" in report.support
 
 
-@pytest.mark.parametrize("name", "MassTable BoxSize Time Redshift NumPart_ThisFile NumPart_Total Dimension Code".split())
+NAMED = ("MassTable", "BoxSize", "Time", "Redshift", "NumPart_ThisFile", "NumPart_Total", "Dimension", "Code")
+
+
+@pytest.mark.parametrize("name", NAMED)
 def test_attributes_without_a_value_say_nothing(name, samples, tmp_path):
     path = with_header(tmp_path / "a.hdf5", samples, **{name: h5py.Empty("f8")})
     assert len(io.read_table(path)) == 7

@@ -6,6 +6,7 @@ import pytest
 import jaxsph.io as io
 from jaxsph.io.formats import find_format
 from jaxsph.io.readers.phantom import native
+from jaxsph.sequence import Snapshots
 
 NOTHING = (0, {})
 SINKS = {
@@ -204,3 +205,27 @@ def test_dumps_without_tags_and_other_files_are_refused(dump, tmp_path):
     )
     with pytest.raises(ValueError, match="another format"):
         native.read(tmp_path / "x")
+
+
+def test_particles_are_followed_by_iorig_from_dump_to_dump(samples, tmp_path):
+    """Stored in another order in the second, all moved by 4 along y."""
+    order, places = np.random.default_rng(8).permutation(7), []
+    for number, rows in enumerate((np.arange(7), order)):
+        p = samples.particles()
+        p.position, p.velocity = (p.position + np.array([0, 4 * number, 0], "f4"))[rows], p.velocity[rows]
+        block = samples.phantom_particles(p, i8={"iorig": rows + 1})
+        header = {"f0": {"time": [float(number)], "hfact": [1.25], "massoftype": [2.0]}}
+        path = tmp_path / f"disc_{number:05d}"
+        path.write_bytes(b"".join(samples.phantom_records([block, NOTHING, NOTHING, NOTHING], header)))
+        places.append(path)
+    at = Snapshots.from_files(places, quantity="density").at(0.25).particle_set.to_numpy()["position"]
+    start = samples.particles().position
+    np.testing.assert_allclose(at[np.lexsort(at.T)], (start + [0, 1, 0])[np.lexsort((start + [0, 1, 0]).T)], atol=1e-5)
+
+
+def test_sinks_are_points_with_a_radius_that_is_given_or_their_own(samples, dump):
+    path = dump(samples.phantom_particles(samples.particles()), (3, {"f0": SINKS}), NOTHING, NOTHING)
+    assert np.asarray(io.read_points(path, part_type=-1).radius).tolist() == [0.25, 0.125]
+    assert np.asarray(io.read_points(path, part_type=-1, radius=0.5).radius).tolist() == [0.5, 0.5]
+    path = dump(samples.phantom_particles(samples.particles()), (3, {"f0": {**SINKS, "h": [0.25, -1.0, 0.5]}}), NOTHING, NOTHING)
+    assert len(io.read_points(path, part_type=-1, radius=0.5).position) == 2
