@@ -213,10 +213,10 @@ def test_particles_are_followed_by_iorig_from_dump_to_dump(samples, tmp_path):
     for number, rows in enumerate((np.arange(7), order)):
         p = samples.particles()
         p.position, p.velocity = (p.position + np.array([0, 4 * number, 0], "f4"))[rows], p.velocity[rows]
-        block = samples.phantom_particles(p, i8={"iorig": rows + 1})
+        count, arrays = samples.phantom_particles(p)
         header = {"f0": {"time": [float(number)], "hfact": [1.25], "massoftype": [2.0]}}
         path = tmp_path / f"disc_{number:05d}"
-        path.write_bytes(b"".join(samples.phantom_records([block, NOTHING, NOTHING, NOTHING], header)))
+        path.write_bytes(b"".join(samples.phantom_records([(count, arrays | {"i8": {"iorig": rows + 1}}), NOTHING], header)))
         places.append(path)
     at = Snapshots.from_files(places, quantity="density").at(0.25).particle_set.to_numpy()["position"]
     start = samples.particles().position
