@@ -2,12 +2,14 @@
 
 Flow: cli -> [cache] -> JAX's persistent compilation cache.
 
-Where `JAX_COMPILATION_CACHE_DIR` names a folder, that is taken as it is, with all that JAX's own variables say of it.
+Programs that are kept are run later, so the folder is this user's alone. Where `JAX_COMPILATION_CACHE_DIR` names one, that is
+taken as it is, with all that JAX's own variables say of it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import sys
@@ -32,9 +34,9 @@ def begin(*, keep: bool) -> None:
         return
     if CHOSEN_BY_USER not in os.environ:
         try:
-            folder().mkdir(parents=True, exist_ok=True)
+            _make_own(folder())
         except OSError as error:
-            print(f"jaxsph: compiled programs are not kept, as {folder()} cannot be made: {error.strerror}", file=sys.stderr)
+            print(f"jaxsph: compiled programs are not kept, as {folder()} cannot be used: {error.strerror}", file=sys.stderr)
             PROGRAMS.on_compile(_Notice("the next command will compile it again"))
             return
         jax.config.update("jax_compilation_cache_dir", str(folder()))
@@ -51,6 +53,27 @@ def folder() -> Path:
 
     chosen = os.environ.get(CHOSEN_BY_USER)
     return Path(chosen) if chosen else Path(platformdirs.user_cache_path("jaxsph")) / "compiled"
+
+
+def _make_own(place: Path) -> None:
+    """Make a folder that this user alone can enter, whatever the umask; what others have put into it goes.
+
+    Raises:
+        OSError: it cannot be made, or it or the one that it is in is another user's.
+    """
+    before = os.umask(0o077)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    finally:
+        os.umask(before)
+    for path in (place.parent, place) if os.name == "posix" else ():
+        if {path.lstat().st_uid, path.stat().st_uid} != {os.geteuid()}:
+            raise PermissionError(errno.EPERM, f"{path} belongs to another user; remove it, or take --no-cache")
+        if path.stat().st_mode & 0o077:
+            path.chmod(0o700)
+            for entry in path.iterdir():
+                if path == place and entry.lstat().st_uid != os.geteuid():
+                    entry.unlink()
 
 
 def say_kept() -> None:

@@ -132,7 +132,8 @@ class Server:
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         name = hosts[0].rpartition(":")[0] if len(hosts) == 1 and ":" in hosts[0] else "".join(hosts)
         mine = name in NAMES and all(origin == f"http://{hosts[0]}" for origin in origins)
-        crossed = headers.get("Sec-Fetch-Site") in ("cross-site", "same-site")
+        goes = headers.get("Sec-Fetch-Mode") == "navigate" and headers.get("Sec-Fetch-Dest") == "document" and not first
+        crossed = headers.get("Sec-Fetch-Site") in ("cross-site", "same-site") and not goes  # as from the file of `jaxsph view`
         return not (mine and not crossed and hmac.compare_digest(given.encode(), self.token.encode()))
 
     async def _requested(self, connection: Any, request: Any) -> Any:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import warnings
 
+import jax
 import pytest
 
 from jaxsph.cli import cache as cli_cache
@@ -74,6 +75,46 @@ def test_a_folder_that_cannot_be_made_is_said_and_does_no_harm(command, tmp_path
 def test_the_folder_is_of_this_user_and_this_program(monkeypatch):
     monkeypatch.delenv(cli_cache.CHOSEN_BY_USER, raising=False)
     assert cli_cache.folder().name == "compiled" and "jaxsph" in str(cli_cache.folder())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="of POSIX")
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o277])
+def test_the_folder_is_open_to_its_user_alone_whatever_the_umask(umask, tmp_path):
+    there = tmp_path / "there" / "jaxsph" / "compiled"
+    there.mkdir(parents=True)
+    for path in (there, there.parent):
+        path.chmod(0o777)
+    (there / "jit_cast-ab-cache").write_bytes(b"mine")
+    new = tmp_path / "new" / "cache" / "jaxsph" / "compiled"
+    before = os.umask(umask)
+    try:
+        for place in (there, new):
+            cli_cache._make_own(place)
+    finally:
+        assert os.umask(before) == umask
+    assert {path.stat().st_mode & 0o777 for place in (there, new) for path in (place, place.parent)} == {0o700}
+    assert new.parent.parent.stat().st_mode & 0o777 == 0o700 and (there / "jit_cast-ab-cache").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="of POSIX")
+def test_programs_of_another_user_are_not_run(tmp_path, monkeypatch, capsys):
+    place = tmp_path / "jaxsph" / "compiled"
+    place.mkdir(parents=True)
+    monkeypatch.setattr(cli_cache, "folder", lambda: place)
+    monkeypatch.delenv(cli_cache.CHOSEN_BY_USER, raising=False)
+    monkeypatch.setattr(cli_cache.PROGRAMS, "on_compile", lambda told: None)
+    kept = jax.config.jax_compilation_cache_dir
+    with monkeypatch.context() as other:
+        other.setattr(os, "geteuid", lambda: place.stat().st_uid + 1)
+        cli_cache.begin(keep=True)
+    assert jax.config.jax_compilation_cache_dir == kept
+    assert "not kept" in (said := capsys.readouterr().err) and "belongs to another user; remove it" in said
+    if os.geteuid() == 0:  # who else can give files away
+        (place / "jit_cast-ab-cache").write_bytes(b"theirs")
+        os.chown(place / "jit_cast-ab-cache", 65534, 65534)
+        place.chmod(0o777)
+        cli_cache._make_own(place)
+        assert not list(place.iterdir())
 
 
 def test_entries_that_cannot_be_read_are_removed_and_no_warning_is_shown(tmp_path, monkeypatch, capsys):

@@ -120,6 +120,11 @@ def test_without_the_token_or_from_elsewhere_there_is_nothing(server):
     evil += [{"Host": host} for host in ("evil.example", f"evil.example:{server.port}", "")] + [{"Sec-Fetch-Site": "cross-site"}]
     for headers in evil:
         assert got(server, good, **headers)[0] == 403, headers
+    entered = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}  # as from a file
+    assert got(server, good, **entered)[0] == 200
+    for path in ("/", "/?token=wrong", f"/{server.token}/view.js", f"/{server.token}/view.png"):
+        assert got(server, path, **entered)[0] == 403, path
+    assert got(server, good, **entered | {"Sec-Fetch-Dest": "iframe"})[0] == 403
     assert got(server, good, Origin=f"http://127.0.0.1:{server.port}")[0] == 200
     assert got(server, good, Host=f"localhost:{server.port}")[0] == 200
     for address, more in ((f"/socket?token={server.token}", {}), (f"/{server.token}/socket", {"origin": "http://evil.example"})):
@@ -291,6 +296,23 @@ def test_settings_of_the_command():
     assert made(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
     assert made(command.View(integrator="samples")).tolerance is None
     assert made(command.View(), fluid).tolerance is None  # a surface has none
+
+
+def test_the_token_is_in_no_command_line(tmp_path, monkeypatch, capsys):
+    """A browser is started with the name of a file that leads to the address, and that this user alone can read."""
+    opened = []
+
+    def browse(address):
+        path = Path(address.removeprefix("file://"))
+        opened.append((address, path.read_text(), path.parent.stat().st_mode & 0o077))
+
+    monkeypatch.setattr(command.webbrowser, "open", browse)
+    monkeypatch.setattr(command, "run", lambda server, ready: ready())
+    assert commanded(capsys, "view", "scene:radial:particles=50", "--size", "8x8")[0] == 0
+    ((address, page, others),) = opened
+    token = re.search(r"token=([\w-]+)", page)[1]
+    assert address.startswith("file://") and token not in address and not others and "127.0.0.1" in page
+    assert not Path(address.removeprefix("file://")).exists()
 
 
 def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import shlex
+import tempfile
 import warnings
 import webbrowser
 from pathlib import Path
@@ -84,17 +85,21 @@ def view(
     session = Session(scene, camera, settings, _source(options) if timeline is None else None, timeline)
     server, opens = Server(session, options.port), not options.no_browser
 
-    def ready() -> None:
-        voice.release()
-        print(server.url, flush=True)
-        session.start()
-        if opens:
-            webbrowser.open(server.url)
+    with tempfile.TemporaryDirectory(prefix="jaxsph-") as folder:  # this user's alone, unlike what browsers are started with
 
-    try:
-        run(server, ready)
-    finally:
-        ended = session.close(SECONDS)
+        def ready() -> None:
+            voice.release()
+            print(server.url, flush=True)
+            session.start()
+            if opens:
+                page = Path(folder) / "view.html"
+                page.write_text(f'<meta http-equiv="refresh" content="0; url={server.url}">\n', encoding="ascii")
+                webbrowser.open(page.as_uri())
+
+        try:
+            run(server, ready)
+        finally:
+            ended = session.close(SECONDS)
     return not ended
 
 
