@@ -95,7 +95,7 @@ def _read_by(run: Any, options: Any) -> list[Path]:
     """The files and folders that a command reads, wherever they are named."""
     beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
     named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
-    return [path for path in (*map(Path, run.args), *beside, *named) if os.path.exists(path)]
+    return [path for path in (*map(Path, filter(None, run.args)), *beside, *named) if os.path.exists(path)]
 
 
 def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsph import io, scenes
 from jaxsph.cli.console import UsageError, attributes, ranges, say_notes, span
-from jaxsph.cli.options.values import Beside
+from jaxsph.cli.options.values import Beside, number_or_name
 from jaxsph.cli.voice import report, result, say, tell
 from jaxsph.model import Points, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -30,7 +30,7 @@ def check(options: Any) -> None:
     """Raise `UsageError` where an option of a file beside the source is out of range."""
     for beside in options.points:
         for name, (must_be, holds) in CHECKED.items():
-            value = _number_or_name(beside.options.get(name))
+            value = number_or_name(beside.options.get(name, ""))
             if isinstance(value, float) and not holds(value):
                 raise UsageError(f"--points {beside.file}: {name} must be {must_be}, got {value:g}")
         _color(beside)
@@ -121,8 +121,7 @@ def _points(table: io.ParticleTable, beside: Beside) -> Points:
     """The points of a table, and what was taken for them, said."""
     points, taken = io.points_from_table(
         table,
-        radius=_number_or_name(beside.options.get("radius")),
-        opacity=_number_or_name(beside.options.get("opacity")),
+        **{name: number_or_name(beside.options[name]) for name in CHECKED if name in beside.options},
         color=_color(beside),
         colormap=beside.options.get("colormap", "heat"),
     )
@@ -131,13 +130,6 @@ def _points(table: io.ParticleTable, beside: Beside) -> Points:
     say("strength", f"{span(taken.strength_range if taken.num_points else ())}: {taken.strength}")
     say_notes(taken.notes)
     return points
-
-
-def _number_or_name(text: str | None) -> float | str | None:
-    try:
-        return None if text is None else float(text)
-    except ValueError:
-        return text
 
 
 def _type(beside: Beside) -> int | None:

@@ -99,7 +99,7 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | None = None, pr
 def read_particles(
     path: str | os.PathLike[str],
     quantity: str | None = None,
-    support: float | Float[np.ndarray, " particles"] | None = None,
+    support: float | str | Float[np.ndarray, " particles"] | None = None,
     *,
     kernel: str | None = None,
     part_type: int | None = None,
@@ -115,8 +115,8 @@ def read_particles(
         path: the file; see `read_table` for formats.
         quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, or `log10:` before any of
             these; `None` picks the first telling one of a concentration, temperature, internal energy, density, speed.
-        support: support radius in the file's length unit; `None` means the file's own, else two spacings where
-            particles lie evenly, else the distance to the 32nd neighbour.
+        support: support radius in the file's length unit, or an expression of columns, as `"2*h"`; `None` means the file's own,
+            else two spacings where particles lie evenly, else the distance to the 32nd neighbour.
         kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.

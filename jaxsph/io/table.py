@@ -145,7 +145,7 @@ def table_from_columns(
     if smoothing is not None and "support" not in special:
         said.append(
             f"column `{smoothing}` looks like a smoothing length and is not used: the factor from it to the support "
-            f"radius differs between codes; pass `support=` to set supports yourself"
+            f"radius differs between codes; pass `support=` or --support, as 2*{smoothing}, to set supports yourself"
         )
     more: dict[str, Any] = {"source": source, "conventions": tuple(said), "unusable": unusable}
     return ParticleTable(position, rest, support, special.get("volume"), **more)
@@ -207,7 +207,7 @@ def _positive(name: str, value: np.ndarray, count: int) -> np.ndarray:
         raise DataError(f"`{name}` must have shape ({count},), got {value.shape}; give one number a particle")
     if value.dtype not in (np.float32, np.float64):
         value = value.astype(np.float64)
-    remedy = f"remove these particles or pass `{name}=` yourself"
+    remedy = "remove these particles" + (", or set supports by `support=` or --support" if name == "support" else "")
     refuse_rows(~(np.isfinite(value) & (value > 0)), value, f"`{name}` must be finite and positive", remedy)
     return value
 

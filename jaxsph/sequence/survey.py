@@ -19,6 +19,7 @@ from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.selection import chosen
+from jaxsph.io.settle.where import evaluated
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range
@@ -253,8 +254,9 @@ class _Looking:
             return io.particles_from_table(table, self._quantity, *self._source.how)[0].to_numpy()["quantity"]
 
     def _reach(self, table: io.ParticleTable) -> float:
-        if self._source.support is not None:
-            return self._source.support
+        support = self._source.support
+        if support is not None:
+            return float(np.max(evaluated(table, support, "support")) if isinstance(support, str) else support)
         return self._support if table.support is None else float(table.support.max(initial=0))
 
 

@@ -108,7 +108,7 @@ class Options:
                 check(self)
 
 
-_SUPPORT = option("--support", "H", values.number, DATA, "support radius (default: the file's, or from neighbours)")
+_SUPPORT = option("--support", "H", values.number_or_name, DATA, "radius, or as 2*h of columns (default: the file's, or found)")
 _KERNEL = choice("--kernel", KERNELS, DATA, "smoothing kernel", more=" (default: the file's)", show=False)
 _TYPE = option("--part-type", "N", values.whole, DATA, "of a Gadget-like file (default: gas, else the first)")
 _BOX = option("--box-size", "LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)")
@@ -122,7 +122,7 @@ class Selection(opening.Source):
 
     color_by: Annotated[str | None, NOT_HERE] = None
     opacity_by: Annotated[str | None, NOT_HERE] = None
-    support: Annotated[float | None, _SUPPORT] = None
+    support: Annotated[float | str | None, _SUPPORT] = None
     kernel: Annotated[str | None, _KERNEL] = None
     part_type: Annotated[int | None, _TYPE] = None
     box: Annotated[Any, _BOX] = "file"

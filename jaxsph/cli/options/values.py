@@ -30,6 +30,14 @@ def number(text: str) -> float:
         raise ValueError(f"must be a number, got {text!r}") from None
 
 
+def number_or_name(text: str) -> float | str:
+    """A number, or the text of what is one by name."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def level(text: str) -> float | bool:
     """A number, or False for `none`."""
     return False if text == "none" else number(text)

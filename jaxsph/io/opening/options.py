@@ -33,7 +33,7 @@ class Source:
         color_by: quantity that colours are looked up by, as `jaxsph info` lists them, or `log10:NAME`; of a volume, which of its
             values.
         opacity_by: quantity that extinction is looked up by.
-        support: support radius in the file's lengths, > 0, of all particles.
+        support: support radius in the file's lengths, > 0, of all particles; or an expression of columns, as `"2*h"`.
         kernel: name of the smoothing kernel.
         part_type: which type of particles of a file that has several.
         box: "file" for the file's periodic box, None for none, or three sides.
@@ -46,7 +46,7 @@ class Source:
 
     color_by: str | None = None
     opacity_by: str | None = None
-    support: float | None = None
+    support: float | str | None = None
     kernel: str | None = None
     part_type: int | None = None
     box: Any = "file"
@@ -54,11 +54,11 @@ class Source:
     share: float | None = None
 
     def __post_init__(self) -> None:
-        if self.support is not None and np.ndim(self.support) == 0 and not (np.isfinite(self.support) and self.support > 0):
+        if isinstance(self.support, int | float) and not (np.isfinite(self.support) and self.support > 0):
             raise ValueError(f"`support` must be > 0, got {self.support:g}")
 
     @property
-    def how(self) -> tuple[float | None, str | None]:
+    def how(self) -> tuple[float | str | None, str | None]:
         """Support and kernel, as `jaxsph.io.particles_from_table` takes them."""
         return self.support, self.kernel
 

@@ -65,7 +65,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if "mass" not in columns and mass > 0:
             columns["mass"] = np.full(counts[chosen], mass)
             said.append(f"mass = {mass:g} for all (mass table in the header)")
-        support = columns.pop("HSML", None)
+        support = columns.get("HSML")
         if support is not None:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
         support, unusable = usable_supports(support)

@@ -103,8 +103,6 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     if smoothing is not None:
         support, sentence = _support(file, columns[smoothing], smoothing, swift)
         support, unusable = usable_supports(support)
-        if unusable is None:
-            del columns[smoothing]
         said.append(sentence)
     if smoothing is None and chosen == 0 and _is_moving_mesh(file, group):
         said.append(MESH_NOTE)

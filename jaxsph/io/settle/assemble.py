@@ -17,7 +17,7 @@ from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
 from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
-from jaxsph.io.settle.where import select
+from jaxsph.io.settle.where import evaluated, select
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import plain
@@ -86,7 +86,7 @@ class Report:
 def particles_from_table(
     table: ParticleTable,
     quantity: str | None = None,
-    support: float | Float[np.ndarray, " particles"] | None = None,
+    support: float | str | Float[np.ndarray, " particles"] | None = None,
     kernel: str | None = None,
     *,
     progress: bool = False,
@@ -104,7 +104,8 @@ def particles_from_table(
     Args:
         table: what was read.
         quantity: name of a quantity (`jaxsph.io.settle.quantities`), or `None` for the most telling one.
-        support: one support radius, or one a particle, in the table's length unit; overrides the table's.
+        support: one support radius, or one a particle, in the table's length unit, or an expression of columns, as `"2*h"`;
+            overrides the table's.
         kernel: for the particles and for kernel sums; `None` for the table's own, else poly6.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the table, `None` for none.
         progress, where, share, opacity_by: as for `jaxsph.io.read_particles`.
@@ -141,7 +142,7 @@ def _assemble(
     table: ParticleTable,
     notes: list[str],
     quantity: str | None,
-    support: float | np.ndarray | None,
+    support: float | str | np.ndarray | None,
     kernel: str | None,
     progress: bool,
     wanted: tuple[str | None, float | None, str | None],
@@ -246,15 +247,17 @@ def opacity_of(
     return None if name == color_by else values, name
 
 
-def _supports(table: ParticleTable, support: float | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
+def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
     if support is not None:
-        given = np.asarray(plain("support", support, OF_FILE), np.float64)
+        said = f"{support}, " if isinstance(support, str) else ""
+        support = evaluated(table, support, "support") if isinstance(support, str) else plain("support", support, OF_FILE)
+        given = np.asarray(support, np.float64)
         if given.ndim and given.shape != (len(table),):
             raise DataError(f"`support` must be a number or have shape ({len(table)},), got shape {given.shape}")
         bad = ~(np.isfinite(given) & (given > 0))
         if bad.any():
             raise DataError(f"`support` must be finite and > 0, got {given[bad].flat[0]}; give a radius")
-        return np.broadcast_to(given, (len(table),)), "given by the caller"
+        return np.broadcast_to(given, (len(table),)), f"{said}given by the caller"
     if table.support is not None:
         sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
         return table.support.astype(np.float64), sentence

@@ -23,7 +23,7 @@ ORIGIN = "support = "
 def chosen(
     table: ParticleTable,
     quantity: str | None = None,
-    support: float | None = None,
+    support: float | str | None = None,
     kernel: str | None = None,
     *,
     box: Any = "file",

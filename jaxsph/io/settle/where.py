@@ -10,6 +10,7 @@ comparisons, chains of them, `and`, `or`, `not`, and the functions below.
 from __future__ import annotations
 
 import ast
+import dataclasses
 import functools
 import re
 import warnings
@@ -90,6 +91,20 @@ def select(
     return Selection(kept, tuple(notes))
 
 
+def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:
+    """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too.
+
+    Raises:
+        ValueError: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
+    """
+    if table.support is not None:
+        table = dataclasses.replace(table, columns={"support": table.support, **table.columns})
+    try:
+        return np.broadcast_to(Condition(text, table).numbers(), len(table))
+    except ConditionError as error:
+        raise ConditionError(f"`{name}`: {error}") from error
+
+
 def _shuffled(table: ParticleTable) -> np.ndarray:
     """Numbers to draw by, one a particle: of ids, such that a share is of the same particles in each file of a sequence."""
     ids = ids_of(table)
@@ -136,11 +151,15 @@ class Condition:
         both = isinstance(self._root, ast.BoolOp) and isinstance(self._root.op, ast.And)
         return self._root.values if both else [self._root]  # type: ignore[attr-defined]
 
-    def of_particles(self, node: ast.expr) -> np.ndarray:
+    def numbers(self) -> np.ndarray:
+        """What it gives, where it is an expression."""
+        return self.of_particles(self._root, False)
+
+    def of_particles(self, node: ast.expr, truth: bool = True) -> np.ndarray:
         """Whether particles meet a part of it."""
         try:
             with np.errstate(all="ignore"):
-                return self._of_kind(node, True)
+                return self._of_kind(node, truth)
         except RecursionError as error:
             raise ConditionError(f"the condition {self.text!r} is nested too deeply; take it apart") from error
 

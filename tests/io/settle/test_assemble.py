@@ -180,3 +180,25 @@ def test_lengths_with_a_unit_are_refused_as_a_file_has_its_own(name):
         io.particles_from_table(ParticleTable(position), **{name: length})
     with pytest.raises(ValueError, match=r"`radius` is in pc, but lengths are numbers in the unit of the file"):
         io.points_from_table(ParticleTable(position), radius=unyt.unyt_quantity(400, "pc"))
+
+
+@pytest.mark.parametrize(("text", "factor"), [("2*h", 2), ("h", 1), ("h*3 - h", 2), ("max(h, 0*h) / 0.5", 2), ("`my h`*2", 4)])
+def test_a_given_support_may_be_an_expression_of_columns(text, factor):
+    table = ParticleTable(position, {"h": density, "my h": 2 * density}, support=np.full(50, 0.5))
+    particles, report = io.particles_from_table(table, "x", text)
+    np.testing.assert_allclose(there(particles.support), factor * density, rtol=1e-6)
+    assert report.support == f"{text}, given by the caller"
+    particles, _ = io.particles_from_table(table, "x", "support*2", where="x > 0.5")
+    np.testing.assert_array_equal(particles.to_numpy()["support"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("k*2", "no quantity 'k'"), ("h*", "at its end"), ("h > 1", "not a number"), ("h - 1.5", "finite and > 0, got -0.5"),
+        ("", "is empty"), ("__import__('os')", "functions are"),
+    ],
+)  # fmt: skip
+def test_an_expression_that_gives_no_supports_is_refused(text, said):
+    with pytest.raises(ValueError, match=rf"`support`.*{said}"):
+        io.particles_from_table(ParticleTable(position, {"h": density}), "x", text)
