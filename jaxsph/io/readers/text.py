@@ -22,6 +22,8 @@ WHOLE = re.compile(r"[+-]?[0-9]{1,400}")
 """Of more digits than any float64 has."""
 MAX_COLUMNS = 2**16
 """Columns that a comment of a few bytes may ask for."""
+MAX_ABOVE = 32
+"""Lines among which the names of columns are looked for."""
 ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
 
 
@@ -41,10 +43,11 @@ def read(path: Path) -> ParticleTable:
         if not text.strip():
             raise DataError("is empty; an empty set of particles needs a line of column names")
         ended = text.endswith(("\n", "\r"))
+        lines, passed = _plain_lines(lines)
         names, rows, delimiter = _names(lines)
         if not rows and not ended:
             raise DataError("is cut short: its first line has no end; copy it again")
-        said = [] if ended else [UNENDED_NOTE]
+        said = [*passed, *([] if ended else [UNENDED_NOTE])]
         first = rows[0].split() if rows and names is None and _is_counted(lines) else []
         if first and all(map(_is_number, first)) and all(map(_begins_with_element, rows)):
             said.append(ELEMENT_NOTE)
@@ -54,6 +57,28 @@ def read(path: Path) -> ParticleTable:
             said.append(f"left out {', '.join(left_out)}: not numbers")
         position, columns = gather_vectors(fields)
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _plain_lines(lines: list[str]) -> tuple[list[str], list[str]]:
+    """Lines as most tables have them, and a note: none above the names, which are told by their width; no separators at ends."""
+    filled = [line for line in lines if line.strip()]
+    said: list[str] = []
+    if _is_counted(lines):
+        return lines, said
+    for above, line in enumerate(filled[:MAX_ABOVE]):
+        mark, rows = _delimiter(line), filled[above:]
+        names = [] if line.lstrip().startswith("#") or len(rows) < 2 else _split(line, mark)
+        begins = above and len(names) >= 3 and len(_split(filled[0], mark)) != len(names) and not any(map(_is_number, names))
+        if begins and {len(_split(row, mark)) for row in rows} <= {len(names), len(names) + (names[-1] != "")}:
+            said, filled = [f"passed over {above} lines above the names of columns"], rows
+            break
+    head, *body = filled or [""]
+    mark = _delimiter(head) or " "
+    if body and all(line.rstrip().endswith(mark.strip() or "\0") for line in body):
+        ended = head.rstrip().endswith(mark)
+        if ended or head.count(mark) == body[0].count(mark) - 1:
+            filled = [head.rstrip()[:-1] if ended else head, *(line.rstrip()[:-1] for line in body)]
+    return filled, said
 
 
 def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:

@@ -145,3 +145,46 @@ def test_whole_numbers_that_would_be_rounded_are_refused(words, tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z,id\n" + "".join(f"1,2,3,{word}\n" for word in words))
     with pytest.raises(ValueError, match=rf"a\.csv: has the whole number {words[0]} in the column `id`.*decimal point"):
         io.read_table(tmp_path / "a.csv")
+
+
+ROWS = "0.5,1,2,7\n3,4.5,5,8\n6,7,8.5,9\n"
+
+
+@pytest.mark.parametrize("names", ["x [m],y [m],z [m],mass\n", "x,y,z,mass,\n", "x,y,z,mass\n", None])
+@pytest.mark.parametrize("above", ["", "Part,Time,Np\n3,0.25,3\n\n", "written by a program\n", "a;b\n1;2\n"])
+@pytest.mark.parametrize("end", ["", ","])
+@pytest.mark.parametrize("mark", [",", ";"])
+def test_lines_above_the_names_and_separators_at_ends_are_no_columns(mark, end, above, names, tmp_path):
+    text = (names or "") + ROWS.replace("\n", f"{end}\n")
+    if names is None:
+        above = ""
+    if names is not None and names.endswith(",\n") and not end:
+        pytest.skip("a name that has no column")
+    (tmp_path / "a.csv").write_text(above + text.replace(",", mark))
+    table = io.read_table(tmp_path / "a.csv")
+    np.testing.assert_array_equal(table.position, [[0.5, 1, 2], [3, 4.5, 5], [6, 7, 8.5]])
+    assert list(table.columns) == (["column4"] if names is None else ["mass"])
+    assert any("above the names" in said for said in table.conventions) == bool(above)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("x,y,z,name\n1,2,3,\n4,5,6,\n", []),  # a column that is empty has a name
+        ("x y z\n1 2 3\n4 5 6\n", []),
+        ("3\na b c d\nAr 1 2 3\nAr 4 5 6\nAr 7 8 9\n", []),
+        ("x,y,z,kind\n1,2,3,gas\n4,5,6,star\n", []),
+    ],
+)
+def test_plain_tables_are_read_as_ever(text, columns, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    table = io.read_table(tmp_path / "a.csv")
+    assert list(table.columns) == columns and table.position[0].tolist() == [1, 2, 3]
+    assert not any("above" in said for said in table.conventions)
+
+
+@pytest.mark.parametrize("text", ["Part,Np\n1,2\n\nx,y,z\n1,2,3\n4,5\n", "a b\n1 2\nx,y,z\n1,2\n", "1,2\nx,y\n3,4\n"])
+def test_lines_above_names_are_passed_over_where_all_below_are_a_table_alone(text, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"a\.csv: "):
+        io.read_table(tmp_path / "a.csv")
