@@ -86,7 +86,7 @@ class Slice:
         Raises:
             ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
         """
-        axes = PlaneAxes(self.pixel_size, self._middle, self.length_unit)
+        axes = PlaneAxes(self.pixel_size, self.camera.middle(), self.length_unit)
         files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
 
     def to_xarray(self) -> Any:
@@ -98,14 +98,8 @@ class Slice:
             ImportError: xarray is not installed.
         """
         height, width = self.values.shape
-        where = places((height, width), self.pixel_size, self._middle, self.length_unit)
+        where = places((height, width), self.pixel_size, self.camera.middle(), self.length_unit)
         return dataset({"values": (PLANE, self.values)}, where, self.metadata)
-
-    @property
-    def _middle(self) -> tuple[float, float]:
-        """Coordinates of the middle, along what is to the right and upwards."""
-        x, y = (np.asarray(self.camera.axes, np.float64) @ self.camera.exact_eye()).tolist()[:2]
-        return x, y
 
 
 def slice(

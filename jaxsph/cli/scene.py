@@ -26,6 +26,7 @@ from jaxsph.io import Labels
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged
 from jaxsph.io.opening.views import camera_and_clip
+from jaxsph.io.settle.unit_names import stated_length
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both
@@ -169,6 +170,11 @@ def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
         loaded = dataclasses.replace(loaded, shown=dataclasses.replace(shown, extinction_quantity=None), opacity_by=None)
     table, taken = loaded.table, loaded.report
     assert table is not None and taken is not None
+    if table.units.length is None and getattr(options, "length_unit", None) is not None:
+        with wrong_usage():
+            units = dataclasses.replace(table.units, length=stated_length(options.length_unit))
+        loaded = dataclasses.replace(loaded, table=dataclasses.replace(table, units=units))
+        say("note", f"lengths are in {options.length_unit}, as --length-unit says: the file does not")
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     columns = loaded.shown.to_numpy()  # type: ignore[union-attr]
     say_report(taken, columns["support"])

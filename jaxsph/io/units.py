@@ -14,6 +14,11 @@ from collections.abc import Mapping
 BASE = "cm", "g", "s", "K"
 LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 VELOCITY = (1, 0, -1, 0)
+LENGTHS = {"cm": 1.0, "mm": 0.1, "m": 1e2, "km": 1e5, "AU": 1.495978707e13}
+LENGTHS |= {f"{prefix}pc": 3.0856775814913673e18 * size for prefix, size in (("", 1), ("k", 1e3), ("M", 1e6), ("G", 1e9))}
+"""In cm."""
+SAME = 3e-5
+"""Relative difference of a unit to one that it may be called after: codes have constants of four or five digits."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -41,6 +41,16 @@ def test_a_draft_takes_a_quarter_of_the_samples_and_what_is_known_of_errors_is_s
     assert code == 2 and "--draft and --samples exclude each other" in err[-1]
 
 
+def test_lengths_are_in_the_unit_that_is_said_where_the_file_says_none(file, by_reference, capsys):
+    pytest.importorskip("unyt")
+    across = ["--view", "z", "--center", "0,0,0", "--width", "2 kpc", "-o", "out.png", *TINY]
+    code, out, err = run(capsys, "render", file, "--length-unit", "Mpc", *across)
+    assert (code, err) == (0, []) and "lengths are in Mpc, as --length-unit says" in out and "width     0.002 (2 kpc)" in out
+    for words, said in ((["--length-unit", "g"], "does not agree"), ([], "the file does not state that of its lengths")):
+        code, _, err = run(capsys, "render", file, *words, *across)
+        assert code in (1, 2) and said in err[-1]
+
+
 def test_render_writes_an_exr_and_says_what_it_picked(file, tmp_path, capsys):
     code, out, err = run(capsys, "render", file, "-o", "out.exr", *TINY)
     assert (code, err) == (0, [])

@@ -190,3 +190,30 @@ def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(f
 def test_compiling_is_told_apart_in_the_time(file, capsys):
     line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
     assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))
+
+
+@pytest.mark.parametrize(
+    ("words", "unit", "code_unit"),
+    [
+        ([], "g/cm2", 2e33 / 4e42), (["--of", "volume"], "cm", 2e21), (["--of", "number"], "cm-2", 1 / 4e42),
+        (["--of", "density"], "g/cm2", 2.5e-31 * 2e21), (["--weight", "mass", "--of", "density"], "g/cm3", 2.5e-31),
+        (["--emission", "2"], None, 1.0), (["--of", "heat"], None, 1.0),
+    ],
+)  # fmt: skip
+def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code_unit, file, capsys):
+    h5py, fits, units = (pytest.importorskip(name) for name in ("h5py", "astropy.io.fits", "astropy.units"))
+    none = dict.fromkeys(("length_scaling", "mass_scaling", "velocity_scaling", "a_scaling", "h_scaling"), 0.0)
+    stated = {"Coordinates": (1, 0, 2e21), "Masses": (0, 1, 2e33), "Density": (-3, 1, 2.5e-31)}
+    with h5py.File("gas.hdf5", "w") as made:
+        group, given = made.create_group("PartType0"), columns()
+        group["Coordinates"], group["Masses"], group["Density"] = given["position"], given["mass"], given["density"]
+        group["SmoothingLength"], group["heat"] = np.full(COUNT, 0.3), given["temperature"]
+        for name, (length, mass, cgs) in stated.items():
+            group[name].attrs.update(none | {"length_scaling": length, "mass_scaling": mass, "to_cgs": cgs})
+    raw, _ = values(capsys, "gas.hdf5", *words)
+    assert run(capsys, "gas.hdf5", *TINY, *words, "-o", "out.fits")[0] == 0
+    with fits.open("out.fits") as found:
+        header = found[0].header
+        assert header["CUNIT1"] == "cm" and abs(header["CRVAL1"] / 1e21 - 1) < 0.2
+        np.testing.assert_allclose(found[0].data, code_unit * raw.astype(np.float64)[::-1], rtol=1e-6)
+        assert (units.Unit(header["BUNIT"]) == units.Unit(unit)) if unit else "BUNIT" not in header

@@ -99,7 +99,7 @@ def project(
     plan.check(particles, camera, pixel)
     sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
     told: Any = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    told += () if traced else (("jaxsph.camera", camera.describe()),)
+    told += () if traced else (("jaxsph.camera", camera.describe()), ("jaxsph.middle", "{!r} {!r}".format(*camera.middle())))
     named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
     return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=told, **named)
 

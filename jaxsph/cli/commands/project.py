@@ -28,10 +28,12 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
-from jaxsph.io.settle.quantities import ROLES, choose_quantity, velocity_name
+from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
+from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.io.table import plain
+from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure
@@ -138,6 +140,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     camera = _camera(particles, table, options)
     say("camera", camera.describe())
     image, seconds = _projected(particles, camera, (of, weight), options.pixel, name)
+    image = dataclasses.replace(image, unit=columns.unit(options))
     found = np.asarray(image.values)
     _save(image, _arrows(columns, particles, camera, options), options, output)
     said = found[np.isfinite(found)]
@@ -256,6 +259,18 @@ class _Columns:
         if name in SUMMED:
             return self.amounts(name)
         return choose_quantity(self.table, name, density=self._summed)[0]
+
+    def unit(self, options: Any) -> str:
+        """The unit of what is asked for, as far as the file states those that it is made of."""
+        length = self.table.units.length
+        name = options.of or ("density" if options.weight else MASS if self.mass_name else NUMBER)
+        own = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name)
+        if options.weight is None and length is not None:
+            own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
+            own = None if own is None else own.over(length, 2 if name in (MASS, NUMBER) else -1)
+        elif options.weight is None:
+            own = None
+        return "" if own is None or options.emission is not None or is_log(name) else written(own)
 
     def _summed(self) -> np.ndarray:
         support = self._particles.to_numpy()["support"].astype(np.float64)

@@ -28,6 +28,8 @@ from jaxsph.io.images.slices import SUFFIXES
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.opening.views import length_of, place_of
+from jaxsph.io.settle.quantities import is_log
+from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.clips.shapes import Plane
@@ -95,7 +97,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     there = np.isfinite(made.values)
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
-    made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options)))
+    made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options), *_unit(loaded)))
     if cli_look.has_key(options):
         shown = Scene(particles=particles, transfer=transfer)
         cli_look.save_with_key(made.image(transfer), shown, made.camera, _labels(loaded, options), options, output)
@@ -130,6 +132,14 @@ def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded
+
+
+def _unit(loaded: Loaded | None) -> list[tuple[str, str]]:
+    """The unit of the values as metadata, where the file states it; logarithms have none."""
+    if loaded is None or loaded.table is None or is_log(loaded.quantity):
+        return []
+    stated = unit_of(loaded.table, loaded.quantity)
+    return [] if stated is None else [("jaxsph.unit", written(stated))]
 
 
 def _labels(loaded: Loaded | None, options: Any) -> Labels:

@@ -6,7 +6,7 @@ Flow: Projection, Slice -> [fits] -> file.
 |---|---|
 | `CTYPE1`, `CTYPE2` | `X` to the right, `Y` upwards: linear, in lengths; with perspective `X/Z` and `Y/Z`, which are tangents |
 | `CRVAL`, `CRPIX`, `CDELT` | coordinates of the middle of the picture, and the side of a pixel |
-| `CUNIT`, `BUNIT` | units of lengths and of values, where they are known; as the standard spells them, if it knows them |
+| `CUNIT`, `BUNIT` | units of lengths and of values, where they are known: numbers are told in such that the standard spells |
 | `BTYPE` | what the values are |
 | `COMMENT` | how they were made |
 
@@ -56,12 +56,14 @@ def write(
     parts = []
     for number, (name, values) in enumerate(layers.items()):
         kind = fits.ImageHDU if number else fits.PrimaryHDU
-        part = kind(np.ascontiguousarray(np.asarray(values)[::-1]))
+        factor, spelled = _spelled(unit) if not number else (1.0, None)
+        rows = np.asarray(values)[::-1]
+        part = kind(np.ascontiguousarray(rows) if factor == 1 else factor * rows.astype(np.float64))  # whose range is that of CGS
         part.header.update(_cards(part.header, name, np.shape(values), axes))
         if number:
             part.header["EXTNAME"] = _letters(name).upper()
         elif unit:
-            part.header["BUNIT"] = _spelled(unit) or _letters(unit)
+            part.header["BUNIT"] = spelled or _letters(unit)
         parts.append(part)
     for name, value in metadata:
         parts[0].header.add_comment(_letters(f"{name} = {value}"))
@@ -74,23 +76,27 @@ def _cards(header: Any, name: str, shape: tuple[int, ...], axes: PlaneAxes) -> d
     cards: dict[str, Any] = {"BTYPE": _letters(name), "WCSAXES": 2}
     for nth, (label, size, place) in enumerate(zip("XY", (shape[1], shape[0]), axes.middle, strict=True), 1):
         cards |= {f"CTYPE{nth}": f"{label}/Z" if axes.perspective else label, f"CRPIX{nth}": (size + 1) / 2}
-        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else place, f"CDELT{nth}": axes.pixel}
-        spelled = None if axes.perspective else _spelled(axes.unit)
+        factor, spelled = (1.0, None) if axes.perspective else _spelled(axes.unit)
+        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else factor * place, f"CDELT{nth}": factor * axes.pixel}
         if spelled:
             cards[f"CUNIT{nth}"] = spelled
     return cards
 
 
-def _spelled(unit: str) -> str | None:
-    """A unit as FITS spells it; None where it has no word for it."""
-    if not unit:
-        return None
+def _spelled(unit: str) -> tuple[float, str | None]:
+    """What numbers in a unit are to be multiplied by, and the unit as FITS spells it; None where it has no word for it.
+
+    A scale factor a and a Hubble parameter h are no years and hours.
+    """
+    if not unit or {word.partition("^")[0] for word in unit.split()} & {"a", "h"}:
+        return 1.0, None
     units = require("astropy.units", "FITS files", "fits")
     try:
-        spelled: str = units.Unit(unit).to_string("fits")
+        known = units.Unit(unit)
+        whole = known if float(known.scale) == 1 else units.CompositeUnit(1, known.bases, known.powers)
+        return float(known.scale), str(whole.to_string("fits"))
     except (ValueError, TypeError):
-        return None
-    return spelled
+        return 1.0, None
 
 
 def _letters(text: str) -> str:

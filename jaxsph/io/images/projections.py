@@ -31,6 +31,7 @@ from jaxsph.numerics.checks import array_of
 
 SUFFIXES = (".exr", ".npy", ".fits", ".png")
 WEIGHT = "weight"
+MIDDLE = "jaxsph.middle"
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
 
@@ -105,7 +106,8 @@ def _write_fits(path: Path, projection: Projection) -> None:
     if projection.weight is not None:
         layers[WEIGHT] = np.asarray(projection.weight)
     side = math.sqrt(float(projection.pixel_area))
-    axes = fits.PlaneAxes(side, unit=projection.length_unit, perspective=bool(projection.perspective))
+    x, y = map(float, dict(projection.metadata).get(MIDDLE, "0 0").split())
+    axes = fits.PlaneAxes(side, (x, y), projection.length_unit, bool(projection.perspective))
     fits.write(path, layers, axes, projection.unit, projection.metadata)
 
 

@@ -36,7 +36,7 @@ def write(path: Path, values: np.ndarray, picture: Image | None, metadata: tuple
         with written_whole(path) as temporary, open(temporary, "wb") as file:
             np.save(file, values)
     elif suffix == ".fits":
-        fits.write(path, {"value": values}, axes, metadata=metadata)
+        fits.write(path, {"value": values}, axes, dict(metadata).get("jaxsph.unit", ""), metadata)
     elif suffix == ".exr":
         layers, header = {"value": values}, dict(metadata)
         if picture is not None:

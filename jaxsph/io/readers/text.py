@@ -7,14 +7,16 @@ element or its number; extended XYZ names its columns in the comment (`Propertie
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
-from jaxsph.io.parsing import gather_vectors
+from jaxsph.io.parsing import POSITION_BASES, SEPARATORS, gather_vectors
 from jaxsph.io.table import ParticleTable, table_from_columns
+from jaxsph.io.units import LENGTH, LENGTHS, CodeUnit, FileUnits
 
 SOURCE = "text table"
 DELIMITERS = (",", ";", "\t")
@@ -22,6 +24,7 @@ WHOLE = re.compile(r"[+-]?[0-9]{1,400}")
 """Of more digits than any float64 has."""
 MAX_COLUMNS = 2**16
 """Columns that a comment of a few bytes may ask for."""
+WITH_UNIT = re.compile(r"(.*)[xyzXYZ012]\]?\s[\[(]\s*(\w+)\s*[\])]")
 MAX_ABOVE = 32
 """Lines among which the names of columns are looked for."""
 ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
@@ -56,7 +59,15 @@ def read(path: Path) -> ParticleTable:
         if left_out:
             said.append(f"left out {', '.join(left_out)}: not numbers")
         position, columns = gather_vectors(fields)
-        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+        table = table_from_columns(position, columns, source=SOURCE, conventions=said)
+        return dataclasses.replace(table, units=FileUnits(_length(list(fields))))
+
+
+def _length(names: list[str]) -> CodeUnit | None:
+    """The unit of positions, where it stands in brackets behind one of their names."""
+    found = (match for name in names if (match := WITH_UNIT.fullmatch(name)))
+    units = {match[2] for match in found if match[1].rstrip(SEPARATORS).lower() in POSITION_BASES}
+    return CodeUnit(LENGTHS[unit], LENGTH) if len(units) == 1 and (unit := units.pop()) in LENGTHS else None
 
 
 def _plain_lines(lines: list[str]) -> tuple[list[str], list[str]]:

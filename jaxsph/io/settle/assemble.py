@@ -17,6 +17,7 @@ from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
 from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.unit_names import written
 from jaxsph.io.settle.where import evaluated, select
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.particles.particles import Particles
@@ -182,6 +183,8 @@ def _assemble(
         if second is not None:
             columns["quantity"] = columns["quantity"], columns.pop("second")
         particles = Particles.from_arrays(table.position[kept], **columns, kernel=kernel, box=table.box_size)
+    length = table.units.length
+    particles = particles if length is None else dataclasses.replace(particles, length_unit=written(length))
     report = Report(
         source=table.source,
         path=table.path,

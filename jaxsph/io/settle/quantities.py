@@ -87,6 +87,11 @@ def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
 
 
+def is_log(name: str) -> bool:
+    """Whether a full name is that of a logarithm."""
+    return name.lower().startswith(LOG_PREFIX)
+
+
 def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:
     if name.lower().startswith(LOG_PREFIX):
         values, inner = _named(table, name[len(LOG_PREFIX) :].strip(), density)

@@ -14,7 +14,7 @@ from fractions import Fraction
 from jaxsph.io.libraries import require
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, velocity_name
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import BASE, LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit
+from jaxsph.io.units import BASE, LENGTH, LENGTHS, MASS, SAME, TEMPERATURE, TIME, VELOCITY, CodeUnit
 
 READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     LENGTH: ("cm", "m", "km", "Rsun", "AU", "pc", "kpc", "Mpc", "Gpc"),
@@ -94,6 +94,20 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None) -> tuple[
             if larger == READABLE[unit.powers][0] or value * abs(magnitude) >= 1:
                 factor, name = value, larger
     return factor, f"{name} {left_in}".strip()
+
+
+def written(unit: CodeUnit) -> str:
+    """A unit as text that other libraries read, with powers of a and h at its end; a length by a name, where it is one."""
+    is_length = "kpc" in READABLE.get(unit.powers, ())
+    called = (name for name, cgs in LENGTHS.items() if is_length and abs(unit.cgs / cgs - 1) < SAME)
+    parts = ([] if unit.cgs == 1 else [f"{unit.cgs:.9g}"]) + ([_powers(unit, "*", "**")] if any(unit.powers) else [])
+    name = next(called, "*".join(parts))
+    return f"{name} {_product([('a', unit.a), ('h', unit.h)], ' ', '^')}".strip()
+
+
+def stated_length(name: str) -> CodeUnit:
+    """The unit of lengths that has this name. Raises `ValueError`: it is none."""
+    return CodeUnit(1 / named(CodeUnit(1.0, LENGTH), 1.0, name)[0], LENGTH)
 
 
 def _powers(unit: CodeUnit, times: str, power: str, exact: bool = False) -> str:

@@ -1,5 +1,6 @@
 """FITS files as astropy reads them: values, places, units, and what they are."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -90,3 +91,33 @@ def test_without_astropy_the_extra_is_named(tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"`astropy` is needed for FITS files: pip install \"jaxsph\[fits\]\""):
         image.save(tmp_path / "a.fits")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("unit", ["kpc", ""])
+def test_projections_and_slices_of_one_middle_lie_at_one_place(unit, tmp_path):
+    js.project(particles(unit), camera((0.3, -0.2, 0.1))).save(tmp_path / "a.fits")
+    js.slice(particles(unit), js.Plane((0, 0, 0.1), (0, 0, 1)), center=(0.3, -0.2, 0), view_height=2.0, width=6, height=4).save(
+        tmp_path / "b.fits"
+    )
+    one, other = (fits.getheader(tmp_path / name) for name in ("a.fits", "b.fits"))
+    for card in ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2", "CDELT1", "CDELT2"):
+        assert one[card] == pytest.approx(other[card], rel=1e-6), card
+    assert one["CRVAL1"] == pytest.approx(0.3) and one["CRVAL2"] == pytest.approx(-0.2)
+    assert one.get("CUNIT1") == other.get("CUNIT1") == (unit or None)
+
+
+def test_numbers_are_told_in_units_that_the_standard_spells(tmp_path):
+    image = js.project(particles(), camera((0.3, -0.2, 0.1)), of=np.ones(2), unit="4e40*g*cm**-2")
+    dataclasses.replace(image, length_unit="2e+20*cm").save(tmp_path / "a.fits")
+    with fits.open(tmp_path / "a.fits") as found:
+        header = found[0].header
+        assert (header["CUNIT1"], header["BUNIT"]) == ("cm", "g cm-2")
+        assert header["CRVAL1"] == pytest.approx(0.6e20) and header["CDELT1"] == pytest.approx(1e20)
+        np.testing.assert_allclose(found[0].data, 4e40 * np.asarray(image.values, np.float64)[::-1])
+
+
+def test_a_scale_factor_is_no_year_and_a_hubble_parameter_no_hour(tmp_path):
+    image = js.project(particles(), camera((0.3, 0, 0)), of=np.ones(2), unit="4e40*g*cm**-2 h a^-2")
+    dataclasses.replace(image, length_unit="kpc a h^-1").save(tmp_path / "a.fits")
+    header = fits.getheader(tmp_path / "a.fits")
+    assert "CUNIT1" not in header and header["BUNIT"] == "4e40*g*cm**-2 h a^-2" and header["CRVAL1"] == pytest.approx(0.3)

@@ -8,7 +8,7 @@ import pytest
 
 from jaxsph import io
 from jaxsph.io.settle.labels import Labels, labels_of, moment_of
-from jaxsph.io.settle.unit_names import named, unit_of
+from jaxsph.io.settle.unit_names import named, stated_length, unit_of, written
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits
 
@@ -209,3 +209,30 @@ def test_the_library_itself_names_units_as_the_stand_in_does():
         named(CodeUnit(KPC, LENGTH), 1.0, "Myr")
     with pytest.raises(ValueError, match="is no unit"):
         named(CodeUnit(KPC, LENGTH), 1.0, "parsnip")
+
+
+@pytest.mark.parametrize(
+    ("unit", "text"),
+    [
+        (CodeUnit(3.08568e21, LENGTH), "kpc"), (CodeUnit(1.496e13, LENGTH), "AU"), (CodeUnit(1e16, LENGTH), "1e+16*cm"),
+        (CodeUnit(KPC, LENGTH, 1, -1), "kpc a h^-1"), (CodeUnit(2.5e-10, (-2, 1, 0, 0)), "2.5e-10*g*cm**-2"),
+        (CodeUnit(1.0, (0, 0, 0, 0)), ""),
+    ],
+)  # fmt: skip
+def test_units_are_written_as_other_libraries_read_them(unit, text):
+    assert written(unit) == text
+
+
+def test_units_of_lengths_reach_particles(tmp_path):
+    assert io.read_particles(gadget(tmp_path / "x.hdf5", density=STATED), "x", 1.0).length_unit == "kpc a h^-1"
+    for names, unit in (("x [kpc],y [kpc],z [kpc]", "kpc"), ("Pos.x (m),Pos.y (m),Pos.z (m)", "m"), ("x,y,z", None),
+                        ("x [furlong],y [furlong],z [furlong]", None), ("x [m],y [km],z [m]", None)):  # fmt: skip
+        (tmp_path / "a.csv").write_text(f"{names},rho [m]\n1,2,3,4\n5,6,7,8\n")
+        assert io.read_particles(tmp_path / "a.csv", "rho", 1.0).length_unit == unit, names
+
+
+def test_a_length_has_the_unit_that_it_is_said_to_have():
+    assert stated_length("kpc").cgs == pytest.approx(3.0857e21, rel=1e-4) and stated_length("kpc").powers == LENGTH
+    for name in ("s", "kpc**2", "furlongs and more"):
+        with pytest.raises(ValueError, match="unit"):
+            stated_length(name)
