@@ -58,8 +58,7 @@ def folder() -> Path:
 def _make_own(place: Path) -> None:
     """Make a folder that this user alone can enter, whatever the umask; what others have put into it goes.
 
-    Raises:
-        OSError: it cannot be made, or it or the one that it is in is another user's.
+    Raises `OSError`: it cannot be made, or it or the one that it is in is another user's.
     """
     before = os.umask(0o077)
     try:

@@ -99,11 +99,7 @@ def _read_by(run: Any, options: Any) -> list[Path]:
 
 
 def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], Any]:
-    """The command that is asked for, with its files, and its options.
-
-    Raises:
-        UsageError: what cannot be understood.
-    """
+    """The command that is asked for, with its files, and its options. Raises `UsageError`: what cannot be understood."""
     if command not in COMMANDS:
         known = ", ".join(COMMANDS)
         raise UsageError(f"there is no command {command!r}; there are {known}{did_you_mean(command, COMMANDS)}")

@@ -61,8 +61,7 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
 
     Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`.
 
-    Raises:
-        ValueError: no `x y z`, nor another triple that is named as a position; names that differ in their unit only.
+    Raises `ValueError`: no `x y z`, nor another triple that is named as a position; names that differ in their unit only.
     """
     columns: dict[str, np.ndarray] = {}
     for full_name, values in fields.items():
@@ -102,8 +101,7 @@ def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompressor, need: int, what: str) -> bytes:
     """All blocks unpacked, each a whole stream.
 
-    Raises:
-        ValueError: a block that does not end, or more than the `need` bytes of `what`; unpacking stops there.
+    Raises `ValueError`: a block that does not end, or more than the `need` bytes of `what`; unpacking stops there.
     """
     parts, left = [], need
     for block in blocks:
@@ -144,8 +142,7 @@ def refuse_missing(count: int, available: int, what: str) -> None:
 def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
     """Refuse a file that goes on for `left` > 0 `unit` behind `what`, where its header lets nothing follow.
 
-    Raises:
-        ValueError: there is something left.
+    Raises `ValueError`: there is something left.
     """
     if left > 0:
         raise DataError(
@@ -157,8 +154,7 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
 def choose_type(present: Sequence[int], part_type: int | None) -> int:
     """The type of particles that is read: the one asked for, else gas (0) if there is any, else the first there is.
 
-    Raises:
-        ValueError: there are none of the type asked for.
+    Raises `ValueError`: there are none of the type asked for.
     """
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"

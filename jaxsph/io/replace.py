@@ -60,8 +60,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     When the block fails, the temporary file is removed and what stood at `path` before still stands there. So it is when the
     process is asked to end, if it hears (`jaxsph.cli.main`).
 
-    Raises:
-        ValueError: the folder of `path` does not exist or may not be written to, or `path` is a folder.
+    Raises `ValueError`: the folder of `path` does not exist or may not be written to, or `path` is a folder.
     """
     path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     if path.is_dir():

@@ -85,8 +85,7 @@ def refuse_strangers(parts: Sequence[ParticleTable], count: int) -> None:
 def files_of(path: Path, number: int) -> list[Path] | None:
     """All files of the snapshot that a file is one of; None where its name does not say which it is.
 
-    Raises:
-        ValueError: some are not there, or no regular files. The folder is listed once: a header may ask for any number.
+    Raises `ValueError`: some are not there, or no regular files. The folder is listed once: a header may ask for any number.
     """
     match = PART.fullmatch(path.name)
     if match is None or int(match[2]) >= number:

@@ -144,8 +144,7 @@ def _edges(count: int, cells: np.ndarray | None) -> np.ndarray:
 def supports_and_volumes(table: ParticleTable) -> tuple[np.ndarray, np.ndarray]:
     """Both in float64; a stored density is not held against sums, as `stored` does in memory: they need all other particles.
 
-    Raises:
-        ValueError: neither can be found without all other particles.
+    Raises `ValueError`: neither can be found without all other particles.
     """
     mass, density = (table.named(*ROLES[role]) for role in ("mass", "density"))
     if table.support is None or (table.volume is None and (mass is None or density is None)):
@@ -161,8 +160,7 @@ def supports_and_volumes(table: ParticleTable) -> tuple[np.ndarray, np.ndarray]:
 def needed_columns(first: ParticleTable, *quantities: str) -> list[str]:
     """Names of the columns that supports, volumes and quantities come from; `first` is a table of any rows.
 
-    Raises:
-        ValueError: a quantity that is not there, or that is a sum over neighbours.
+    Raises `ValueError`: a quantity that is not there, or that is a sum over neighbours.
     """
     roles = list(map(plain, gadget_hdf5.SMOOTHING_NAMES))
     roles += [name for role in ("mass", "density") if (name := first.named(*ROLES[role])) is not None]

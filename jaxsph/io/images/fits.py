@@ -49,8 +49,7 @@ def write(
 ) -> None:
     """Write layers (height, width) by name, the values first, whole or not at all; `unit` is that of the values.
 
-    Raises:
-        ImportError: astropy is not installed.
+    Raises `ImportError`: astropy is not installed.
     """
     fits = require("astropy.io.fits", "FITS files", "fits")
     parts = []

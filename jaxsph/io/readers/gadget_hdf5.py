@@ -77,8 +77,7 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`. Of those, `rows` are read, and
     besides positions `only` the columns of those names (`plain`).
 
-    Raises:
-        ValueError: no such type; data sets of other lengths; a SWIFT kernel that is not known.
+    Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
     (chosen, group), present = _choose(file, part_type)
     position = read_positions(group["Coordinates"], rows)

@@ -76,8 +76,7 @@ def position_shape(dataset: Any) -> tuple[int, int]:
 def columns_of(group: Any) -> dict[str, Any]:
     """The data sets of `group` with one or two axes, not read.
 
-    Raises:
-        ValueError: a link that cannot be followed, a view of files that are missing or may not be opened.
+    Raises `ValueError`: a link that cannot be followed, a view of files that are missing or may not be opened.
     """
     return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
 
@@ -87,8 +86,7 @@ def numeric_datasets(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Those with `count` rows of one or more numbers, and a sentence on each that a missing filter has packed.
 
-    Raises:
-        ValueError: such a filter of one that is `needed` (`plain`).
+    Raises `ValueError`: such a filter of one that is `needed` (`plain`).
     """
     columns, said = {}, []
     for name, dataset in datasets.items():
@@ -105,8 +103,7 @@ def numeric_datasets(
 def shape_of(dataset: Any) -> tuple[int, ...] | None:
     """The shape of a data set, which of some views HDF5 opens files to know; None of what is none, or has no data.
 
-    Raises:
-        ValueError: a view of files that are missing or may not be opened.
+    Raises `ValueError`: a view of files that are missing or may not be opened.
     """
     if getattr(dataset, "is_virtual", False):
         _sources(dataset)
@@ -117,8 +114,7 @@ def shape_of(dataset: Any) -> tuple[int, ...] | None:
 def refuse_unwritten(dataset: Any) -> None:
     """Refuse a data set some of whose data is not there.
 
-    Raises:
-        ValueError: never written, cut short, or a view of what is not there; what cannot be known.
+    Raises `ValueError`: never written, cut short, or a view of what is not there; what cannot be known.
     """
     needed = math.prod(shape_of(dataset) or ()) * dataset.dtype.itemsize
     if needed == 0:

@@ -42,8 +42,7 @@ class Element(NamedTuple):
 def read(path: Path) -> ParticleTable:
     """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns.
 
-    Raises:
-        ValueError: damaged, cut short, or longer than its header says.
+    Raises `ValueError`: damaged, cut short, or longer than its header says.
     """
     with explained(path, SOURCE):
         content = path.read_bytes()

@@ -48,8 +48,7 @@ def looks_like(start: bytes) -> bool:
 def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
     """Read the particles of one type: gas if there is any, else the first that there is.
 
-    Raises:
-        ValueError: damaged; no particles of that type.
+    Raises `ValueError`: damaged; no particles of that type.
     """
     with explained(path, SOURCE):
         with path.open("rb") as file:

@@ -35,8 +35,7 @@ COMPRESSORS: dict[str | None, tuple[Decompressor | None, int]] = {
 def read(path: Path) -> ParticleTable:
     """Read points and point data of all pieces; columns of words are left out, and said so.
 
-    Raises:
-        ValueError: damaged, cut short, another type of data set, or a compressor that is not known.
+    Raises `ValueError`: damaged, cut short, another type of data set, or a compressor that is not known.
     """
     with explained(path, SOURCE):
         root, decoder = parsed(path, DATASETS, ".vtu, .vtp")

@@ -34,8 +34,7 @@ def chosen(
 
     Supports, volumes and, where `quantity` needs it, the density are those that all particles have made, as columns.
 
-    Raises:
-        ValueError: as `particles_from_table`.
+    Raises `ValueError`: as `particles_from_table`.
     """
     boxed, notes = in_box(table, box)
     if boxed.box_size is None:  # else it is said where particles are made

@@ -94,8 +94,7 @@ def select(
 def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:
     """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too.
 
-    Raises:
-        ValueError: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
+    Raises `ValueError`: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
     """
     if table.support is not None:
         table = dataclasses.replace(table, columns={"support": table.support, **table.columns})

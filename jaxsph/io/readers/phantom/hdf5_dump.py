@@ -22,8 +22,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
 
     Without `part_type` that is gas, or the lowest other type there is.
 
-    Raises:
-        ValueError: missing data sets, no particles of that type, data sets of other lengths.
+    Raises `ValueError`: missing data sets, no particles of that type, data sets of other lengths.
     """
     header, group = file["header"], file["particles"]
     for each in (header, group):
