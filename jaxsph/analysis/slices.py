@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxsph.engine.render import render
 from jaxsph.io.images import slices as files
-from jaxsph.io.images.fits import PlaneAxes
+from jaxsph.io.images.fits import PlaneAxes, middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
@@ -86,7 +86,7 @@ class Slice:
         Raises:
             ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
         """
-        axes = PlaneAxes(self.pixel_size, self.camera.middle(), self.length_unit)
+        axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit)
         files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
 
     def to_xarray(self) -> Any:
@@ -98,7 +98,7 @@ class Slice:
             ImportError: xarray is not installed.
         """
         height, width = self.values.shape
-        where = places((height, width), self.pixel_size, self.camera.middle(), self.length_unit)
+        where = places((height, width), self.pixel_size, middle_of(self.camera), self.length_unit)
         return dataset({"values": (PLANE, self.values)}, where, self.metadata)
 
 

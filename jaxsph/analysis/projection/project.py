@@ -28,6 +28,7 @@ from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, besi
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.runtime.executors import Clock
+from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, unit_held
@@ -99,7 +100,7 @@ def project(
     plan.check(particles, camera, pixel)
     sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
     told: Any = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    told += () if traced else (("jaxsph.camera", camera.describe()), ("jaxsph.middle", "{!r} {!r}".format(*camera.middle())))
+    told += () if traced else (("jaxsph.camera", camera.describe()), ("jaxsph.middle", "{!r} {!r}".format(*middle_of(camera))))
     named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
     return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=told, **named)
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
+from jaxsph.model.camera.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,12 @@ class PlaneAxes:
     middle: tuple[float, float] = (0.0, 0.0)
     unit: str = ""
     perspective: bool = False
+
+
+def middle_of(camera: Camera) -> tuple[float, float]:
+    """Coordinates of the middle of a picture, along what is to the right and upwards, length units."""
+    x, y, _ = (np.asarray(camera.axes, np.float64) @ camera.exact_eye()).tolist()
+    return x, y
 
 
 def write(

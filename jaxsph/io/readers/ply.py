@@ -9,7 +9,7 @@ import functools
 import itertools
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from jaxsph.io.table import ParticleTable, table_from_columns
 SOURCE = "PLY"
 VERTEX = "vertex"
 INDICES = "vertex_indices", "vertex_index"
+Element = tuple[str, int, list[list[str]]]
+"""Name, rows, and the words of each property, as `float x` or `list uchar int vertex_indices`."""
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8",
@@ -31,14 +33,6 @@ END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
 """A line of its own: a comment may hold the word, too."""
 
 
-class Element(NamedTuple):
-    """A table of the file: its rows, and the words of each property, `float x` or `list uchar int vertex_indices`."""
-
-    name: str
-    rows: int
-    properties: list[list[str]]
-
-
 def read(path: Path) -> ParticleTable:
     """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns.
 
@@ -47,9 +41,9 @@ def read(path: Path) -> ParticleTable:
     with explained(path, SOURCE):
         content = path.read_bytes()
         encoding, elements, start = _header(content)
-        place = [element.name for element in elements].index(VERTEX)
-        count, order = elements[place].rows, BYTE_ORDERS[encoding]
-        record = np.dtype([(name, order + TYPES[kind]) for kind, name in elements[place].properties])
+        place = [name for name, *_ in elements].index(VERTEX)
+        (_, count, properties), order = elements[place], BYTE_ORDERS[encoding]
+        record = np.dtype([(name, order + TYPES[kind]) for kind, name in properties])
         if encoding == "ascii":
             points = _ascii_points(content[start:], elements, place, record)
         else:
@@ -66,12 +60,13 @@ def _end(content: bytes, order: str, vertices: int, at: int, element: Element) -
 
     Lists that begin at a wrong byte may end at the right one: so faces are of vertices that there are.
     """
-    left = element.rows if element.properties else 0
-    run = 1 if any(kind == "list" for kind, *_ in element.properties) else left
+    called, count, properties = element
+    left = count if properties else 0
+    run = 1 if any(kind == "list" for kind, *_ in properties) else left
     while left:
         fields: list[Any] = []
         lengths: dict[str, int] = {}
-        for number, (kind, *words) in enumerate(element.properties):
+        for number, (kind, *words) in enumerate(properties):
             fields.append((f"{number}", order + TYPES[words[0] if kind == "list" else kind]))
             if kind == "list":
                 lengths[f"{number}"] = length = int(np.frombuffer(content, fields, 1, at)[f"{number}"][0])
@@ -79,12 +74,12 @@ def _end(content: bytes, order: str, vertices: int, at: int, element: Element) -
         row = np.dtype(fields)
         rows = np.frombuffer(content, row, min(left, run, (len(content) - at) // row.itemsize), at)
         if not len(rows):
-            refuse_missing(element.rows, element.rows - left, "vertices" if element.name == VERTEX else f"rows of {element.name}")
+            refuse_missing(count, count - left, "vertices" if called == VERTEX else f"rows of {called}")
         other = np.any([rows[name] != length for name, length in lengths.items()], axis=0) if lengths else np.zeros(1, bool)
         taken = int(other.argmax()) if other.any() else len(rows)
-        for name in lengths if element.name == "face" else ():
+        for name in lengths if called == "face" else ():
             corners = rows[f"of {name}"][:taken]
-            if element.properties[int(name)][-1] in INDICES and ((corners < 0) | (corners >= vertices)).any():
+            if properties[int(name)][-1] in INDICES and ((corners < 0) | (corners >= vertices)).any():
                 raise DataError(f"has faces of other than its {vertices} vertices, so its data is shifted; copy it again")
         at, left, run = at + taken * row.itemsize, left - taken, 2 * run if taken == run else 1
     return at
@@ -93,7 +88,7 @@ def _end(content: bytes, order: str, vertices: int, at: int, element: Element) -
 def _ascii_points(content: bytes, elements: list[Element], place: int, record: np.dtype) -> np.ndarray:
     """The lines of an element that are not blank, each number read as its own type: an id has more digits than float64."""
     filled = [row for row in content.split(b"\n") if row.strip()]
-    counts = [element.rows if element.properties else 0 for element in elements]
+    counts = [rows if properties else 0 for _, rows, properties in elements]
     before, count, lines = sum(counts[:place]), counts[place], sum(counts)
     rows = filled[before : before + count]
     refuse_missing(count, len(rows), "vertices")
@@ -130,14 +125,14 @@ def _header(content: bytes) -> tuple[str, list[Element], int]:
     elements: list[Element] = []
     for words in lines:
         if words[:1] == ["element"]:
-            elements.append(Element(words[1], int(words[2]), []))
+            elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            elements[-1].properties.append(words[1:])
-    vertices = [element for element in elements if element.name == VERTEX]
-    if len(vertices) != 1 or min(element.rows for element in elements) < 0:
-        told = ", ".join(f"{element.rows} {element.name}" for element in elements) or "nothing"
+            elements[-1][2].append(words[1:])
+    vertices = [properties for name, _, properties in elements if name == VERTEX]
+    if len(vertices) != 1 or min(rows for _, rows, _ in elements) < 0:
+        told = ", ".join(f"{rows} {name}" for name, rows, _ in elements) or "nothing"
         raise DataError(f"announces {told}, and must have one element `{VERTEX}` of particles; write it again")
-    kinds = [words[0] for words in vertices[0].properties]
+    kinds = [words[0] for words in vertices[0]]
     if any(kind not in TYPES for kind in kinds):
         raise DataError("has vertex properties that are lists or of unknown type; save the vertices without them")
     if not kinds:

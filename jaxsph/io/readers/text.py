@@ -60,14 +60,10 @@ def read(path: Path) -> ParticleTable:
             said.append(f"left out {', '.join(left_out)}: not numbers")
         position, columns = gather_vectors(fields)
         table = table_from_columns(position, columns, source=SOURCE, conventions=said)
-        return dataclasses.replace(table, units=FileUnits(_length(list(fields))))
-
-
-def _length(names: list[str]) -> CodeUnit | None:
-    """The unit of positions, where it stands in brackets behind one of their names."""
-    found = (match for name in names if (match := WITH_UNIT.fullmatch(name)))
-    units = {match[2] for match in found if match[1].rstrip(SEPARATORS).lower() in POSITION_BASES}
-    return CodeUnit(LENGTHS[unit], LENGTH) if len(units) == 1 and (unit := units.pop()) in LENGTHS else None
+        matches = [match for name in fields if (match := WITH_UNIT.fullmatch(name))]
+        units = {match[2] for match in matches if match[1].rstrip(SEPARATORS).lower() in POSITION_BASES}
+        length = CodeUnit(LENGTHS[unit], LENGTH) if len(units) == 1 and (unit := units.pop()) in LENGTHS else None
+        return dataclasses.replace(table, units=FileUnits(length))
 
 
 def _plain_lines(lines: list[str]) -> tuple[list[str], list[str]]:

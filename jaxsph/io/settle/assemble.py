@@ -170,9 +170,7 @@ def _assemble(
     volumes, volume_origin = _volumes(table, mass_name, stored, number_density)
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
-    rounding = rounding_note(table.position, supports)
-    if rounding:
-        notes.append(rounding)
+    notes += [rounding] if (rounding := rounding_note(table.position, supports)) else []
     dtype = table.position.dtype
     kept, told = select(table, *wanted[:2], density=density)
     notes += told

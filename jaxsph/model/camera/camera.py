@@ -323,11 +323,6 @@ class Camera:
         eye = np.asarray(self.eye, np.float64)
         return eye if self.eye_rest is None else eye + np.asarray(self.eye_rest, np.float64)
 
-    def middle(self) -> tuple[float, float]:
-        """Coordinates of the middle of the picture, along what is to the right and upwards, length units (host side)."""
-        x, y, _ = (np.asarray(self.axes, np.float64) @ self.exact_eye()).tolist()
-        return x, y
-
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()
