@@ -32,8 +32,7 @@ OTHERS = ("volume", "points", "iso", "support", "where", "share", "center", "wid
 def render_options(options: Any, settings: Settings) -> tuple[Image, Camera]:
     """The picture of a snapshot that stays on disk, and its camera.
 
-    Raises:
-        UsageError: options that need all particles at once.
+    Raises `UsageError`: options that need all particles at once.
     """
     if options.source is None or options.source.startswith(SCENE):
         raise UsageError("--from-disk is for a snapshot file")

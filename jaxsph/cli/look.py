@@ -36,8 +36,7 @@ def is_looked(options: Any) -> bool:
 def look(shown: Particles | Volume, options: Any, quantity: str) -> TransferFunction:
     """What particles or a volume look like, by the options, with the extinction of typical columns; and say so.
 
-    Raises:
-        UsageError: options that the quantity does not suit.
+    Raises `UsageError`: options that the quantity does not suit.
     """
     with wrong_usage():
         made, called = look_of(shown, quantity, options)
@@ -76,8 +75,7 @@ def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
 def label_file(table: ParticleTable, quantity: str, values: np.ndarray, options: Any, opacity_by: str | None = None) -> Labels:
     """Labels of a quantity of a file; in code units, with a note, without unyt.
 
-    Raises:
-        UsageError: a unit that does not agree, or that the file does not state.
+    Raises `UsageError`: a unit that does not agree, or that the file does not state.
     """
     largest = float(np.abs(values).max(initial=0)) if values.size else 1.0
     if quantity.lower().startswith(LOG_PREFIX) and values.size:

@@ -17,8 +17,7 @@ _LOCK = threading.Lock()  # there is one of each in a process
 def require(module: str, purpose: str, extra: str = "io") -> Any:
     """The module called `module`.
 
-    Raises:
-        ImportError: when it is not installed; the message names `purpose` and the `extra` that brings the library.
+    Raises `ImportError`: when it is not installed; the message names `purpose` and the `extra` that brings the library.
     """
     try:
         return importlib.import_module(module)

@@ -45,9 +45,7 @@ def numbers(tokens: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndar
 
     Each is converted on its own, as an array of words would be as wide as the longest of them.
 
-    Raises:
-        ValueError: a token that is no number; Python's `1_000` is none.
-        OverflowError: an integer that `dtype` cannot hold.
+    Raises `ValueError` for what is no number, as Python's `1_000` is none, and `OverflowError` for what `dtype` cannot hold.
     """
     native, mark = dtype.newbyteorder("="), b"_" if tokens and isinstance(tokens[0], bytes) else "_"
     wrong = next((token for token in tokens if mark in token), None)  # type: ignore[operator]

@@ -32,13 +32,11 @@ _KEPT: dict[tuple[int, int], Path] = {}
 @contextlib.contextmanager
 def keeping(inputs: Iterable[Path]) -> Iterator[None]:
     """Files, and folders with all in them, that nothing in the block replaces, even by links to them."""
-    before = dict(_KEPT)
     _KEPT.update((_identity(path), path) for path in inputs)
     try:
         yield
     finally:
         _KEPT.clear()
-        _KEPT.update(before)
 
 
 def refuse_input(path: Path) -> None:

@@ -35,8 +35,7 @@ def settings_of(options: Any) -> Settings:
 def as_medium(options: Any, settings: Settings) -> Any:
     """Options that choose no surface for liquids where a tolerance is to be kept or media are asked at points: it has neither.
 
-    Raises:
-        UsageError: a surface is asked for as well.
+    Raises `UsageError`: a surface is asked for as well.
     """
     asks_points = registry.integrator_class(settings.integrator).asks_points
     if settings.tolerance is None and not asks_points:

@@ -31,14 +31,9 @@ Reader = Callable[[Path, int | None], ParticleTable]
 
 
 def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader) -> ParticleTable:
-    """The particles of all files of a snapshot, in the order of their numbers; the table itself if it is in one file.
+    """The particles of all files of a snapshot, in the order of their numbers, of which `table` is what `read` gave for `path`.
 
-    Args:
-        table: what `read` gave for `path`.
-        read: reads one file; `NoParticlesError` where it has none of the type.
-
-    Raises:
-        ValueError: a file is missing or damaged (which), or files have different columns.
+    Raises `ValueError`: a file is missing or damaged (which), of another snapshot, or has other columns.
     """
     if table.num_files == 1:
         if is_all(len(table), table):
@@ -63,12 +58,7 @@ def is_all(count: int, table: ParticleTable) -> bool:
 
 
 def refuse_strangers(parts: Sequence[ParticleTable], count: int) -> None:
-    """Refuse files that are not parts of one snapshot, or not all: by their headers, and as two have the same positions.
-
-    Args:
-        parts: of each file, from its first row on.
-        count: of the particles of all files.
-    """
+    """Refuse files of together `count` particles that are not all parts of one snapshot, by what each begins with."""
     first, seen = parts[0], dict[bytes, ParticleTable]()
     for part in parts:
         for name in ("num_files", "announced", "time", "box_size"):

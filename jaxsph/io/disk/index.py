@@ -78,15 +78,7 @@ ARRAYS = "file", "begin", "end", *CORNERS, "support", "least", "widest", "strong
 def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> SnapshotIndex:
     """The index of a snapshot: the one that is kept if it is of these very files, else made in one pass, and kept.
 
-    Args:
-        snapshot: what is to be known.
-        progress: called as `progress(done, total)` after each read.
-
-    Raises:
-        ValueError: damaged files; particles without supports, or without masses and densities.
-
-    Warns:
-        UserWarning: where the index cannot be written; it is then made again the next time.
+    Raises `ValueError`: damaged files; particles without supports, or without masses and densities. Warns where it is not kept.
     """
     kept = _kept(snapshot)
     if kept is not None:

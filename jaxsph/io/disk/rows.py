@@ -34,15 +34,7 @@ OTHER_FORMAT = (
 
 
 class Snapshot:
-    """The files of a snapshot, of which some rows can be read.
-
-    Args:
-        path: any of its files: Gadget-like HDF5.
-        part_type: kind of particles; default gas, or the first other kind there is.
-
-    Raises:
-        FileNotFoundError, ValueError: as `read_table`; another format.
-    """
+    """The files of a Gadget-like HDF5 snapshot, by any of them, of which some rows can be read. Raises as `read_table`."""
 
     def __init__(self, path: str | Path, part_type: int | None = None):
         path = Path(path)

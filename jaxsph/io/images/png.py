@@ -25,10 +25,7 @@ SOURCE = "PNG"
 def write(path: Path, image: Image, background: Any = None) -> None:
     """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to.
 
-    Args:
-        path: where to.
-        image: what.
-        background: None is black; `"transparent"` keeps alpha; else a colour.
+    A `background` of None is black, and `"transparent"` keeps alpha.
     """
     if background is None:
         pixels = image.to_uint8()
@@ -65,8 +62,7 @@ def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) ->
 def read(path: Path) -> Image:
     """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file, and NaN.
 
-    Raises:
-        ValueError: damaged or another format.
+    Raises `ValueError`: damaged or another format.
     """
     pillow = require("PIL.Image", "reading PNG images")
     with explained(path, SOURCE):

@@ -49,11 +49,7 @@ def header_of(*, displayed: bool) -> dict[str, Any]:
 
 
 def is_light(header: Mapping[str, Any]) -> bool:
-    """Whether colours of a file are linear light.
-
-    Raises:
-        DataError: the header says something else than files of jaxsph do.
-    """
+    """Whether colours of a file are linear light. Raises `DataError`: the header says something else than files of jaxsph do."""
     told = header.get(COLOR_KEY)
     if told is None:
         return not any(name.startswith("jaxsph.") for name in header)

@@ -26,10 +26,7 @@ PURPOSE = "reading HDF5 files"
 def opened(path: Path) -> Iterator[Any]:
     """An `h5py.File` to read, none of whose links leads astray; what fails inside the block names `path`.
 
-    Raises:
-        ValueError: no regular file, damaged; a link to another folder or to what is no regular file, one at the top that cannot
-            be followed.
-        ImportError: h5py is not installed.
+    Raises `ValueError`: no regular file, damaged; a link to another folder or to no regular file, or at the top to nothing.
     """
     h5py = require("h5py", PURPOSE)
     with explained(path, "HDF5"):
@@ -71,15 +68,9 @@ def check_links(path: Path) -> None:
 
 
 def file_of(file: Any, name: str, what: str) -> Path | None:
-    """The file that HDF5 opens for a name that stands in `file`; None where there is none.
+    """The file that HDF5 opens for a name that stands in an open `file`; None where there is none. `what` names it in errors.
 
-    Args:
-        file: an open `h5py.File`.
-        name: as stored: relative to the folder of `file`, or absolute.
-        what: names it, for errors.
-
-    Raises:
-        ValueError: it lies in another folder, or is no regular file.
+    Raises `ValueError`: it lies in another folder, or is no regular file.
     """
     path = Path(os.path.abspath(file.filename))
     folders = path.parent, Path.cwd(), path.resolve().parent  # in this order HDF5 looks

@@ -37,8 +37,7 @@ def looks_like(folder: Path) -> bool:
 def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
     """Read the particles of one type: gas if there is any, else the first that there is.
 
-    Raises:
-        ValueError: damaged; files of different numbers of particles; no particles of that type.
+    Raises `ValueError`: damaged; files of different numbers of particles; no particles of that type.
     """
     with explained(path, SOURCE):
         held = {n: _count(_header(file)) for n in FOLDERS if (file := _positions(path, n)) is not None}

@@ -44,8 +44,7 @@ MARGIN = 1e-4
 def write_camera_path(path: str | os.PathLike[str], camera_path: CameraPath) -> None:
     """Write a camera path to `path`, a `.json`, whole or not at all.
 
-    Raises:
-        ValueError: another suffix, or a place that cannot be written to.
+    Raises `ValueError`: another suffix, or a place that cannot be written to.
     """
     first = camera_path.legs[0].cameras[0]
     head = {"format": FORMAT, "version": VERSION, "width": first.width, "height": first.height}

@@ -31,8 +31,7 @@ KNOWN = {"format", "version", "dtype", "note"}
 def write_transfer(path: str | os.PathLike[str], transfer: TransferFunction) -> None:
     """Write `transfer` to `path`, a `.json`, whole or not at all.
 
-    Raises:
-        ValueError: another suffix, or a place that cannot be written to.
+    Raises `ValueError`: another suffix, or a place that cannot be written to.
     """
     head = {"format": FORMAT, "version": VERSION, "dtype": str(transfer.values.dtype)}
     fields = {field.name: getattr(transfer, field.name) for field in dataclasses.fields(transfer)}

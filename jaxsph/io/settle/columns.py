@@ -53,9 +53,8 @@ def particles_from_columns(
 ) -> tuple[Particles, Report]:
     """Particles of named columns, and the report on what was settled; see `jaxsph.Particles.from_columns`.
 
-    Raises:
-        ValueError: no positions, another number of rows, a smoothing length of which nobody says how many a support is, units
-            that cannot be converted to that of positions; see `jaxsph.io.particles_from_table`.
+    Raises `ValueError`: no positions, another number of rows, a smoothing length of which nobody says how many a support is,
+    units that cannot be converted to that of positions; see `jaxsph.io.particles_from_table`.
     """
     wanted = [name.removeprefix(LOG_PREFIX).partition(".")[0] for name in (quantity, opacity_by) if isinstance(name, str)]
     fields = _fields(columns, [*wanted, *([support] if isinstance(support, str) else [])])

@@ -46,12 +46,7 @@ SHOW_PROGRESS_FROM = 100_000
 
 
 def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | None = None) -> float | None:
-    """Spacing of particles that lie about evenly, length units; None where they cluster, or are too few to tell.
-
-    Args:
-        position: (N, 3), any length unit.
-        box: sides of a periodic box, across whose faces neighbours are found; None for none.
-    """
+    """Spacing of particles that lie about evenly, also across the faces of a `box`; None where they cluster, or are too few."""
     places = in_period(position, box)
     if len(places) < FEW:
         return None

@@ -127,13 +127,9 @@ def _product(factors: list[tuple[str, float]], times: str, power: str, exact: bo
 
 
 def checked_unit(text: str) -> str:
-    """The same unit, as `unyt` may be given it.
+    """Names with powers, between them `*` or `/`, such as `"Msun/kpc**3"`, `"g*cm**(-1/2)"` or `"1/s"`, as `unyt` takes them.
 
-    Args:
-        text: names with powers, between them `*` or `/`, such as `"Msun/kpc**3"`, `"g*cm**(-1/2)"` or `"1/s"`.
-
-    Raises:
-        ValueError: anything else; more than 100 characters; a power beyond 12.
+    Raises `ValueError`: anything else; more than 100 characters; a power beyond 12.
     """
     if len(text) > MAX_LENGTH:
         raise ValueError(f"a unit may have {MAX_LENGTH} characters, this one has {len(text)}; write it as 'Msun/kpc**3'")

@@ -20,8 +20,7 @@ def read(path: Path) -> VolumeTable:
 
     It is read into memory: a file that another program writes again would kill whoever had mapped it.
 
-    Raises:
-        ValueError: damaged, cut short, longer than its header says, not of numbers, or another number of axes.
+    Raises `ValueError`: damaged, cut short, longer than its header says, not of numbers, or another number of axes.
     """
     with explained(path, SOURCE), path.open("rb") as file:
         shape, is_fortran, dtype = array_header(file)

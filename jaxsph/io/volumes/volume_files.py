@@ -70,8 +70,7 @@ def volume_from_table(
 def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     """Write a volume, whole or not at all: `.vti` with its place, or `.npy`, which holds the values alone.
 
-    Raises:
-        ValueError: another suffix, or a place that cannot be written to.
+    Raises `ValueError`: another suffix, or a place that cannot be written to.
     """
     file, suffix = Path(path), _suffix(path)
     if suffix not in WRITERS:

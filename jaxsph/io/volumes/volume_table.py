@@ -43,8 +43,7 @@ class VolumeTable:
 
         Without a name it is the first array of one number, else the magnitude of the first.
 
-        Raises:
-            ValueError: there is no such array or component.
+        Raises `ValueError`: there is no such array or component.
         """
         if name is None:
             plain = [key for key, values in self.arrays.items() if values.ndim == 3]
@@ -75,8 +74,7 @@ def along_axes(
 ) -> VolumeTable:
     """A table of arrays whose index k moves by column k of `steps` from `origin`; axes are permuted and flipped into x, y, z.
 
-    Raises:
-        ValueError: steps that are not finite or that lie along no axis.
+    Raises `ValueError`: steps that are not finite or that lie along no axis.
     """
     steps, origin = np.asarray(steps, np.float64), np.asarray(origin, np.float64)
     if not (np.isfinite(steps).all() and np.isfinite(origin).all()):

@@ -60,8 +60,7 @@ class Records:
     def next(self, what: str, length: int | None = None) -> np.ndarray:
         """The bytes of the next record.
 
-        Raises:
-            ValueError: cut short, two lengths that differ, or another length than the one asked for.
+        Raises `ValueError`: cut short, two lengths that differ, or another length than the one asked for.
         """
         begin, more = self.at, True
         parts: list[np.ndarray] = []
@@ -102,8 +101,7 @@ class Records:
 def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
     """Read the living particles of one type (1 is gas), or the sinks (-1); by default gas, or the lowest other type there is.
 
-    Raises:
-        ValueError: damaged, cut short, without tags, without `h`, `hfact` or `massoftype`, or no such type.
+    Raises `ValueError`: damaged, cut short, without tags, without `h`, `hfact` or `massoftype`, or no such type.
     """
     with explained(path, SOURCE):
         content = np.fromfile(path, dtype=np.uint8)
