@@ -65,7 +65,7 @@ FORMATS = (
     Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom or points", (".hdf5", ".h5", ".hdf"), "hdf5",
            lambda start: start[:8] == b"\x89HDF\r\n\x1a\n", typed=True),
     Format("legacy VTK", (".vtk",), "vtk", lambda start: start.startswith(b"# vtk DataFile")),
-    Format("VTK XML", (".vtu", ".vtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
+    Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
     Format("Phantom dump", (), native.__name__, native.looks_like, typed=True),

@@ -1,4 +1,4 @@
-"""VTK XML point sets: unstructured grids (`.vtu`) and polydata (`.vtp`); points and point data, cells are not read.
+"""VTK XML point sets: unstructured grids (`.vtu`, `.pvtu` of several) and polydata; points and point data, cells are not read.
 
 Data may be ASCII, base64 or appended (raw or base64), plain or compressed by zlib or LZMA, of both byte orders, in any
 number of pieces. Point sets without a single cell are common among particle codes, and are read like others.
@@ -14,12 +14,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained
+from jaxsph.io.damage import DataError, explained, regular_file
 from jaxsph.io.parsing import DEFLATE_RATIO, INFLATING, LZMA_RATIO, UNLZMA, Decompressor, numbers, refuse_leftover, unpack_blocks
+from jaxsph.io.readers.hdf5_links import inside
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "VTK XML"
 DATASETS = ("UnstructuredGrid", "PolyData")
+PARALLEL = ("PUnstructuredGrid", "PPolyData")
+GHOST = "vtkGhostType"
 TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
@@ -38,8 +41,16 @@ def read(path: Path) -> ParticleTable:
     Raises `ValueError`: damaged, cut short, another type of data set, or a compressor that is not known.
     """
     with explained(path, SOURCE):
-        root, decoder = parsed(path, DATASETS, ".vtu, .vtp")
-        pieces = [_piece(piece, decoder) for piece in root.iter("Piece")]
+        files = [parsed(path, (*DATASETS, *PARALLEL), ".vtu, .vtp, .pvtu, .pvtp")]
+        if files[0][0].get("type") in PARALLEL:
+            names = [piece.get("Source", "") for piece in files[0][0].iter("Piece")]
+            folders = path.absolute().parent, path.resolve().parent
+            parts = {regular_file(inside(folders[0] / name, folders, f"has a piece in `{name}`")).resolve() for name in names}
+            if len(parts) < len(names):
+                raise DataError("has one of its pieces twice; write it again")
+            files = [parsed(folders[0] / name, DATASETS, ".vtu, .vtp") for name in names]
+        pieces = [_piece(piece, decoder) for root, decoder in files for piece in root.iter("Piece")]
+        words = dict.fromkeys(word for _, decoder in files for word in decoder.words)
         if not pieces:
             raise DataError("has no Piece, so it is cut short or damaged; copy it again")
         columns = {
@@ -49,8 +60,8 @@ def read(path: Path) -> ParticleTable:
         }
         partial = {name for _, columns in pieces for name in columns} - set(columns)
         said = [f"left out {', '.join(sorted(partial))}: not in every piece"] if partial else []
-        if decoder.words:
-            said.append(f"left out {', '.join(dict.fromkeys(decoder.words))}: not numbers")
+        if words:
+            said.append(f"left out {', '.join(words)}: not numbers")
         position = np.concatenate([position for position, _ in pieces])
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
 
@@ -85,7 +96,9 @@ def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, di
     position = np.zeros((0, 3)) if points is None else decoder.array(points, count, 3)
     if position is None or position.shape != (count, 3):
         raise DataError("has points that are not three numbers each; write it again")
-    return position, decoder.point_data(piece, count)
+    columns = decoder.point_data(piece, count)
+    shown = (columns.pop(GHOST)[:, 0] & 1) == 0 if GHOST in columns else np.ones(count, bool)  # others are in another piece
+    return position[shown], {name: column[shown] for name, column in columns.items()}
 
 
 class Decoder:

@@ -208,3 +208,42 @@ def test_text_behind_an_array_in_place_is_refused(tmp_path):
     (tmp_path / "a.vtu").write_bytes(whole[:place] + b"AAAA" + whole[place:])
     with pytest.raises(ValueError, match=r"a\.vtu: has 4 more characters than `a`"):
         io.read_table(tmp_path / "a.vtu")
+
+
+def parallel(folder, sources, extra=""):
+    pieces = "".join(f'<Piece Source="{source}"/>' for source in sources)
+    (folder / "all.pvtu").write_text(
+        f'<VTKFile type="PUnstructuredGrid" byte_order="LittleEndian"><PUnstructuredGrid>{pieces}</PUnstructuredGrid></VTKFile>'
+    )
+    return folder / "all.pvtu"
+
+
+def test_a_parallel_file_is_all_of_its_pieces_without_their_ghosts(samples, tmp_path):
+    for number in range(2):
+        samples.writers["ascii.vtu"](tmp_path / f"p_{number}.vtu", samples.particles(seed=number))
+    path = parallel(tmp_path, ["p_0.vtu", "p_1.vtu"])
+    table, each = io.read_table(path), [samples.particles(seed=number) for number in range(2)]
+    np.testing.assert_array_equal(table.position, np.concatenate([p.position for p in each]))
+    np.testing.assert_array_equal(table.columns["density"], np.concatenate([p.density for p in each]))
+    ghosts = '<DataArray type="UInt8" Name="vtkGhostType" format="ascii">0 1 0 0 1 8 0</DataArray></PointData>'
+    content = (tmp_path / "p_1.vtu").read_text()
+    (tmp_path / "p_1.vtu").write_text(content.replace("</PointData>", ghosts))
+    kept = np.concatenate([each[0].position, each[1].position[[0, 2, 3, 5, 6]]])
+    np.testing.assert_array_equal(io.read_table(path).position, kept)
+
+
+@pytest.mark.parametrize(
+    ("sources", "said"),
+    [
+        (["p.vtu", "./p.vtu"], "one of its pieces twice"),
+        (["../p.vtu"], "outside of the folder"),
+        (["gone.vtu"], "no regular file"),
+        ([], "no Piece"),
+    ],
+)
+def test_pieces_of_a_parallel_file_are_others_beside_it(sources, said, samples, tmp_path):
+    (tmp_path / "sub").mkdir()
+    for folder in (tmp_path, tmp_path / "sub"):
+        samples.writers["ascii.vtu"](folder / "p.vtu", samples.particles())
+    with pytest.raises(ValueError, match=rf"all\.pvtu: .*{said}"):
+        io.read_table(parallel(tmp_path / "sub", sources))
