@@ -143,7 +143,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
 def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> Any:
     """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
 
-    Within one, it is no call of its own.
+    A call of its own within one, too: inlined, what is transposed outside of a `jit` would be single operations, some 170.
     """
 
     def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
@@ -152,7 +152,7 @@ def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> A
         drawn = _drawn(scene, camera, settings, plan) if mesh is None else drawn_over_mesh(scene, camera, settings, plan, mesh)
         return traced_image_of(drawn, settings, plan)
 
-    return jax.jit(image, inline=True)
+    return jax.jit(image)
 
 
 def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
