@@ -197,7 +197,7 @@ def _in_medium(
 
     def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
         color = _interpolated(transfer.values, transfer.colors, quantities[0][..., i])
-        extinction = _interpolated(of_extinction, transfer.extinction[:, None], quantities[-1][..., i])[..., 0]
+        extinction = _interpolated(of_extinction, np.asarray(transfer.extinction)[:, None], quantities[-1][..., i])[..., 0]
         own = np.where(inside[..., i], extinction, 0) * (edges[i + 1] - edges[i]) * lengths
         return own, own[..., None] * color
 
