@@ -28,8 +28,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import product
-from jaxsph.numerics.extremes import lesser
+from jaxsph.numerics.checks import array_of, product
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.viewer.control_points import everywhere
 
@@ -65,7 +64,7 @@ def fewer(particles: Particles) -> Particles:
     kept = particles.at(np.sort(np.random.default_rng(0).permutation(entries)[:MOST]))
     support = product(kept.support, ratio ** (1 / 3))
     if particles.box is not None:
-        support = lesser(particles.support.max(), support)
+        support = array_of(np.minimum(np.asarray(particles.support).max(), support))
     return dataclasses.replace(kept, support=support, volume=product(kept.volume, np.asarray(ratio, kept.volume.dtype)))
 
 

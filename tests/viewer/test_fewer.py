@@ -34,7 +34,7 @@ def test_few_particles_are_left_as_they_are():
 def test_sums_of_fewer_particles_are_those_of_all_on_average():
     particles = uniform(8000)
     few = module.fewer(particles)
-    assert few.num_particles == 1000 and float(few.volume.sum()) == pytest.approx(1, rel=1e-5)
+    assert few.num_particles == 1000 and np.asarray(few.volume).sum() == pytest.approx(1, rel=1e-5)
     np.testing.assert_allclose(few.support, 0.6, rtol=1e-5)
     inside = np.abs(np.asarray(few.position) - 0.5).max(1) < 0.1
     assert np.asarray(few.position)[inside].mean() == pytest.approx(0.5, abs=0.05)
@@ -47,7 +47,7 @@ def test_sums_of_fewer_particles_are_those_of_all_on_average():
 
 def test_in_a_periodic_set_no_support_is_longer_than_it_was():
     particles = uniform(2000, box=(1.0, 1.0, 1.0))
-    assert float(module.fewer(particles).support.max()) == float(particles.support.max())
+    assert np.asarray(module.fewer(particles).support).max() == np.asarray(particles.support).max()
 
 
 def test_a_draft_says_how_many_particles_it_leaves_out_and_the_full_picture_has_all(monkeypatch):

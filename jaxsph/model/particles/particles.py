@@ -216,9 +216,9 @@ class Particles:
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
-        columns: dict[str, Any] = {name: column[entries] for name, column in (self.columns | {"valid": self.valid}).items()}
-        rest = None if self.position_rest is None else self.position_rest[entries]
-        return dataclasses.replace(self, **columns, position_rest=rest)
+        xp, given = module_for(self, entries), self.columns | {"valid": self.valid, "position_rest": self.position_rest}
+        columns = {name: None if column is None else array_of(xp.asarray(column)[entries]) for name, column in given.items()}
+        return dataclasses.replace(self, **columns)
 
     def centered(self, at: Any) -> Particles:
         """The same periodic set with the period moved such that a point is in its middle, and positions moved into it.
