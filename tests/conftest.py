@@ -116,7 +116,7 @@ class Adversary:
         if style == 1:
             quantity = 0.4 + 0.01 * quantity
         support = np.asarray(particles.support) * (4 if rng.uniform() < 0.5 else 1)
-        particles = dataclasses.replace(particles, quantity=jnp.asarray(quantity, dtype), support=jnp.asarray(support, dtype))
+        particles = dataclasses.replace(particles, quantity=quantity.astype(dtype), support=support.astype(dtype))
         values = np.sort(rng.uniform(0, 1, 5))
         if rng.uniform() < 0.3:
             values[3] = values[2]

@@ -8,13 +8,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
 from jaxsph.reference.where import integral_across, lines
+
+BLOCK = 4096  # places at which a function is asked at once: one program, whatever the number of rays
 
 
 class Chords(NamedTuple):
@@ -52,6 +53,7 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
     across, down = np.meshgrid(u, v)
     starts, directions = lines(across, down, camera.is_perspective)
     axes, center = np.asarray(camera.axes, np.float64), points.exact_position() - camera.exact_eye()
+    points = jax.tree.map(np.asarray, points)
     for point in np.flatnonzero(np.asarray(points.valid)):
         radius, middle = float(points.radius[point]), axes @ center[point]
         slant = np.linalg.norm(directions, axis=-1)
@@ -100,10 +102,14 @@ def kinks(profile: Profile) -> np.ndarray:
 def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.ndarray]) -> np.ndarray:
     """A profile at offsets (..., 3) in radii, along world axes, of points with the given attributes (of any shape up to ...)."""
     if isinstance(profile, Shaped):
+        given = (*np.moveaxis(offset, -1, 0), *(np.broadcast_to(value, offset.shape[:-1]) for value in attributes.values()))
+        found, function = np.empty(-(-given[0].size // BLOCK) * BLOCK), jax.jit(profile.function)
+        columns = [np.resize(column, found.size) for column in given]
         with jax.enable_x64(True):
-            given = {name: jnp.asarray(np.broadcast_to(value, offset.shape[:-1])) for name, value in attributes.items()}
-            x, y, z = (jnp.asarray(part) for part in np.moveaxis(offset, -1, 0))
-            return np.asarray(profile.function((x, y, z), given), np.float64)
+            for first in range(0, found.size, BLOCK):
+                x, y, z, *named = (column[first : first + BLOCK] for column in columns)
+                found[first : first + BLOCK] = function((x, y, z), dict(zip(attributes, named, strict=True)))
+        return found[: given[0].size].reshape(given[0].shape)
     distance = np.linalg.norm(offset, axis=-1)
     if isinstance(profile, Gaussian):
         return np.exp(-FALLOFF * distance**2)

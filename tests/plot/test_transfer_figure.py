@@ -30,7 +30,8 @@ def test_bars_are_shares_of_what_is_absorbed_in_the_colours_of_their_values():
     (seen,) = np.flatnonzero(heights)
     assert heights[seen] == pytest.approx(1)
     middle = bars[seen].get_x() + bars[seen].get_width() / 2
-    np.testing.assert_allclose(bars[seen].get_facecolor()[:3], LOOK(np.array([middle]))[0][0], atol=1e-3)
+    wanted = [np.interp(middle, np.asarray(LOOK.values), channel) for channel in np.asarray(LOOK.colors).T]
+    np.testing.assert_allclose(bars[seen].get_facecolor()[:3], wanted, atol=1e-3)
     assert bars[seen].get_x() <= 3 <= bars[seen].get_x() + bars[seen].get_width()
 
 

@@ -35,6 +35,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.macrocells import MACROCELL, Occupancy
 from jaxsph.engine.runtime.tuning import MEMORY
 from jaxsph.model.particles.particles import capacity_class
+from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.trees import tree
 
 INNER = -1  # the length of a node that is split
@@ -164,8 +165,8 @@ def build_octree(
             break
         num_nodes, num_entries, level = num_nodes + len(count), num_entries + len(entries[-1]), below
     before = np.pad(occupied, ((1, 0),) * 3).cumsum(0).cumsum(1).cumsum(2)
-    parts = _padded(nodes), _padded(entries), Occupancy(jnp.asarray(before, jnp.int32))
-    return Octree(jnp.asarray(lower), jnp.asarray(side), *parts, top, level.depth)
+    parts = _padded(nodes), _padded(entries), Occupancy(array_of(before, np.int32))
+    return Octree(array_of(lower), array_of(side), *parts, top, level.depth)
 
 
 def _placed(centre: np.ndarray, radius: np.ndarray, live: np.ndarray) -> tuple[Spheres, np.ndarray, np.ndarray]:
@@ -229,4 +230,4 @@ def _padded(parts: list[np.ndarray]) -> Int[Array, "rows ..."]:
     """One after the other, as int32, with room for those of similar sets, so that programs are shared."""
     rows = np.concatenate(parts)
     missing = capacity_class(len(rows)) - len(rows)
-    return jnp.asarray(np.pad(rows, [(0, missing)] + [(0, 0)] * (rows.ndim - 1)), jnp.int32)
+    return array_of(np.pad(rows, [(0, missing)] + [(0, 0)] * (rows.ndim - 1)), np.int32)

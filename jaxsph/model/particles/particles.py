@@ -207,7 +207,7 @@ class Particles:
         xp = module_for(self)
 
         def longer(column: Any, **how: Any) -> Array:
-            return jnp.asarray(padded_to(xp.asarray(column), capacity, xp=xp, **how))
+            return array_of(padded_to(xp.asarray(column), capacity, xp=xp, **how))
 
         columns: dict[str, Any] = {name: longer(column, **_padding(name)) for name, column in self.columns.items()}
         valid = longer(self.valid, nothing=False, repeat=False)

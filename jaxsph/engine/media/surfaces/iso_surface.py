@@ -26,7 +26,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import is_traced, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
 
@@ -86,7 +86,7 @@ class IsoSurface(Medium):
                 if name != "level":
                     require_positive(name, value, "it lies in [0, 1]", strict=False)
                     require_positive(f"1 - {name}", 1 - np.asarray(value, np.float64), f"{name} lies in [0, 1]", strict=False)
-        packed: dict[str, Any] = {name: jnp.asarray(value, volume.dtype) for name, (value, _) in given.items()}
+        packed: dict[str, Any] = {name: array_of(value, volume.dtype) for name, (value, _) in given.items()}
         return cls(volume, **packed)
 
     def seen_by(self, camera: Camera) -> IsoSurface:
