@@ -1,11 +1,12 @@
 """Column integrals of kernels against quadrature of the kernels themselves."""
 
+import functools
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +16,20 @@ from jaxsph.model.particles import kernels
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
+
+
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def found_at(square):
+    """Of all kernels, whole columns and those between ends beyond them."""
+    return {name: (columns.whole_column(name, square), columns.column_between(name, square, -2.0, 2.0)) for name in NAMES}
+
+
+@functools.partial(jax.jit, compiler_options=QUICKLY)
+def slopes_at(b, start, end):
+    """Of whole columns by the distance, and of those between ends by both ends."""
+    whole = {name: jax.grad(lambda b, name=name: columns.whole_column(name, b * b))(b) for name in NAMES}
+    between = {name: functools.partial(columns.column_between, name) for name in NAMES}
+    return whole, {name: jax.grad(function, (1, 2))(b * b, start, end) for name, function in between.items()}
 
 
 def quadrature(name, b, start, end):
@@ -53,9 +68,9 @@ def test_integrals_are_those_of_the_kernel_to_1e_10(name, b, ends):
 def test_single_precision_is_good_to_1e_5_of_the_peak_and_never_negative(name):
     square = np.linspace(0, 1.05, 4001, dtype=np.float32) ** 2
     truth = columns.whole_column(name, square.astype(np.float64), np)
-    for found in (columns.whole_column(name, jnp.asarray(square)), columns.column_between(name, jnp.asarray(square), -2.0, 2.0)):
+    for found in map(np.asarray, found_at(square)[name]):
         assert np.abs(found - truth).max() <= 1e-5 * truth.max()
-        assert np.min(found) >= 0 and (np.asarray(found)[square >= 1] == 0).all()
+        assert found.min() >= 0 and (found[square >= 1] == 0).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -73,12 +88,10 @@ def test_the_column_has_unit_integral_over_the_plane_and_so_have_all_depths(name
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_are_finite_and_those_of_differences(name, x64):
     for b in (0.0, 0.2, 0.5, 0.9, 1.0, 1.1):
-        slope = jax.grad(lambda b: columns.whole_column(name, b * b))(b)
+        slope = float(slopes_at(b, -0.2, 0.4)[0][name])
         step = 1e-6
         ends = (columns.whole_column(name, np.float64(b + side) ** 2, np) for side in (step, -step))
         assert abs(slope - (next(ends) - next(ends)) / (2 * step)) < 1e-5
     for b in (0.0, 0.3, 0.7):
-        for wanted in (1, 2):
-            found = jax.grad(lambda *at: columns.column_between(name, *at), wanted)(b * b, -0.2, 0.4)
-            at, sign = ((-0.2, -1), (0.4, 1))[wanted - 1]
+        for found, at, sign in zip(map(float, slopes_at(b, -0.2, 0.4)[1][name]), (-0.2, 0.4), (-1, 1), strict=True):
             assert abs(found - sign * kernels.by_name(name).norm * kernels.by_name(name).of_square(b * b + at * at, np)) < 1e-9

@@ -69,8 +69,7 @@ def particles():
 
 def shaped(offset, attributes):
     x, y, z = offset
-    exp = np.exp if isinstance(x, np.ndarray) else jnp.exp  # of the reference, and of programs
-    return exp(-4 * (x * x + 4 * y * y + z * z)) * attributes["brightness"]
+    return jnp.exp(-4 * (x * x + 4 * y * y + z * z)) * attributes["brightness"]
 
 
 def off(image, truth):
@@ -122,13 +121,14 @@ def test_an_eye_among_points_sees_them_from_inside():
 def test_points_that_touch_only_the_ends_of_rays_are_met():
     """They lie before the first sample and behind the last one, within the intervals that those stand for."""
     view = js.Camera.look_at((0, 0, 0), (0, 0, 1), width=WIDTH, height=HEIGHT, near=1.0, far=3.0)
-    rays = [view.axes.T @ jnp.stack([view.column(x + 0.5), view.row(y + 0.5), 1.0]) for x, y in ((10, 9), (4, 5))]
-    first, last = (float(view.depth(jnp.float32(nth), 24)) for nth in (0.5, 23.5))
+    told = jax.tree.map(np.asarray, view)
+    rays = [told.axes.T @ np.stack([told.column(x + 0.5), told.row(y + 0.5), 1.0]) for x, y in ((10, 9), (4, 5))]
+    first, last = 3.0 ** (np.array([0.5, 23.5]) / 24)
     assert first > 1 + 2 * 0.008 and last < 3 - 2 * 0.03
     ends = points(np.stack([1.008 * rays[0], 2.97 * rays[1]]), [0.008, 0.03], COLOR[:2], [100.0, 30.0])
     assert_is_reference(js.Scene(points=ends), view)
-    alpha = shown(js.Scene(points=ends), view).alpha
-    assert float(alpha[9, 10]) > 0.3 and float(alpha[5, 4]) > 0.3
+    left = np.asarray(shown(js.Scene(points=ends), view).transmittance)
+    assert left[9, 10] < 0.7 and left[5, 4] < 0.7
 
 
 @pytest.mark.slow
@@ -184,9 +184,9 @@ def test_to_swap_two_layers_in_depth_is_seen_and_no_pasting_of_their_images_show
 def test_what_is_mixed_within_a_fog_is_no_pasting_of_any_order():
     everywhere = fog((-2, -2, -2), 0.8, 1.0)
     given = {**everywhere, "points": points()}, {"points": points()}, everywhere
-    together, alone, gas = (shown(js.Scene(**parts)) for parts in given)
+    together, alone, gas = (jax.tree.map(np.asarray, shown(js.Scene(**parts))) for parts in given)
     for one, other in ((gas, alone), (alone, gas)):
-        assert float(jnp.abs(one.color + one.transmittance[..., None] * other.color - together.color).max()) > 0.1
+        assert np.abs(one.color + one.transmittance[..., None] * other.color - together.color).max() > 0.1
 
 
 @pytest.mark.parametrize("mix", MIXES)
@@ -238,9 +238,11 @@ def test_a_tolerance_is_refused_by_name_and_so_are_steps_of_any_length_under_a_t
 @pytest.mark.parametrize("name", ["position", "radius", "color", "extinction"])
 def test_numbers_that_mean_nothing_are_a_fault_under_jit(name):
     scene = js.Scene(points=points())
-    broken = dataclasses.replace(scene.points, **{name: getattr(scene.points, name).at[3].set(jnp.nan)})
+    values = np.array(getattr(scene.points, name))
+    values[3] = np.nan
+    broken = dataclasses.replace(scene.points, **{name: values})
     image = traced(dataclasses.replace(scene, points=broken))
-    assert "a point has" in faults.describe(int(image.faults)) and bool(jnp.isfinite(image.color).all())
+    assert "a point has" in faults.describe(int(image.faults)) and np.isfinite(image.color).all()
     with pytest.raises(ValueError, match="a point has"):
         shown(dataclasses.replace(scene, points=broken))
 
