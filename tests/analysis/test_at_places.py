@@ -1,19 +1,19 @@
 """What particles are at places is the sums of their definition, in periods and out of every support, too."""
 
+import formulas
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.analysis import at_places
 from jaxsph.analysis.at_places import ParticleField
-from jaxsph.model.particles import kernels
 
 
 def sums(places, position, particles):
     """By definition: coverage, quantity and how many, of all pairs; positions as given."""
     support, volume, quantity = (particles.to_numpy()[name].astype(np.float64) for name in ("support", "volume", "quantity"))
     distance = np.linalg.norm(places[:, None] - position[None], axis=-1)
-    weight = volume * np.asarray(kernels.evaluate(particles.kernel, distance, support[None]))
+    weight = volume / support**3 * formulas.KERNELS[particles.kernel](distance / support)
     return weight.sum(1), (weight * quantity).sum(1), (distance < support).sum(1)
 
 

@@ -25,7 +25,7 @@ def test_the_order_of_particles_changes_a_pixel_by_rounding_alone(frames):
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
     for seed in range(4):
         order = np.random.default_rng(seed).permutation(frames.capacity)
-        shuffled = dataclasses.replace(scene, particles=jax.tree.map(lambda leaf: leaf[order], scene.particles))  # noqa: B023
+        shuffled = dataclasses.replace(scene, particles=scene.particles.at(order))
         other = js.render(shuffled, camera, frames.settings, plan=frames.plan())
         assert np.abs(layers(other) - layers(image)).max() <= 4 * EPS
 
@@ -36,20 +36,21 @@ def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(fram
     extreme = Extreme(length=length, decades=4.3, volume="equal")
     scene, camera = extreme.scene(frames), extreme.camera(frames)
     transfer = scene.transfer
+    values, colors, extinction = map(np.asarray, (transfer.values, transfer.colors, transfer.extinction))
     for i in (0, 2, 4):
-        quantity = jnp.full_like(scene.particles.quantity, transfer.values[i])
+        quantity = np.full_like(scene.particles.quantity, values[i])
         constant = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
         flat = dataclasses.replace(
             transfer,
-            colors=jnp.broadcast_to(transfer.colors[i], (5, 3)),
-            extinction=jnp.broadcast_to(transfer.extinction[i], (5,)),
+            colors=np.broadcast_to(colors[i], (5, 3)),
+            extinction=np.broadcast_to(extinction[i], (5,)),
         )
         image, same = (
             js.render(s, camera, frames.settings, plan=frames.plan())
             for s in (constant, dataclasses.replace(scene, transfer=flat))
         )
         assert np.array_equal(image.color, same.color) and np.array_equal(image.transmittance, same.transmittance)
-        alpha, color = 1 - np.asarray(image.transmittance, np.float64), np.asarray(transfer.colors[i], np.float64)
+        alpha, color = 1 - np.asarray(image.transmittance, np.float64), colors[i].astype(np.float64)
         assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
 
 

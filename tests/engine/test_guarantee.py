@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -41,7 +42,8 @@ def error_of(image, truth):
 def wide(scene, factor, spread):
     """Particles that fill the view: cells that are covered, and vary little, so that something can be saved."""
     particles = scene.particles
-    particles = dataclasses.replace(particles, support=particles.support * factor, quantity=0.3 + spread * particles.quantity)
+    moved = {"support": np.asarray(particles.support) * factor, "quantity": 0.3 + spread * np.asarray(particles.quantity)}
+    particles = dataclasses.replace(particles, **{name: np.float32(part) for name, part in moved.items()})
     return dataclasses.replace(scene, particles=particles)
 
 
@@ -106,7 +108,7 @@ STEEP = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 
 
 def in_view(camera, across, down, depth):
     """World positions of places in view space, lengths across and down as shares of the image's height."""
-    high = camera.half_height * (depth if camera.is_perspective else 1)
+    high = np.asarray(camera.half_height) * (depth if camera.is_perspective else 1)
     return np.stack([2 * across * high, 2 * down * high, depth], -1) @ np.asarray(camera.axes) + np.asarray(camera.eye)
 
 
@@ -120,7 +122,7 @@ def behind_a_wall(frames, kernel, projection, dtype):
     quantity = np.append(1.0, rng.uniform(0, 0.7, count - 1))
     columns = in_view(camera, across, down, depth), support, quantity, support**3
     particles = js.Particles.from_arrays(*(column.astype(dtype) for column in columns), kernel)
-    return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: leaf.astype(dtype), STEEP)), camera
+    return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), STEEP)), camera
 
 
 def half_constant(frames, kernel, projection, dtype):
@@ -133,7 +135,7 @@ def half_constant(frames, kernel, projection, dtype):
     quantity = np.append(0.3, rng.uniform(0, 0.7, count - 1))
     columns = in_view(camera, across, down, depth), support, quantity, support**3
     particles = js.Particles.from_arrays(*(column.astype(dtype) for column in columns), kernel)
-    return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: leaf.astype(dtype), STEEP)), camera
+    return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), STEEP)), camera
 
 
 @pytest.mark.slow
@@ -183,7 +185,7 @@ def test_a_constant_quantity_costs_nothing_inside_and_errs_by_rounding_only(fram
     rng, frames = np.random.default_rng(5), frames.deep(4)
     scene, camera = frames.scene(rng), frames.camera(rng, projection)
     particles = scene.particles
-    constant, support = jnp.full_like(particles.quantity, 0.61), jnp.full_like(particles.support, 2)
+    constant, support = np.full_like(particles.quantity, 0.61), np.full_like(particles.support, 2)
     particles = dataclasses.replace(particles, quantity=constant, support=support)
     scene = dataclasses.replace(scene, particles=particles)
     truth = js.render(scene, camera, frames.settings, plan=frames.plan())
@@ -215,12 +217,12 @@ def test_levels_say_what_each_cell_was_given_in_its_place(frames):
 def quantities_in_cells(scene, camera, samples):
     """Least and greatest quantity among the particles that weigh at any sample of a cell, (cells, rows, columns)."""
     s = js.reference.sample_depths(camera, samples)
-    u, v = (np.asarray(f(np.arange(n) + 0.5)) for f, n in ((camera.column, camera.width), (camera.row, camera.height)))
+    u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     spread = s if camera.is_perspective else np.ones_like(s)
     found = np.full((2, -(-samples // 16), -(-camera.height // 8), -(-camera.width // 8)), [[[[np.inf]]], [[[-np.inf]]]])
     particles = scene.particles
     for place, support, quantity in zip(
-        np.asarray(camera.to_view(particles.position)), np.asarray(particles.support), np.asarray(particles.quantity), strict=True
+        to_view(particles.exact_position(), camera), np.asarray(particles.support), np.asarray(particles.quantity), strict=True
     ):
         away = (spread * u[:, None] - place[0]) ** 2 + (spread * v[:, None, None] - place[1]) ** 2 + (s - place[2]) ** 2
         for row, column, k in zip(*np.nonzero(away < support**2), strict=True):

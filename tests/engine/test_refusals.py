@@ -54,7 +54,7 @@ def test_a_particle_too_small_for_a_narrow_view_is_refused_and_from_nearby_it_is
     nearby = js.Camera.look_at(target - 3e-6 * FORWARD, target, **size, near=1.9e-6, far=4.1e-6)
     image = js.render(scene, nearby, frames.settings, plan=frames.plan())
     error, allowed = error_and_allowance(image, scene, nearby, frames.settings)
-    assert (error <= allowed).all() and float(image.alpha.max()) > 0.1
+    assert (error <= allowed).all() and np.asarray(image.transmittance).min() < 0.9
 
 
 SPOILT = {
@@ -73,6 +73,13 @@ SPOILT = {
 }
 
 
+def spoilt(numbers, value):
+    """With the first number replaced."""
+    found = np.array(numbers)
+    found[(0,) * found.ndim] = value
+    return found
+
+
 @pytest.fixture(scope="module")
 def jitted(frames):
     return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
@@ -82,24 +89,23 @@ def test_nan_under_jit_is_a_fault_and_no_image_of_nan(frames, jitted):
     for field, (part, value, bit) in SPOILT.items():
         scene, camera = Extreme().scene(frames), Extreme().camera(frames)
         owner = camera if part == "camera" else getattr(scene, part)
-        whole = getattr(owner, field)
-        owner = dataclasses.replace(owner, **{field: whole.at[(0,) * whole.ndim].set(value)})
+        owner = dataclasses.replace(owner, **{field: spoilt(getattr(owner, field), value)})
         scene, camera = (scene, owner) if part == "camera" else (dataclasses.replace(scene, **{part: owner}), camera)
         image = jitted(scene, camera)
         assert int(image.faults) & bit, field
         assert np.isfinite(image.color).all() and np.isfinite(image.transmittance).all(), field
         if part != "particles":  # nothing of the image means anything, so there is none
-            assert not np.any(image.color) and np.all(image.transmittance == 1), field
-            assert np.all(np.isinf(image.depth)) and np.all(image.error_bound == 1), field
+            assert not np.asarray(image.color).any() and np.all(np.asarray(image.transmittance) == 1), field
+            assert np.all(np.isinf(image.depth)) and np.all(np.asarray(image.error_bound) == 1), field
 
 
 def test_what_cannot_be_held_apart_is_a_fault_under_jit(frames, jitted):
     scene, camera = Extreme().scene(frames), Extreme().camera(frames)
     assert int(jitted(scene, camera).faults) == 0
-    assert int(jitted(scene, dataclasses.replace(camera, far=camera.near * np.float32(1.00001))).faults) & faults.UNRESOLVED
-    tiny = dataclasses.replace(scene.transfer, values=scene.transfer.values * np.float32(1e-37))
+    assert int(jitted(scene, dataclasses.replace(camera, far=np.asarray(camera.near) * np.float32(1.00001))).faults) & faults.UNRESOLVED
+    tiny = dataclasses.replace(scene.transfer, values=np.asarray(scene.transfer.values) * np.float32(1e-37))
     assert int(jitted(dataclasses.replace(scene, transfer=tiny), camera).faults) & faults.BAD_TRANSFER
     for change in ({"volume": np.float32(1e-37)}, {"support": np.float32(1e-12)}):
         field, value = next(iter(change.items()))
-        weak = dataclasses.replace(scene.particles, **{field: getattr(scene.particles, field).at[0].set(value)})
+        weak = dataclasses.replace(scene.particles, **{field: spoilt(getattr(scene.particles, field), value)})
         assert int(jitted(dataclasses.replace(scene, particles=weak), camera).faults) & faults.WEAK_PARTICLES

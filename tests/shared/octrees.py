@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from examples import examples
@@ -41,8 +40,8 @@ def built(centre, radius, live=None, **how):
     """A deep tree of few spheres, with room for any, such that looking it up is compiled a few times."""
     live = np.ones(len(radius), bool) if live is None else live
     tree = build_octree(centre, radius, live, **({"most": 2, "max_level": 4} | how))
-    node = jnp.asarray(np.pad(np.asarray(tree.node), ((0, NODES - len(tree.node)), (0, 0))))
-    return dataclasses.replace(tree, node=node, entry=jnp.asarray(np.pad(np.asarray(tree.entry), (0, ENTRIES - len(tree.entry)))))
+    node = np.pad(np.asarray(tree.node), ((0, NODES - len(tree.node)), (0, 0)))
+    return dataclasses.replace(tree, node=node, entry=np.pad(np.asarray(tree.entry), (0, ENTRIES - len(tree.entry))))
 
 
 def members(tree, begin, length):

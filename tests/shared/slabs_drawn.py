@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.engine.access.ordering import Ordered
@@ -24,17 +23,15 @@ def drawn(rng, form):
     where = {"x": x, "y": y, "z": rng.uniform(NEAR, FAR, PARTICLES), "scale": scale, "size": scale * support}
     columns = where | {"quantity": rng.uniform(0, 1, PARTICLES)}
     unread = dict.fromkeys(field.name for field in dataclasses.fields(Ordered))
-    ordered = Ordered(**unread | {name: jnp.asarray(value) for name, value in columns.items()})
+    ordered = Ordered(**unread | columns)
     begin = np.stack([np.zeros(TASKS), rng.integers(10, 20, TASKS)]).astype(np.int32)
     length = np.stack([rng.integers(0, 10, TASKS), rng.integers(0, 10, TASKS)]).astype(np.int32)
     reference = rng.uniform(0, 1, TASKS)
-    zero = jnp.asarray(np.zeros(TASKS, np.int32))
-    given = jnp.asarray(begin), jnp.asarray(length), jnp.asarray(length.sum(0)), (jnp.asarray(reference),)
-    entry = SlabSchedule(jnp.asarray(np.ones(TASKS, bool)), zero, *given)
+    zero = np.zeros(TASKS, np.int32)
+    entry = SlabSchedule(np.ones(TASKS, bool), zero, begin, length, length.sum(0), (reference,))
     first = rng.uniform(NEAR, FAR, (TASKS, 1))
     depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
     count = COLUMNS if form != "scattered" else ROWS
     u, v = rng.uniform(-0.4, 0.4, (TASKS, count)), rng.uniform(-0.4, 0.4, (TASKS, ROWS))
-    placed = (jnp.asarray(value) for value in (u, v, depth, depth))
-    task = SlabTask(entry, zero, zero, *placed, form != "orthographic", form == "scattered", between=True)
-    return ordered, jnp.asarray(rng.permutation(PARTICLES).astype(np.int32)), task
+    task = SlabTask(entry, zero, zero, u, v, depth, depth, form != "orthographic", form == "scattered", between=True)
+    return ordered, rng.permutation(PARTICLES).astype(np.int32), task
