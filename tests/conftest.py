@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 
 import hypothesis
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY

@@ -52,7 +52,7 @@ def project(
     views, (across, down) = to_view(particles.exact_position(), camera), np.meshgrid(u, v)
     rays = lines(across, down, camera.is_perspective)
     for i in np.flatnonzero(np.asarray(particles.valid)):
-        column = _column(particles.kernel, views[i], float(particles.support[i]), *rays, (near, far))
+        column = _column(particles.kernel, views[i], float(np.asarray(particles.support)[i]), *rays, (near, far))
         sums += column[..., None] * amounts[i]
     parts = sums.reshape(camera.height, number, camera.width, number, -1)
     means: Any = np.einsum("isjtk,s,t->ijk", parts, shares / 2, shares / 2)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
@@ -18,6 +19,7 @@ from jaxsph.engine.lengths import scaled, scaled_camera
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.numerics import faults
+from jaxsph.numerics.checks import array_of
 
 NAMES = sorted(kernels.KERNELS)
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -72,7 +74,7 @@ def test_parts_of_rays_are_those_of_the_oracle_and_add_up(projection):
     np.testing.assert_allclose(part.values, truth, atol=3e-5 * truth.max())
     whole = project(particles, camera, pixel="ray", depth_range=(0.1, 9.0)).values
     others = [project(particles, camera, pixel="ray", depth_range=ends).values for ends in ((0.1, 1.9), (3.1, 9.0))]
-    np.testing.assert_allclose(part.values + others[0] + others[1], whole, atol=3e-5 * truth.max())
+    np.testing.assert_allclose(np.sum([part.values, *others], 0), whole, atol=3e-5 * truth.max())
 
 
 @pytest.mark.parametrize(("projection", "near"), [("orthographic", 0.5), ("orthographic", 2.4), ("perspective", 2.4)])
@@ -84,7 +86,7 @@ def test_means_over_pixels_are_those_of_the_oracle(projection, near):
 
 def test_means_of_small_supports_are_those_of_the_oracle_where_rays_hardly_spread():
     particles = particles_of(3, count=20, decades=0.1)
-    particles = dataclasses.replace(particles, support=0.4 * particles.support)
+    particles = dataclasses.replace(particles, support=array_of(0.4 * np.asarray(particles.support)))
     camera = js.Camera.look_at((10, 7, 29), (0.05, 0, 0), fov_degrees=6.5, near=25, far=40, **SIZE)
     truth = js.reference.project(particles, camera, subrays=24).values
     np.testing.assert_allclose(project(particles, camera).values, truth, atol=3e-3 * truth.max())
@@ -245,13 +247,14 @@ def test_gradients_are_those_of_differences(pixel, projection, x64):
     def looked(inputs, moves):
         return *jax.jvp(loss, inputs, moves), jax.grad(loss, argnums=(0, 1, 2, 3, 4))(*inputs)
 
-    inputs = particles.position, particles.support, jnp.linspace(1.0, 2.0, CAPACITY), camera.eye, camera.far
+    inputs = tuple(map(np.asarray, (particles.position, particles.support, np.linspace(1, 2, CAPACITY), camera.eye, camera.far)))
     rng = np.random.default_rng(1)
-    moves = tuple(jnp.asarray(rng.normal(size=np.shape(value))) for value in inputs)
-    _, forward, pulled = looked(inputs, moves)
+    moves = tuple(np.asarray(rng.normal(size=np.shape(value))) for value in inputs)
+    _, forward, pulled = jax.tree.map(np.asarray, looked(inputs, moves))
     step = 1e-5
     ends = [
-        looked(tuple(value + side * step * move for value, move in zip(inputs, moves, strict=True)), moves)[0] for side in (1, -1)
+        float(looked(tuple(value + side * step * move for value, move in zip(inputs, moves, strict=True)), moves)[0])
+        for side in (1, -1)
     ]
     wanted = (ends[0] - ends[1]) / (2 * step)
     backward = sum((cotangent * move).sum() for cotangent, move in zip(pulled, moves, strict=True))
@@ -267,8 +270,7 @@ def test_one_program_serves_moved_particles_and_many_at_once():
         moved = dataclasses.replace(particles, position=particles.position + shift)
         return js.project(moved, camera, plan=plan).values
 
-    shifts = jnp.asarray([0.0, 0.02])
-    together = jax.jit(jax.vmap(shifted))(shifts)
+    together = np.asarray(jax.jit(jax.vmap(shifted))(np.float32([0, 0.02])))
     np.testing.assert_allclose(together[0], js.project(particles, camera).values, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
 
@@ -310,7 +312,7 @@ def test_bad_input_is_refused_by_name(given, said):
 
 def test_bad_particles_and_missing_plans_are_refused():
     particles, camera = particles_of(), camera_of()
-    broken = dataclasses.replace(particles, position=particles.position.at[3, 1].set(jnp.nan))
+    broken = spoilt(particles, "position", np.nan, (3, 1))
     with pytest.raises(ValueError, match="not finite"):
         js.project(broken, camera)
     with pytest.raises(ValueError, match="plan_projection"):

@@ -108,7 +108,7 @@ def test_a_picture_has_the_colours_of_the_values_and_black_elsewhere():
     ("normal", "right", "up"), [((0, 0, 1), "x", "y"), ((1, 0, 0), "y", "z"), ((0, -1, 0), "x", "z"), ((0, 0, 3), "x", "y")]
 )
 def test_a_slice_along_axes_has_them_to_the_right_and_upwards(normal, right, up):
-    rise = {axis: np.diff(js.slice(particles_of(), js.Plane((0.5, 0.6, 0.4), normal), width=3, height=3).positions(), axis=k)
+    rise = {axis: np.diff(js.slice(particles_of(), js.Plane((0.5, 0.6, 0.4), normal), **SIZE).positions(), axis=k)
             for k, axis in ((1, "right"), (0, "up"))}  # fmt: skip
     assert (rise["right"][..., "xyz".index(right)] > 0).all() and (rise["up"][..., "xyz".index(up)] < 0).all()
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import nnls
 
 import jaxsph as js
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -24,16 +25,15 @@ def placed(frames, camera, rng, decades):
         rng.uniform(-1, 1, (2, frames.capacity)),
     )
     place = np.stack([*reach, depth], 1) @ np.asarray(camera.axes) + np.asarray(camera.eye)
-    particles = js.Particles.from_arrays(place.astype(np.float32), support, scene.particles.quantity)
+    particles = js.Particles.from_arrays(place.astype(np.float32), support, np.asarray(scene.particles.quantity))
     return dataclasses.replace(scene, particles=particles)
 
 
 def seen_by_bundles(scene, camera):
     """Whether a sphere meets the pyramid of a bundle, and some of its columns and rows of rays: (particles, rows, columns)."""
-    view = np.asarray(camera.to_view(scene.particles.position), np.float64)
+    view = to_view(scene.particles.exact_position(), camera)
     support = np.asarray(scene.particles.support, np.float64)
-    u = np.asarray(camera.column(np.arange(camera.width) + 0.5), np.float64)
-    v = np.asarray(camera.row(np.arange(camera.height) + 0.5), np.float64)
+    u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
 
     def off(place, rays):
         """Distance to each of the planes of rays."""
@@ -45,8 +45,7 @@ def seen_by_bundles(scene, camera):
     for row, column in np.ndindex(found.shape[1:]):
         across, down = slice(8 * column, 8 * column + 8), slice(8 * row, 8 * row + 8)
         # a bundle has eight rays each way, those beyond the image too
-        ends = [camera.column(8 * column + k) for k in (0.5, 7.5)], [camera.row(8 * row + k) for k in (0.5, 7.5)]
-        ends = [[float(end) for end in pair] for pair in ends]
+        ends = ray_coordinates(camera, 8 * column + np.array([0.5, 7.5]), 8 * row + np.array([0.5, 7.5]))
         for k, place in enumerate(view):
             inside = columns[k, across].any() and rows[k, down].any()
             found[k, row, column] = inside and distance(place, *ends, camera.is_perspective) <= support[k]
@@ -63,7 +62,7 @@ def distance(place, across, down, perspective):
 
 def near_slabs(scene, camera, depths, num_classes):
     """Whether a particle of a class can touch a slab as far as the widest of the class reaches: (particles, slabs)."""
-    z = np.asarray(camera.to_view(scene.particles.position), np.float64)[:, 2]
+    z = to_view(scene.particles.exact_position(), camera)[:, 2]
     support = np.asarray(scene.particles.support, np.float64)
     octave = np.minimum(np.floor(np.log2(support.max() / support)), num_classes - 1)
     widest = np.array([support[octave == own].max() for own in octave])[:, None]

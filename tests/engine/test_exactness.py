@@ -3,8 +3,6 @@
 import dataclasses
 import itertools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from extreme import EPS, Extreme, layers

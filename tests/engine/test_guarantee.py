@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.numerics.checks import array_of
 from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -43,7 +44,7 @@ def wide(scene, factor, spread):
     """Particles that fill the view: cells that are covered, and vary little, so that something can be saved."""
     particles = scene.particles
     moved = {"support": np.asarray(particles.support) * factor, "quantity": 0.3 + spread * np.asarray(particles.quantity)}
-    particles = dataclasses.replace(particles, **{name: np.float32(part) for name, part in moved.items()})
+    particles = dataclasses.replace(particles, **{name: array_of(part) for name, part in moved.items()})
     return dataclasses.replace(scene, particles=particles)
 
 

@@ -34,7 +34,7 @@ def same(image, other, digits):
 def test_a_frame_in_any_unit_of_length_is_the_same_bit_for_bit(frames, projection):
     scene, camera = frame(frames, projection=projection)
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
-    assert float(image.alpha.max()) > 0.5 and np.isfinite(image.depth).any()
+    assert np.asarray(image.transmittance).min() < 0.5 and np.isfinite(image.depth).any()
     for digits in DIGITS:
         moved, seen = scaled(scene, digits), scaled_camera(camera, digits)
         of_unit = js.render(moved, seen, frames.settings, plan=frames.plan())
@@ -48,15 +48,13 @@ def test_frames_of_lengths_beyond_those_of_float32_are_right(frames, length):
     scene, camera = frame(frames, length=length)
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
     error, allowed = error_and_allowance(image, scene, camera, frames.settings)
-    assert (error <= allowed).all() and float(image.alpha.max()) > 0.5
+    assert (error <= allowed).all() and np.asarray(image.transmittance).min() < 0.5
 
 
 def test_a_plan_of_such_a_frame_is_that_of_the_frame_in_another_unit(frames):
     scene, camera = frame(frames)
     moved, seen = scaled(scene, 80), scaled_camera(camera, 80)
-    made = js.plan(moved, seen, frames.settings)
-    assert made == js.plan(scene, camera, frames.settings)
-    same(js.render(moved, seen, frames.settings, plan=made), js.render(scene, camera, frames.settings, plan=made), 80)
+    assert js.plan(moved, seen, frames.settings) == js.plan(scene, camera, frames.settings)
 
 
 def test_comfortable_frames_are_left_alone(frames):

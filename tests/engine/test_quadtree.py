@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, filled, towards, weights
@@ -14,6 +13,7 @@ import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.engine.screen.quadtree import QuadtreePlan
+from jaxsph.numerics.checks import array_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -56,7 +56,7 @@ def agree(image, truth):
 def cloud(frames, rng, supports=5.0, extinction=0.4):
     """A smooth scene: all supports reach beyond what is seen, and colours are linear in the quantity."""
     scene = frames.scene(rng)
-    particles = dataclasses.replace(scene.particles, support=jnp.full(frames.capacity, supports, jnp.float32))
+    particles = dataclasses.replace(scene.particles, support=array_of(np.full(frames.capacity, supports), np.float32))
     points = np.linspace(0, 1, 5)
     colors = np.stack([points, 0.5 + 0 * points, 1 - points], 1)
     transfer = js.TransferFunction.from_points(points, colors, np.full(5, extinction))
@@ -66,8 +66,8 @@ def cloud(frames, rng, supports=5.0, extinction=0.4):
 def specks(frames, rng, camera, pixels=0.8):
     """As many particles as there is room for, each seen through a few pixels at most; far from each other in most cases."""
     scene, height = frames.scene(rng), 2 * float(camera.half_height) * 3 / frames.height
-    support = jnp.full(frames.capacity, pixels * height, jnp.float32).at[8:].set(1e-3 * height)
-    transfer = dataclasses.replace(scene.transfer, extinction=jnp.full(5, 1e3, jnp.float32))
+    support = array_of(np.where(np.arange(frames.capacity) < 8, pixels * height, 1e-3 * height), np.float32)
+    transfer = dataclasses.replace(scene.transfer, extinction=np.full(5, 1e3, np.float32))
     return js.Scene(dataclasses.replace(scene.particles, support=support), transfer)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from extreme import FORWARD, Extreme, error_and_allowance
+from extreme import FORWARD, Extreme, error_and_allowance, spoilt
 
 import jaxsph as js
 from jaxsph.numerics import faults
@@ -73,13 +73,6 @@ SPOILT = {
 }
 
 
-def spoilt(numbers, value):
-    """With the first number replaced."""
-    found = np.array(numbers)
-    found[(0,) * found.ndim] = value
-    return found
-
-
 @pytest.fixture(scope="module")
 def jitted(frames):
     return jax.jit(lambda scene, camera: js.render(scene, camera, frames.settings, plan=frames.plan()))
@@ -89,7 +82,7 @@ def test_nan_under_jit_is_a_fault_and_no_image_of_nan(frames, jitted):
     for field, (part, value, bit) in SPOILT.items():
         scene, camera = Extreme().scene(frames), Extreme().camera(frames)
         owner = camera if part == "camera" else getattr(scene, part)
-        owner = dataclasses.replace(owner, **{field: spoilt(getattr(owner, field), value)})
+        owner = spoilt(owner, field, value)
         scene, camera = (scene, owner) if part == "camera" else (dataclasses.replace(scene, **{part: owner}), camera)
         image = jitted(scene, camera)
         assert int(image.faults) & bit, field
@@ -102,10 +95,10 @@ def test_nan_under_jit_is_a_fault_and_no_image_of_nan(frames, jitted):
 def test_what_cannot_be_held_apart_is_a_fault_under_jit(frames, jitted):
     scene, camera = Extreme().scene(frames), Extreme().camera(frames)
     assert int(jitted(scene, camera).faults) == 0
-    assert int(jitted(scene, dataclasses.replace(camera, far=np.asarray(camera.near) * np.float32(1.00001))).faults) & faults.UNRESOLVED
+    thin = dataclasses.replace(camera, far=np.asarray(camera.near) * np.float32(1.00001))
+    assert int(jitted(scene, thin).faults) & faults.UNRESOLVED
     tiny = dataclasses.replace(scene.transfer, values=np.asarray(scene.transfer.values) * np.float32(1e-37))
     assert int(jitted(dataclasses.replace(scene, transfer=tiny), camera).faults) & faults.BAD_TRANSFER
-    for change in ({"volume": np.float32(1e-37)}, {"support": np.float32(1e-12)}):
-        field, value = next(iter(change.items()))
-        weak = dataclasses.replace(scene.particles, **{field: spoilt(getattr(scene.particles, field), value)})
+    for field, value in (("volume", 1e-37), ("support", 1e-12)):
+        weak = spoilt(scene.particles, field, value)
         assert int(jitted(dataclasses.replace(scene, particles=weak), camera).faults) & faults.WEAK_PARTICLES

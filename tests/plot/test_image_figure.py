@@ -69,7 +69,8 @@ def test_the_bar_spans_the_control_points_on_their_scale(domain):
     scene, image = ramp(values, look)
     axes = bar_of(image.figure(scene, labels="density"))
     assert axes.get_ylim() == pytest.approx((1e-3, 10), rel=1e-5)
-    places = axes.transAxes.inverted().transform(axes.transData.transform([(0.5, value) for value in np.asarray(look.values)]))[:, 1]
+    marks = axes.transData.transform([(0.5, value) for value in np.asarray(look.values)])
+    places = axes.transAxes.inverted().transform(marks)[:, 1]
     np.testing.assert_allclose(places, np.linspace(0, 1, 16), atol=1e-4)
     assert axes.get_ylabel().replace("\n", " ") == "density (code units)"
 

@@ -10,10 +10,18 @@ from unittest import mock
 import numpy as np
 
 import jaxsph as js
+from jaxsph.numerics.checks import array_of
 from jaxsph.reference import image as reference_image
 
 EPS = float(np.finfo(np.float32).eps)
 FORWARD = -np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+
+
+def spoilt(owner, field, value, at=None):
+    """The same with other numbers at an index or a slice of one of its arrays; by default, with another first number."""
+    found = np.array(getattr(owner, field))
+    found[(0,) * found.ndim if at is None else at] = value
+    return dataclasses.replace(owner, **{field: array_of(found)})
 
 
 @dataclasses.dataclass(frozen=True)

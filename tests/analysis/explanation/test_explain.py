@@ -51,7 +51,7 @@ def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board
         assert set(one.sources) == sources and min(one.sources.values(), default=0) >= 0
         assert sum(one.sources.values()) == pytest.approx(one.total, rel=1e-9, abs=1e-12)
         assert one.transmittance[-1] == pytest.approx(left[one.pixel], abs=bound[one.pixel] + ROUNDING)
-        assert one.alpha == 1 - left[one.pixel] and np.array_equal(one.color, image.color[one.pixel])
+        assert one.alpha == 1 - left[one.pixel] and np.array_equal(one.color, np.asarray(image.color)[one.pixel])
         lengths = {len(one.depth), len(one.quantity), len(one.extinction), len(one.transmittance)}
         assert len(lengths) == 1 and (np.diff(one.depth) >= 0).all()
     assert (max(one.total for one in made) > 0) == bool(sources)
@@ -88,7 +88,7 @@ def test_of_several_bands_the_own_one_is_drawn_and_tells_the_same(board):
     image = js.render(scene, camera, settings)
     for pixel in ((149, 20), (75, 20), (0, 0)):
         one = js.explain(scene, camera, settings, pixel=pixel)
-        assert one.alpha == 1 - float(image.transmittance[pixel]) and one.half_depth == float(image.depth[pixel])
+        assert one.alpha == 1 - np.asarray(image.transmittance)[pixel] and one.half_depth == np.asarray(image.depth)[pixel]
 
 
 def test_where_nothing_is_estimated_the_note_says_why(board):
@@ -135,7 +135,7 @@ def test_a_figure_is_drawn_and_saved(board, tmp_path):
 def test_of_two_quantities_both_are_told_and_drawn(board):
     pytest.importorskip("matplotlib")
     scene, camera = board
-    particles = dataclasses.replace(scene.particles, extinction_quantity=10 * scene.particles.quantity)
+    particles = dataclasses.replace(scene.particles, extinction_quantity=10 * np.asarray(scene.particles.quantity))
     values = 10 * np.asarray(scene.transfer.values)
     look = js.TransferFunction.from_points(scene.transfer.values, scene.transfer.colors, scene.transfer.extinction, values)
     two = js.explain(js.Scene(particles=particles, transfer=look), camera, js.Settings(samples=SAMPLES), pixel=(20, 30))

@@ -25,6 +25,7 @@ from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
+from jaxsph.numerics.checks import array_of
 
 CANDIDATES = range(SUPER_PIXEL + 1)
 
@@ -80,7 +81,7 @@ def filled_cells(slabs, slab_samples, number):
 def looked(stages, scene, camera, wished, plan, form):
     frame = stages(scene.particles, camera, plan=plan)
     kernel = scene.particles.kernel
-    return jax.tree.map(np.asarray, look(scene, camera, frame, jnp.asarray(wished), plan=plan, kernel=kernel, form=form))
+    return jax.tree.map(np.asarray, look(scene, camera, frame, wished, plan=plan, kernel=kernel, form=form))
 
 
 def wishes(cells, bundles):
@@ -99,7 +100,7 @@ def seen_whole(frames, kernel, projection, dtype):
     """A frame that particles fill, and a level for every bundle, one after the other."""
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng, kernel, decades=0.3, dtype=dtype), frames.camera(rng, projection, dtype=dtype)
-    particles = dataclasses.replace(scene.particles, support=2 * scene.particles.support)
+    particles = dataclasses.replace(scene.particles, support=array_of(2 * np.asarray(scene.particles.support)))
     return dataclasses.replace(scene, particles=particles), camera
 
 
@@ -142,11 +143,11 @@ def alike(frames, x64):
     """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
     frames = frames.deep(4)
     scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
-    particles = dataclasses.replace(scene.particles, support=jnp.full_like(scene.particles.support, 30))
+    particles = dataclasses.replace(scene.particles, support=np.full_like(scene.particles.support, 30))
     transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 15).reshape(5, 3), np.linspace(0.1, 1, 5))
 
     def of(spread):
-        quantity = 0.4 + spread * particles.quantity
+        quantity = 0.4 + spread * np.asarray(particles.quantity)
         return js.Scene(particles=dataclasses.replace(particles, quantity=quantity), transfer=transfer)
 
     return of, camera, frames.plan(4), (-(-frames.samples // CELL_SAMPLES), 16)

@@ -13,7 +13,7 @@ from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import SUBSAMPLED_SHARE, interpolation_error
-from jaxsph.engine.field.lattice import FINEST, GAP, Region, Spacing, region_of
+from jaxsph.engine.field.lattice import FINEST, GAP, Region, Spacing
 from jaxsph.engine.frame.stages import sum_shard
 
 
@@ -57,7 +57,7 @@ def test_nothing_is_interpolated_without_a_lattice(band):
 def test_what_would_be_interpolated_from_beyond_the_lattice_is_not(band, nodes):
     """Even where sums fall off so evenly that nodes which are missing look like zero."""
     grid, lattice, judge = band
-    region = dataclasses.replace(region_of(grid, 12, 13, nodes), row=np.int32(0), column=np.int32(0))
+    region = Region(np.int32(0), np.int32(0), 12, 13, nodes)
     layers, down, across = lattice.weight.shape[0], 12 * nodes.across, 13 * nodes.across
     ramp = np.zeros((layers, down + GAP, across + GAP), np.float32)
     ramp[:, :down, :across] = across - np.arange(across)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,11 +37,10 @@ def chosen_by(allocation, drawn, tolerance):
     """Candidates, and what is taken of the tolerance and saved by them, (cells, bundles); the best that each cell could do."""
     error, saving, on_offer, rounding = drawn
     with jax.enable_x64(True):
-        nothing = jnp.zeros((4, CELLS, BUNDLES))
-        errors = CellErrors(jnp.asarray(error), jnp.asarray(error), nothing, nothing[0])
-        given = (jnp.asarray(value) for value in (saving, on_offer, rounding, tolerance))
-        chosen = choosing(errors, *given, allocation=allocation)
-        largest = np.asarray(bounding(offer_errors(error), chosen, jnp.asarray(rounding)))
+        nothing = np.zeros((4, CELLS, BUNDLES))
+        errors = CellErrors(error, error, nothing, nothing[0])
+        chosen = choosing(errors, saving, on_offer, rounding, np.asarray(tolerance), allocation=allocation)
+        largest = np.asarray(bounding(offer_errors(error), chosen, rounding))
     chosen = np.asarray(chosen)
     taken, gain = (np.take_along_axis(value, chosen[None], 0)[0] for value in (offer_errors(error), saving))
     np.testing.assert_allclose(largest, np.where((chosen > 0).any(0), taken.sum(0) + rounding, 0))

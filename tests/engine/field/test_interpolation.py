@@ -36,7 +36,7 @@ def test_a_cubic_field_is_interpolated_exactly(spacing, x64):
         each = range(MAX_SPACING_LEVEL + 1)
         return [interpolate(lattice, slab, (row, column), slab_samples=slab_samples, level=level) for level in each]
 
-    every = jax.jit(at_every_level, compiler_options=QUICKLY)(lattice, *where)
+    every = jax.tree.map(np.asarray, jax.jit(at_every_level, compiler_options=QUICKLY)(lattice, *where))
     for (level, found), k in itertools.product(enumerate(every), range(2)):
         middles = (np.arange(slab_samples) + 0.5) * 2**level - 0.5
         at = [

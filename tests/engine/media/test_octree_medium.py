@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.engine.field.tasks import SlabTask
@@ -224,8 +225,7 @@ def test_what_has_no_extinction_at_a_point_is_refused_by_name(given, name):
 
 
 def test_points_that_mean_nothing_are_a_fault():
-    broken = points(shaped)
-    broken = dataclasses.replace(broken, radius=np.where(np.arange(COUNT) == 3, np.float32(np.nan), broken.radius))
+    broken = spoilt(points(shaped), "radius", np.nan, 3)
     word, _, optics = asked(OctreePoints.of(broken), camera(), slabs("perspective"))
     assert int(word) == faults.BAD_POINTS and np.isfinite(np.stack(optics)).all()
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
@@ -238,9 +239,7 @@ def test_a_tolerance_is_refused_by_name_and_so_are_steps_of_any_length_under_a_t
 @pytest.mark.parametrize("name", ["position", "radius", "color", "extinction"])
 def test_numbers_that_mean_nothing_are_a_fault_under_jit(name):
     scene = js.Scene(points=points())
-    values = np.array(getattr(scene.points, name))
-    values[3] = np.nan
-    broken = dataclasses.replace(scene.points, **{name: values})
+    broken = spoilt(scene.points, name, np.nan, 3)
     image = traced(dataclasses.replace(scene, points=broken))
     assert "a point has" in faults.describe(int(image.faults)) and np.isfinite(image.color).all()
     with pytest.raises(ValueError, match="a point has"):

@@ -88,7 +88,7 @@ def test_a_scene_of_float64_is_rendered_in_float64(x64):
 
 
 def test_values_that_are_no_numbers_are_a_fault_under_jit():
-    shown, view = scene(), camera()
+    shown, view = scene(**particles()), camera("perspective")
     broken = dataclasses.replace(shown.volume, values=np.where(FIELD[3, 2, 1] == FIELD, np.float32(np.nan), FIELD))
     words = [int(FAULTS(volume, shown.volume_transfer, view)) for volume in (shown.volume, broken)]
     assert words == [0, faults.BAD_VOLUME]

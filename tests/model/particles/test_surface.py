@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import formulas
 import jax
 import numpy as np
 import pytest
+from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.model.particles.surface import coverage_at_centers
@@ -25,6 +27,12 @@ def some(number=30, support=0.4, kernel="wendland_c2"):
 
 def camera():
     return js.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), width=8, height=8, near=1.5, far=4.5, fov_degrees=30.0)
+
+
+@functools.cache
+def plan():
+    """For all pictures of some particles."""
+    return js.plan(js.Scene(particles=some(), surface=js.Surface(50.0)), camera(), SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -88,10 +96,10 @@ def test_a_quantity_that_makes_no_field_is_refused_by_name(of, given, match):
 
 def test_a_surface_of_a_quantity_is_that_of_the_coverage_by_particles_of_so_much_more_volume():
     particles, more = some(), np.random.default_rng(2).uniform(0.5, 3, 30)
-    second = dataclasses.replace(particles, extinction_quantity=particles.quantity * 0 + 1)
+    second = dataclasses.replace(particles, extinction_quantity=np.ones_like(particles.quantity))
     scene = widened(js.Scene(particles=second, surface=js.Surface(2.0, of="extinction_quantity", smoothing=1.2)))
     np.testing.assert_allclose(scene.particles.volume, particles.volume, rtol=1e-6)
-    given = dataclasses.replace(particles, quantity=particles.quantity.at[:30].set(more))
+    given = spoilt(particles, "quantity", more, np.s_[:30])
     scene = widened(js.Scene(particles=given, surface=js.Surface(2.0, of="quantity")))
     assert scene.surface.of == "coverage" and jax.tree.structure(scene) == jax.tree.structure(widened(scene))
     np.testing.assert_allclose(np.asarray(scene.particles.volume)[:30], 0.01 * more, rtol=1e-6)
@@ -109,7 +117,7 @@ def test_coverage_at_centers_is_that_of_the_definition():
 
 def test_a_level_of_a_quantity_that_no_ray_meets_is_told_with_its_range():
     with pytest.warns(UserWarning, match=r"level 50: the particles' quantity, smoothed by their kernels, is 0\.\d+ to [\d.]+ at"):
-        js.render(js.Scene(particles=some(), surface=js.Surface(50.0, of="quantity")), camera(), SETTINGS)
+        js.render(js.Scene(particles=some(), surface=js.Surface(50.0, of="quantity")), camera(), SETTINGS, plan=plan())
 
 
 def test_a_level_that_no_ray_meets_is_an_empty_picture_and_told_with_the_range():
@@ -117,11 +125,12 @@ def test_a_level_that_no_ray_meets_is_an_empty_picture_and_told_with_the_range()
     with pytest.warns(
         UserWarning, match=r"no ray meets the surface of level 50: the coverage by particles is 0\.\d+ to [\d.]+ at"
     ):
-        image = js.render(scene, camera(), SETTINGS)
-    assert not np.any(image.color) and np.isinf(np.asarray(image.depth)).all() and (np.asarray(image.transmittance) == 1).all()
+        image = js.render(scene, camera(), SETTINGS, plan=plan())
+    color, left, depth = map(np.asarray, (image.color, image.transmittance, image.depth))
+    assert not color.any() and (left == 1).all() and np.isinf(depth).all()
     nobody = dataclasses.replace(scene.particles, valid=np.zeros_like(scene.particles.valid))
     with pytest.warns(UserWarning, match="0, as there are no particles"):
-        js.render(dataclasses.replace(scene, particles=nobody), camera(), SETTINGS)
+        js.render(dataclasses.replace(scene, particles=nobody), camera(), SETTINGS, plan=plan())
 
 
 def test_a_camera_is_fitted_to_a_surface_without_a_transfer_function_as_to_an_even_fog():

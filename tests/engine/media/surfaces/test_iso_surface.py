@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -36,9 +37,8 @@ def camera(projection, width=24, height=20):
 
 def first_hit(view):
     """Of all pixels' rays with the ball, in float64: closest approach, depth, and the cosine towards the eye."""
-    u = np.asarray(view.column(np.arange(view.width) + 0.5), np.float64)[None, :] + np.zeros((view.height, 1))
-    v = np.asarray(view.row(np.arange(view.height) + 0.5), np.float64)[:, None] + np.zeros((1, view.width))
-    centre = np.asarray(view.to_view(jnp.zeros(3)), np.float64)
+    u, v = np.meshgrid(*ray_coordinates(view, np.arange(view.width) + 0.5, np.arange(view.height) + 0.5))
+    centre = to_view(np.zeros(3), view)
     zero, one = np.zeros_like(u), np.ones_like(u)
     origin, way = (zero, (u, v, one)) if view.is_perspective else ((u, v, zero), (zero, zero, one))
     origin, way = np.stack(np.broadcast_arrays(*(origin if isinstance(origin, tuple) else (zero,) * 3)), -1), np.stack(way, -1)
@@ -58,10 +58,10 @@ def test_a_ball_is_opaque_in_its_place_and_shaded(projection):
     miss, depth, facing = first_hit(view)
     inside, outside = miss < 0.97 * RADIUS, miss > 1.01 * RADIUS
     assert inside.sum() > 100 < outside.sum()
-    np.testing.assert_array_equal(np.asarray(image.alpha)[inside], 1)
-    np.testing.assert_array_equal(np.asarray(image.alpha)[outside], 0)
-    step = np.asarray(view.depth(np.arange(49.0), 48))
-    assert (np.abs(np.asarray(image.depth)[inside] - depth[inside]) <= np.diff(step).max()).all()
+    np.testing.assert_array_equal(np.asarray(image.transmittance)[inside], 0)
+    np.testing.assert_array_equal(np.asarray(image.transmittance)[outside], 1)
+    step = np.diff(js.reference.sample_depths(view, 48)).max()
+    assert (np.abs(np.asarray(image.depth)[inside] - depth[inside]) <= step).all()
     wanted = np.asarray(COLOR) * (AMBIENT + (1 - AMBIENT) * facing)[..., None]
     np.testing.assert_allclose(np.asarray(image.color)[inside], wanted[inside], atol=0.02)
 

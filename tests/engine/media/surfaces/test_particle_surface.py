@@ -17,6 +17,7 @@ import jaxsph as js
 from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.numerics import faults
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -39,10 +40,10 @@ def check(scene, view, settings=SETTINGS, close=CLOSE, within=None):
     met = np.isfinite(truth.depth)
     assert met.sum() > 40
     np.testing.assert_array_equal(np.isfinite(depth)[sure], met[sure])
-    np.testing.assert_array_equal(np.asarray(image.alpha), np.isfinite(depth))
+    np.testing.assert_array_equal(1 - np.asarray(image.transmittance), np.isfinite(depth))
     both = sure & met
     steep = np.abs(truth.facing) > 0.02
-    assert np.abs(depth[both & steep] - truth.depth[both & steep]).max() <= close * float(np.min(scene.particles.support))
+    assert np.abs(depth[both & steep] - truth.depth[both & steep]).max() <= close * np.asarray(scene.particles.support).min()
     return image, truth, both
 
 
@@ -82,8 +83,8 @@ def test_a_light_far_away_lights_the_side_that_is_seen_by_the_cosine(projection)
     scene = lit()
     image, truth, both = check(scene, camera(projection))
     light = np.asarray(scene.surface.light)
-    towards = camera(projection).axes @ (light / np.linalg.norm(light))
-    cosine = np.maximum(truth.normal @ np.asarray(towards), 0)  # from outside, the normal faces the eye
+    towards = np.asarray(camera(projection).axes) @ (light / np.linalg.norm(light))
+    cosine = np.maximum(truth.normal @ towards, 0)  # from outside, the normal faces the eye
     wanted = (AMBIENT + (1 - AMBIENT) * cosine)[..., None] * np.array([0.8, 0.6, 0.4])
     np.testing.assert_allclose(np.asarray(image.color)[both], wanted[both], atol=1e-3)
     assert (cosine[both] == 0).any() and cosine[both].max() > 0.9
@@ -125,7 +126,7 @@ def test_from_within_the_fluid_the_first_crossing_is_where_a_ray_leaves_it():
 def test_a_surface_of_a_quantity_is_where_that_has_the_level_and_coloured_by_what_it_is_made_of(of):
     """A ball whose quantity grows from one side to the other: it is cut off where there is little of it."""
     particles = ball()
-    grows = jnp.where(particles.valid, particles.position[:, 0] + 0.5, 0)
+    grows = np.where(particles.valid, np.asarray(particles.position)[:, 0] + np.float32(0.5), 0)
     given = {"quantity": grows} if of == "quantity" else {"extinction_quantity": grows}
     look = js.TransferFunction.from_points([-0.5, 1.0], [[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]], [1.0, 1.0])
     surface = js.Surface(0.28, of=of, ambient=1.0)
@@ -192,10 +193,10 @@ def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, 
     """Eight samples a ray, two to four supports apart: every ray on which one particle reaches the level meets a surface."""
     (scene, peak, support), view = droplets(seed, share), camera()
     depth = np.asarray(js.render(scene, view, COARSE, plan=plan_for_droplets()).depth)
-    u, v = np.meshgrid(np.asarray(view.column(np.arange(WIDTH) + 0.5)), np.asarray(view.row(np.arange(HEIGHT) + 0.5)))
-    way = np.stack([u, v, np.ones_like(u)], -1).astype(np.float64)
+    u, v = np.meshgrid(*ray_coordinates(view, np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5))
+    way = np.stack([u, v, np.ones_like(u)], -1)
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    center = np.asarray(view.to_view(scene.particles.position), np.float64)[np.asarray(scene.particles.valid)]
+    center = to_view(scene.particles.exact_position(), view)[np.asarray(scene.particles.valid)]
     foot = way @ center.T
     square = np.maximum((center**2).sum(1) - foot**2, 0) / support**2
     most = peak * np.maximum(1 - square, 0) ** 3
