@@ -67,7 +67,7 @@ def framed(camera, *parts):
     for part in parts:
         view = (ends_of(part, axes) - camera.exact_eye()) @ axes.T
         aside = np.abs(view[:, :2]) / view[:, 2:] / float(camera.half_height) / (camera.width / camera.height, 1)
-        if not ((aside <= 1).all() and (view[:, 2] >= camera.near).all() and (view[:, 2] <= camera.far).all()):
+        if not ((aside <= 1).all() and (view[:, 2] >= float(camera.near)).all() and (view[:, 2] <= float(camera.far)).all()):
             return False
     return True
 
@@ -93,7 +93,7 @@ def test_a_volume_and_points_share_a_picture_that_is_the_references(files, capsy
     assert truth.alpha.max() > 0.5 and truth.color[..., 0].max() > 0.3
 
 
-def test_points_alone_need_no_source(files, capsys):
+def test_points_alone_need_no_source(files, capsys, by_reference):
     code, out, err = run(capsys, "render", "--points", "stars.csv", *TINY)
     assert (code, err) == (0, []) and (files / "stars.png").stat().st_size > 0 and "2 points" in out
 
@@ -145,7 +145,7 @@ def test_radius_colour_and_opacity_are_numbers_or_columns(files, monkeypatch, ca
     points = scene.points[0]
     np.testing.assert_array_equal(points.radius[:2], radius)
     np.testing.assert_allclose(points.color[:2], color, atol=1e-3)
-    np.testing.assert_allclose(points.extinction[:2] * points.radius[:2], np.log(2) / 0.833287, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(points.extinction)[:2] * np.asarray(points.radius)[:2], np.log(2) / 0.833287, rtol=1e-5)
     assert said in out
 
 

@@ -134,7 +134,7 @@ def test_the_box_of_a_file_can_be_left_aside(tmp_path, monkeypatch, seen, capsys
     assert seen.scene.particles.box is None
 
 
-def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
+def test_a_slice_is_written_as_values_or_as_a_picture(file, by_reference, capsys):
     plane = ["--plane", "0.5,0.5,0.5,0,0,1", "--color-by", "pressure", "--size", "24x16"]
     for name in ("a.npy", "a.exr", "a.png"):
         code, out, err = run(capsys, "slice", file, "-o", name, *plane)
@@ -145,7 +145,7 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, capsys):
     assert np.asarray(io.read_image("a.png").color).max() > 0.3
 
 
-def test_a_slice_has_its_key_where_that_is_asked_for(file, capsys):
+def test_a_slice_has_its_key_where_that_is_asked_for(file, by_reference, capsys):
     pytest.importorskip("matplotlib")
     code, _, err = run(capsys, "slice", file, "-o", "key.png", "--color-by", "pressure", "--size", "24x16", "--annotate")
     assert (code, err) == (0, []) and np.asarray(Picture.open("key.png")).shape[1] > 24
@@ -201,7 +201,7 @@ def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
         (["--tolerance", "1"], 2, "Unknown option: --tolerance"),
     ],
 )
-def test_slices_that_cannot_be_are_told_in_one_line(file, capsys, arguments, code, said):
+def test_slices_that_cannot_be_are_told_in_one_line(file, by_reference, capsys, arguments, code, said):
     found, _, err = run(capsys, "slice", file, *TINY[:2], *arguments)
     assert found == code and len(err) == 1 and said in err[0], err
 
@@ -227,7 +227,7 @@ def test_options_of_particle_files_are_not_for_scenes_and_volumes(tmp_path, monk
         assert code == 2 and len(err) == 1 and option[0] in err[0]
 
 
-def test_a_slice_of_particles_with_a_density_has_colours_of_one_quantity(tmp_path, monkeypatch, capsys):
+def test_a_slice_of_particles_with_a_density_has_colours_of_one_quantity(tmp_path, monkeypatch, capsys, by_reference):
     monkeypatch.chdir(tmp_path)
     generator = np.random.default_rng(0)
     density = generator.lognormal(0, 3, 80).astype(np.float32)
@@ -236,7 +236,7 @@ def test_a_slice_of_particles_with_a_density_has_colours_of_one_quantity(tmp_pat
     assert (code, err) == (0, []) and "heat" in out and "opacity" not in out
 
 
-def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, capsys):
+def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, by_reference, capsys):
     code, _, err = run(
         capsys, "slice", file, "--center", "0.5,0.5,0.4", "--view", "x", "--width", "0.6", *TINY[:2], "-o", "a.npy"
     )

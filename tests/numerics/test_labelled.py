@@ -38,7 +38,7 @@ def test_with_perspective_pixels_have_no_place():
     assert not set(js.project(PARTICLES, view).to_xarray().coords)
 
 
-def test_a_slice_is_a_dataset_over_its_plane():
+def test_a_slice_is_a_dataset_over_its_plane(by_reference):
     pytest.importorskip("xarray")
     found = js.slice(PARTICLES, js.Plane((0, 0, 0.05), (0, 0, 1)), center=(0.1, 0.2, 0), view_height=1.0, width=6, height=4)
     table = found.to_xarray()
