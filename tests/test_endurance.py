@@ -34,7 +34,7 @@ def render_shape(nth: int) -> None:
     for frame in range(FRAMES_PER_SHAPE - 1):
         settings = js.Settings(samples=samples, **ESTIMATORS[frame % len(ESTIMATORS)])
         image = js.render(scene, camera, settings)
-        assert image.faults == 0 and np.isfinite(np.asarray(image.color)).all() and float(image.alpha.max()) > 0.1
+        assert image.faults == 0 and np.isfinite(np.asarray(image.color)).all() and np.asarray(image.alpha).max() > 0.1
     settings = js.Settings(samples=samples)
     plan = js.plan(scene, camera, settings)
 

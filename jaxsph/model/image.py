@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics import faults, short
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import array_of, is_traced, module_for
 from jaxsph.numerics.colors import rgb
 from jaxsph.numerics.labelled import PLANE, dataset
 from jaxsph.numerics.names import found
@@ -94,7 +94,8 @@ class Image:
     @property
     def alpha(self) -> Float[Array, "height width"]:
         """Opacity, `1 - transmittance`."""
-        return 1 - self.transmittance
+        left = self.transmittance
+        return array_of(1 - np.asarray(left)) if isinstance(left, Array) and module_for(left) is np else 1 - left
 
     @property
     def shape(self) -> tuple[int, int]:

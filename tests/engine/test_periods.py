@@ -75,7 +75,7 @@ def differences(image, truth):
 def test_images_are_those_of_explicit_copies_within_the_box(integrator, projection):
     settings = js.Settings(samples=24, integrator=integrator)
     found, truth = (js.render(scene, camera(projection), settings) for scene in scenes())
-    assert 0.3 < float(found.alpha.mean()) < 0.95
+    assert 0.3 < np.asarray(found.alpha).mean() < 0.95
     assert differences(found, truth).max() <= 1e-6
 
 

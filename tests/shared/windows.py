@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows
@@ -16,4 +15,4 @@ def windows_of(slab_samples):
     shape = (CLASSES, CELLS * CELL_SAMPLES // slab_samples, BUNDLES)
     begin = np.sort(rng.integers(0, 900, shape), 1).astype(np.int32)
     length = np.where(rng.uniform(size=shape) < 0.3, 0, rng.integers(1, 40, shape)).astype(np.int32)
-    return SlabWindows(*(jnp.asarray(value) for value in (begin, length, length.sum(0, dtype=np.int32))))
+    return SlabWindows(begin, length, length.sum(0, dtype=np.int32))

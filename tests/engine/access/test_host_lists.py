@@ -72,8 +72,7 @@ def test_the_host_makes_the_lists_and_windows_that_xla_makes(frames, dtype, proj
         rng, shape = np.random.default_rng(seed), dataclasses.replace(frames, **SIZE)
         scene, camera = shape.scene(rng, decades=4, dtype=dtype), shape.camera(rng, projection, distance, dtype)
         (ordered, expected), (same, found) = both(scene, camera, LISTS, first_row)
-        for name, column in dataclasses.asdict(ordered).items():
-            np.testing.assert_array_equal(getattr(same, name), column)
+        jax.tree.map(np.testing.assert_array_equal, same, ordered)
         assert int(found.lists.faults) == 0 and int(found.pairs) == int(expected.pairs) == sum(map(len, lists_of(found)))
         assert lists_of(found) == lists_of(expected)
         np.testing.assert_array_equal(found.windows.length, expected.windows.length)
@@ -98,7 +97,7 @@ def test_a_full_capacity_is_the_same_fault_on_the_host(frames, capacity):
     scene, camera = shape.scene(rng, decades=0), shape.camera(rng)
     expected, found = (grid for _, grid in both(scene, camera, dataclasses.replace(LISTS, **{capacity: 5})))
     assert int(found.lists.faults) & int(expected.lists.faults) != 0
-    assert int(found.lists.end.max()) == 0
+    assert not np.asarray(found.lists.end).any()
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.model.camera.frusta import between_depths, seen_by
+from jaxsph.reference.where import ray_coordinates
 
 
 def camera_of(perspective, height):
@@ -24,7 +25,7 @@ def test_spheres_that_a_ray_of_a_pane_meets_are_met_and_so_are_boxes_around_them
     bottom, right = (int(rng.integers(first + 1, end)) for first, end in zip((top, left), size, strict=True))
     rows, columns = rng.integers(top, bottom, 50), rng.integers(left, right, 50)
     depth = rng.uniform(1.5, 4.5, 50)
-    u, v = (np.asarray(side, float) for side in (camera.column(columns + 0.5), camera.row(rows + 0.5)))
+    u, v = ray_coordinates(camera, columns + 0.5, rows + 0.5)
     spread = depth if perspective else np.ones(50)
     on_rays = camera.exact_eye() + np.stack([u * spread, v * spread, depth], 1) @ np.asarray(camera.axes, float)
     reach = 10**decade * rng.uniform(0.1, 1, 50)
