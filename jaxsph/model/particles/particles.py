@@ -217,8 +217,8 @@ class Particles:
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
         xp, given = module_for(self, entries), self.columns | {"valid": self.valid, "position_rest": self.position_rest}
-        columns = {name: None if column is None else array_of(xp.asarray(column)[entries]) for name, column in given.items()}
-        return dataclasses.replace(self, **columns)
+        at: dict[str, Any] = {name: one if one is None else array_of(xp.asarray(one)[entries]) for name, one in given.items()}
+        return dataclasses.replace(self, **at)
 
     def centered(self, at: Any) -> Particles:
         """The same periodic set with the period moved such that a point is in its middle, and positions moved into it.
