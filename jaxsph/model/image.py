@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics import faults, short
-from jaxsph.numerics.checks import array_of, is_traced, module_for
+from jaxsph.numerics.checks import array_of, at_hand, is_traced
 from jaxsph.numerics.colors import rgb
 from jaxsph.numerics.labelled import PLANE, dataset
 from jaxsph.numerics.names import found
@@ -94,8 +94,7 @@ class Image:
     @property
     def alpha(self) -> Float[Array, "height width"]:
         """Opacity, `1 - transmittance`."""
-        left = self.transmittance
-        return array_of(1 - np.asarray(left)) if isinstance(left, Array) and module_for(left) is np else 1 - left
+        return array_of(1 - at_hand(self.transmittance)[1]) if isinstance(self.transmittance, Array) else 1 - self.transmittance
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -103,13 +103,10 @@ def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.nda
     """A profile at offsets (..., 3) in radii, along world axes, of points with the given attributes (of any shape up to ...)."""
     if isinstance(profile, Shaped):
         given = (*np.moveaxis(offset, -1, 0), *(np.broadcast_to(value, offset.shape[:-1]) for value in attributes.values()))
-        found, function = np.empty(-(-given[0].size // BLOCK) * BLOCK), jax.jit(profile.function)
-        columns = [np.resize(column, found.size) for column in given]
+        blocks = zip(*(np.resize(one, (-(-one.size // BLOCK), BLOCK)) for one in given), strict=True)
         with jax.enable_x64(True):
-            for first in range(0, found.size, BLOCK):
-                x, y, z, *named = (column[first : first + BLOCK] for column in columns)
-                found[first : first + BLOCK] = function((x, y, z), dict(zip(attributes, named, strict=True)))
-        return found[: given[0].size].reshape(given[0].shape)
+            found = [jax.jit(profile.function)(block[:3], dict(zip(attributes, block[3:], strict=True))) for block in blocks]
+        return np.ravel([np.broadcast_to(one, BLOCK) for one in found])[: given[0].size].reshape(given[0].shape)
     distance = np.linalg.norm(offset, axis=-1)
     if isinstance(profile, Gaussian):
         return np.exp(-FALLOFF * distance**2)
