@@ -82,7 +82,7 @@ def test_the_kernel_is_the_one_that_the_file_states_and_that_is_said(name, place
     assert not any(note.startswith("kernel") for note in report.notes)
 
 
-def test_a_file_is_drawn_with_the_kernel_that_it_states(samples, tmp_path, frames, compare, quick_programs):
+def test_a_file_is_drawn_with_the_kernel_that_it_states(samples, tmp_path, frames, compare, traced):
     """Against float64 brute force."""
     name, place, stated = next(one for one in STATED if one[0] == "quartic_spline")
     given = io.read_particles(write(tmp_path / "a.hdf5", samples, place, stated), "x", 0.6, box=None)
@@ -93,7 +93,7 @@ def test_a_file_is_drawn_with_the_kernel_that_it_states(samples, tmp_path, frame
     values = np.linspace(columns["quantity"].min(), columns["quantity"].max(), 5)
     transfer = js.TransferFunction.from_points(values, np.eye(5, 3), np.full(5, 3.0))
     scene, camera = js.Scene(particles=particles, transfer=transfer), frames.camera(np.random.default_rng(3))
-    image = js.render(scene, camera, frames.settings, plan=frames.plan())
+    image = traced(scene, camera, frames.plan())
     compare(image, js.reference.render(scene, camera, frames.settings), 1e-4, 0.999)
     assert particles.kernel == name and np.asarray(image.alpha).max() > 0.1
 
