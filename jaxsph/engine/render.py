@@ -150,7 +150,7 @@ def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> A
         given = iter(numbers)
         settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
         drawn = _drawn(scene, camera, settings, plan) if mesh is None else drawn_over_mesh(scene, camera, settings, plan, mesh)
-        return traced_image_of(drawn, settings, plan)
+        return traced_image_of(drawn, settings, plan, scene.formulas)
 
     return jax.jit(image)
 

@@ -31,7 +31,8 @@ class Image:
         depth: view depth where transmittance falls to 1/2, inf where it never does, length units.
         error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full
             rate, and at most 1. With a tolerance and `integrator="segments"`, the estimated error against the light integral;
-            NaN where other integrators than `"samples"` have none.
+            infinite where nothing is known: without a tolerance of other integrators than `"samples"`, and of surfaces, of which
+            samples may miss what is thin.
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound.
         faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them. An image with a fault
@@ -161,7 +162,7 @@ class Image:
         if isinstance(seconds, dict):
             told.append(f"{sum(float(value) for value in seconds.values()):.2g} s")
         worst = float(np.max(np.nan_to_num(np.asarray(self.error_bound, np.float64)), initial=0))
-        if worst > 0:
+        if 0 < worst <= 1:
             told.append(f"error at most {worst:.2g}, {'certified' if bool(self.certified) else 'estimated'}")
         if int(self.faults):
             told.append(f"faults {int(self.faults)}")

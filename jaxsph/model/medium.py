@@ -55,12 +55,14 @@ class Medium(abc.ABC):
         stops_rays: whether `stops` tells where rays meet a surface; behind one that is opaque nothing is marched.
         in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
             part of an interval.
+        may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
     """
 
     at_points: ClassVar[bool] = True
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     stops_rays: ClassVar[bool] = False
+    may_be_missed: ClassVar[bool] = False
 
     @property
     def dtype(self) -> Any:

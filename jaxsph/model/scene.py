@@ -34,10 +34,14 @@ MIXES = "extinction", "opacity"
 
 
 class Formulas(NamedTuple):
-    """What of a scene is compiled rather than given: the name of its smoothing kernel, and of how its parts are mixed."""
+    """What of a scene is compiled rather than given: the name of its smoothing kernel, and of how its parts are mixed.
+
+    `surfaces`: whether there are any, parts of which may be missed between samples.
+    """
 
     kernel: str
     mix: str
+    surfaces: bool = False
 
 
 @tree(static=("mix",))
@@ -139,7 +143,8 @@ class Scene:
     @property
     def formulas(self) -> Formulas:
         """What programs are compiled for."""
-        return Formulas(self.particle_set.kernel, self.mix)
+        surfaces = self.surface is not None or any(medium.may_be_missed for medium in self.media)
+        return Formulas(self.particle_set.kernel, self.mix, surfaces)
 
     @property
     def volumes(self) -> tuple[tuple[Volume, TransferFunction], ...]:

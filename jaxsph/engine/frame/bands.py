@@ -71,7 +71,8 @@ class Work:
 
     def image(self, clock: Clock, progress: Progress | None = None, *, planned: bool = True) -> Image:
         """The image of it; `planned`: whether capacities were made for this very frame."""
-        return image_of(self.drawn(clock, progress), self.camera, self.settings, self.plan, clock, planned=planned)
+        drawn, about = self.drawn(clock, progress), (self.camera, self.settings, self.plan, self.formulas, clock)
+        return image_of(drawn, *about, planned=planned)
 
     def in_order(self, shards: int, run: Executor, told: _Told | None) -> Drawn:
         """All bands one after the other; a quadtree is of all of them."""

@@ -85,7 +85,8 @@ def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, 
     shards, plan = work.plan.shards, work.plan
     clock.foresee(lambda run: work.bands(shards, run, [number], None))
     (band,) = work.bands(shards, clock, [number], None)
-    return band, image_of(work.developed(clock, [band]), work.camera, work.settings, plan, clock, planned=planned)
+    about = work.camera, work.settings, plan, work.formulas, clock
+    return band, image_of(work.developed(clock, [band]), *about, planned=planned)
 
 
 def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int, column: int) -> dict[str, float | None]:

@@ -19,14 +19,18 @@ from jaxsph.engine.frame.layers import REFERENCE
 from jaxsph.engine.frame.stages import ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.model.image import Image
+from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import at_hand, is_traced
+from jaxsph.numerics.checks import array_of, at_hand, is_traced
 
 
-def certified(plan: Plan, settings: Settings) -> Bool[Array, ""] | bool:
-    """Whether `error_bound` is proven where there are no faults: of point samples, a ray a pixel, by strict bounds."""
-    if plan.integrator != REFERENCE or plan.quadtree is not None or isinstance(plan.control, PilotPlan):
+def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
+    """Whether `error_bound` is proven where there are no faults: of point samples, a ray a pixel, by strict bounds.
+
+    Of surfaces nothing is: samples may miss what is thin of them.
+    """
+    if plan.integrator != REFERENCE or plan.quadtree is not None or isinstance(plan.control, PilotPlan) or formulas.surfaces:
         return False
     if plan.control is None:
         return True
@@ -78,6 +82,13 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
     let_through = lax.stop_gradient(image.transmittance)
     left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
     return dataclasses.replace(image, error_bound=image.error_bound + left_out)
+
+
+def with_unknown(image: Image, plan: Plan, formulas: Formulas) -> Image:
+    """With no error told of surfaces where nothing is compared: infinite."""
+    if not formulas.surfaces or plan.quadtree is not None or plan.cast.doublings:
+        return image
+    return dataclasses.replace(image, error_bound=array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype))
 
 
 def missed(image: Image, settings: Settings) -> Int[Array, ""] | int:

@@ -11,20 +11,29 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.engine.frame.claims import certified, disclaimed, faults_of_settings, missed, tell, with_ended_rays
+from jaxsph.engine.frame.claims import certified, disclaimed, faults_of_settings, missed, tell, with_ended_rays, with_unknown
 from jaxsph.engine.frame.layers import Drawn, Layers
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
 from jaxsph.numerics.version import __version__
 
 
 def image_of(
-    drawn: Drawn, camera: Camera, settings: Settings, plan: Plan, clock: Clock, *, planned: bool = True, **stats: Any
+    drawn: Drawn,
+    camera: Camera,
+    settings: Settings,
+    plan: Plan,
+    formulas: Formulas,
+    clock: Clock,
+    *,
+    planned: bool = True,
+    **stats: Any,
 ) -> Image:
     """The image that was drawn; faults raise.
 
@@ -33,6 +42,7 @@ def image_of(
         camera: in whose view.
         settings: that were asked for.
         plan: by which it was drawn.
+        formulas: of the scene.
         clock: that the stages were timed by.
         planned: whether capacities were made for this very frame.
         stats: what else is known of it.
@@ -44,7 +54,7 @@ def image_of(
         UserWarning: where segments cannot keep a tolerance everywhere.
     """
     faults.raise_for(int(drawn.faults), planned)
-    image, word = _image(drawn, settings, plan)
+    image, word = _image(drawn, settings, plan, formulas)
     word = int(word)
     tell(word, image, settings)
     counted: dict[str, Any] = {
@@ -53,27 +63,28 @@ def image_of(
         **{name: int(count) for name, count in _counts(drawn).items()},
     }
     clock.mark("image")
-    proven = bool(certified(plan, settings))
+    proven = bool(certified(plan, settings, formulas))
     counted |= {"seconds": dict(clock.seconds), **stats}
     metadata = metadata_of(camera, settings, proven)
     return dataclasses.replace(image, certified=proven, faults=word, stats=counted, metadata=metadata)
 
 
-def traced_image_of(drawn: Drawn, settings: Settings, plan: Plan) -> Image:
+def traced_image_of(drawn: Drawn, settings: Settings, plan: Plan, formulas: Formulas) -> Image:
     """The image that is drawn within a trace: after a fault it claims nothing."""
-    image, word = _image(drawn, settings, plan)
+    image, word = _image(drawn, settings, plan, formulas)
     sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **_counts(drawn)}
-    image = dataclasses.replace(image, certified=jnp.asarray(certified(plan, settings)), stats=sums)
+    image = dataclasses.replace(image, certified=jnp.asarray(certified(plan, settings, formulas)), stats=sums)
     return disclaimed(image, word | faults_of_settings(settings))
 
 
-def _image(drawn: Drawn, settings: Settings, plan: Plan) -> tuple[Image, Any]:
+def _image(drawn: Drawn, settings: Settings, plan: Plan, formulas: Formulas) -> tuple[Image, Any]:
     """The layers as an image, and its fault word."""
     layers: Layers = drawn.layers
     of_pixels = *layers[:3], layers.bound, layers.evaluations
     image = Image(*of_pixels, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:
         image = with_ended_rays(image, settings)
+    image = with_unknown(image, plan, formulas)
     return image, drawn.faults | missed(image, settings)
 
 

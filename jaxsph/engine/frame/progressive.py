@@ -150,9 +150,9 @@ class Progressive:
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        return self._asked.in_given_unit(
-            image_of(drawn, self._frame.camera, self._settings, self._frame.plan, self._clock, **told)
-        )
+        frame = self._frame
+        image = image_of(drawn, frame.camera, self._settings, frame.plan, frame.formulas, self._clock, **told)
+        return self._asked.in_given_unit(image)
 
 
 class _Stage(NamedTuple):

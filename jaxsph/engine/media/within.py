@@ -64,6 +64,11 @@ class Within(Medium):
         return self.medium.stops_rays
 
     @property
+    def may_be_missed(self) -> bool:  # type: ignore[override]
+        """As the medium."""
+        return self.medium.may_be_missed
+
+    @property
     def dtype(self) -> Any:
         """That of the medium."""
         return self.medium.dtype

@@ -55,6 +55,7 @@ class IsoSurface(Medium):
     """
 
     at_points = False  # a surface lies between points, and no step is short enough to resolve it
+    may_be_missed = True
     volume: Volume | None
     level: Float[Array, ""]
     color: Float[Array, "3"]

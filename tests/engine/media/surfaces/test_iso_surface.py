@@ -66,6 +66,16 @@ def test_a_ball_is_opaque_in_its_place_and_shaded(projection):
     np.testing.assert_allclose(np.asarray(image.color)[inside], wanted[inside], atol=0.02)
 
 
+@pytest.mark.parametrize("within", [None, js.Sphere((0.0, 0.0, 0.0), 5.0)], ids=["everywhere", "within a clip"])
+def test_a_ball_that_lies_between_samples_is_within_what_is_told(within):
+    """Neither picture is certified, as the coarser one misses it."""
+    scene, view = js.Scene(media=(surface(0.12),), within=within), camera("perspective")
+    images = [js.render(scene, view, dataclasses.replace(SETTINGS, samples=samples)) for samples in (4, 48)]
+    few, many = (np.asarray(image.alpha, np.float64) for image in images)
+    assert (np.abs(few - many) <= sum(np.asarray(image.error_bound) for image in images)).all()
+    assert many.max() == 1 > few.max() and not any(image.certified for image in images)
+
+
 @pytest.mark.slow
 def test_what_lies_in_front_is_seen_and_what_lies_behind_is_not():
     """A fog in front of the surface, and one behind it."""

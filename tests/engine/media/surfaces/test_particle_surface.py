@@ -90,6 +90,16 @@ def test_a_light_far_away_lights_the_side_that_is_seen_by_the_cosine(projection)
     assert (cosine[both] == 0).any() and cosine[both].max() > 0.9
 
 
+@pytest.mark.parametrize("settings", [SETTINGS, COARSE], ids=["fine", "coarse"])
+def test_nothing_is_certified_of_what_samples_may_miss(settings):
+    """At no number of samples, eagerly or under a trace."""
+    plan = js.plan(lit(), camera(), settings)
+    images = js.render(lit(), camera(), settings), jax.jit(lambda of: js.render(of, camera(), settings, plan=plan))(lit())
+    for image in images:
+        assert not image.certified and not image.faults and (np.asarray(image.error_bound) == np.inf).all()
+    assert "not certified" in repr(images[0]) and "error at most" not in images[0]._repr_html_()
+
+
 def test_in_double_precision_depths_are_good_to_many_digits(x64):
     scene = js.Scene(particles=ball(dtype=np.float64), surface=js.Surface(0.45))
     view = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera())
