@@ -79,8 +79,8 @@ def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
     dark = [float((color.max(-1) < DARK).mean()) for color in shown if len(color)]
     bright = [float((color.min(-1) > BRIGHT).mean()) for color in shown if len(color)]
     for shares, what, remedy in (
-        (dark, f"darker than {DARK:.0%}", "a larger --exposure, --opacity-by log10:NAME, or another camera"),
-        (bright, f"brighter than {BRIGHT:.0%}", "a smaller --exposure, or another --range or --colormap"),
+        (dark, f"nearly black, darker than {DARK:.0%}", "a larger --exposure, --opacity-by log10:NAME, or another camera"),
+        (bright, f"nearly white, brighter than {BRIGHT:.0%}", "a smaller --exposure, or another --range or --colormap"),
     ):
         if shares and min(shares) >= NEARLY_ALL:
             share = f"{min(shares):.4g}"

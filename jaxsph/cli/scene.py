@@ -25,7 +25,7 @@ from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged
-from jaxsph.io.opening.views import camera_and_clip
+from jaxsph.io.opening.views import framed
 from jaxsph.io.settle.unit_names import stated_length
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -48,6 +48,12 @@ def require_something(options: Any) -> None:
 
 def scene_of(options: Any) -> tuple[Scene, Camera, Labels]:
     """The source, and what else shares its picture; the camera; and labels of what it shows."""
+    opened = opened_of(options)
+    return opened.scene, opened.camera, opened.labels
+
+
+def opened_of(options: Any) -> Opened:
+    """The same, with all that was chosen."""
     volumes, points = cli_parts.volumes_of(options), cli_parts.points_of(options)
     parts: list[tuple[str, Any]] = [*((path, volume) for path, volume, _ in volumes), *points]
     beside = Scene(
@@ -67,7 +73,7 @@ def scene_of(options: Any) -> tuple[Scene, Camera, Labels]:
     if parts:
         cli_parts.warn_apart([*shown, *parts], options.command)
     report(particles=opened.scene.particle_set.num_particles if opened.scene.particles is not None else 0)
-    return opened.scene, opened.camera, opened.labels
+    return opened
 
 
 Shown = list[tuple[str, Bounded]]
@@ -80,8 +86,8 @@ def _no_source(options: Any, beside: Scene) -> tuple[Opened, Shown]:
         name = next(iter(options.said), "transfer" if options.transfer is not None else "exposure")
         refuse(options, (name,), "is for FILE or scene:NAME, and there is none")
     with wrong_usage():
-        camera, clip, _ = camera_and_clip(beside, options)
-    return Opened(dataclasses.replace(beside, within=clip), camera, Labels(), ()), []
+        camera, clip, _, center = framed(beside, options)
+    return Opened(dataclasses.replace(beside, within=clip), camera, Labels(), (), center), []
 
 
 def named_scene(options: Any) -> tuple[str, Scene, Camera]:
@@ -111,7 +117,7 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     name, scene, camera = named_scene(options)
     particles = scene.particle_set
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
-    looked = cli_look.is_looked(options)
+    looked, center = cli_look.is_looked(options), None
     if looked:
         with wrong_usage():
             transfer, called = look_of(particles, "concentration", options)
@@ -123,7 +129,7 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     )
     with wrong_usage():
         if cli_where.is_placed(options):
-            camera, clip, said = camera_and_clip(scene, options)
+            camera, clip, said, center = framed(scene, options)
             for what, text in said:
                 say(what, text)
         else:
@@ -134,17 +140,17 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     if getattr(options, "surface", None) not in (None, False):
         scene = dataclasses.replace(scene, surface=Surface(options.surface))
         say("surface", f"where the coverage by particles is {options.surface:g}")
-    return Opened(scene, camera, labels, ()), [(options.source, particles)]
+    return Opened(scene, camera, labels, (), center), [(options.source, particles)]
 
 
 def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     """A file of particles or of a volume, as `io.read_scene` opens it."""
     loaded = loaded_of(options)
     labels = labels_of(loaded, options)
-    cli_where.framed(loaded.shown, options)  # refuses clips that leave nothing
     with wrong_usage():
         look = options if isinstance(options, groups.SurfaceLook) else dataclasses.replace(options, surface=False)
         opened = staged(loaded, look, options, source=options, beside=beside, labels=labels)
+    cli_where.left_by(cli_where.clip_of(options), opened.scene.particles or loaded.shown)  # refuses clips that leave nothing
     for what, text in opened.said:
         say(what, text)
     if getattr(options, "iso", None) is not None:

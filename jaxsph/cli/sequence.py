@@ -18,8 +18,9 @@ from jaxsph.cli.voice import say
 from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.model import Camera
+from jaxsph.model import Camera, Scene
 from jaxsph.model.camera.camera import Bounded
+from jaxsph.model.preview.frame import across_faces, bulk_of_period
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Survey, surveyed
 
@@ -47,12 +48,18 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     transfer = cli_look.look(colored, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
-    center = cli_where.middle_of(survey, options)
+    center, middle = cli_where.middle_of(survey, options), Scene(particles=survey.middle, transfer=transfer)
+    if center is None and options.eye is None and not options.clips and (place := across_faces(middle)) is not None:
+        center = tuple(place.tolist())
+        say("box", f"its middle is {' '.join(f'{one:.6g}' for one in center)}, as what is shown lies across its faces")
     if surface is not None:
         say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
     snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)
     placed = dataclasses.replace(options, center=None) if center is not None else options
-    return snapshots, cli_where.camera_of(snapshots, placed), cli_where.framed(snapshots, options)
+    if center is not None:
+        middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
+    shown = (None if options.clips or options.eye is not None else bulk_of_period(middle)) or snapshots
+    return snapshots, cli_where.camera_of(shown, placed), cli_where.left_by(snapshots.within, shown)
 
 
 def _say_survey(survey: Survey) -> None:

@@ -13,13 +13,14 @@ import numpy as np
 
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.voice import say
-from jaxsph.io.opening.views import FOV_DEGREES, UP, length_of
+from jaxsph.io.opening.views import FOV_DEGREES, OBLIQUE, UP, length_of
 from jaxsph.io.units import CodeUnit
-from jaxsph.model import Camera, Particles
+from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.camera.snug import snug, snug_box
 from jaxsph.model.clips.clips import Clip
+from jaxsph.model.preview.frame import Direction
 from jaxsph.sequence.snapshots import center_of
 from jaxsph.sequence.survey import Survey
 
@@ -38,7 +39,7 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
     Raises:
         UsageError: options that do not go together, or that the place does not suit.
     """
-    shown = framed(shown, options)
+    shown = left_by(clip_of(options), shown)
     lower, upper = shown.bounds()
     width, height = options.size
     with wrong_usage():
@@ -50,10 +51,13 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
             return _along(shown, options, middle, depths, unit)
         if options.view in ("face-on", "edge-on"):
             raise ValueError(f"--view {options.view} is for a single file that is rendered; choose x, y, z or iso")
-        if across is not None or middle is not None:
-            at = (lower + upper) / 2 if middle is None else middle
-            reach = (upper - lower) / 2 if across is None else np.full(3, length_of(across, "width", unit)[0] / 2)
-            shown = BoundingBox(at - reach, at + reach)
+        at = (lower + upper) / 2 if middle is None else middle
+        if across is not None:
+            tall = length_of(across, "width", unit)[0] * height / width
+            made = Direction.along(OBLIQUE, _up(options), _fov(options), options.size).camera(at, tall, Scene())
+            return snug_box(made, lower, upper)
+        if middle is not None:
+            shown = BoundingBox(at - (upper - lower) / 2, at + (upper - lower) / 2)
         return Camera.framing(shown, up=_up(options), fov_degrees=_fov(options), width=width, height=height)
 
 
@@ -126,17 +130,16 @@ def clip_of(options: Any) -> Clip | None:
     return functools.reduce(operator.and_, clips) if clips else None
 
 
-def framed(parts: Bounded, options: Any) -> Bounded:
-    """What there is to frame: all of it, or what is in the boxes and spheres that it is clipped by.
+def left_by(clip: Clip | None, parts: Bounded) -> Bounded:
+    """What there is to frame: all of it, or what a clip leaves.
 
     Raises:
-        UsageError: nothing is.
+        UsageError: that is nothing.
     """
-    inner = [one.ends for one in getattr(options, "clip", ()) if one.ends is not None]
-    if not inner:
+    if clip is None:
         return parts
     lower, upper = parts.bounds()
-    low, high = np.max([lower, *(one for one, _ in inner)], 0), np.min([upper, *(other for _, other in inner)], 0)
+    low, high = np.array([clip.ends(axis, lower, upper) for axis in np.eye(3)]).T
     if not (low < high).all():
         raise UsageError(f"nothing is inside of --clip; there is something {ends_of(lower, upper)}")
     return BoundingBox(low, high)

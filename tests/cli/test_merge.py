@@ -21,6 +21,16 @@ def test_a_part_is_called_as_it_was_asked_for(text, index):
     assert (part, str(part)) == ((index, 2), text)
 
 
+@pytest.mark.parametrize(("level", "said"), [(0.0, "nearly black"), (0.5, "")])
+def test_a_picture_of_parts_that_shows_almost_nothing_says_so(tmp_path, capsys, monkeypatch, level, said):
+    layer = np.zeros((8, 8), np.float32)
+    made = js.Image(layer[..., None] + np.full(3, level, np.float32), layer, layer, layer, layer, True, 0, {})
+    made.save("part.exr")
+    monkeypatch.setattr("jaxsph.scale.parts.merge_tiles", lambda parts, names: made)
+    code, _, err = run(capsys, "merge", "part.exr", "-o", "whole.png")
+    assert code == 0 and len(err) == bool(said) and said in "".join(err)
+
+
 @pytest.mark.slow
 def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
     assert run(capsys, "render", *SCENE, "-o", "whole.exr")[0] == 0

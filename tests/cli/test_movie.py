@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import commanded
 import numpy as np
@@ -86,6 +87,68 @@ def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch
     images = [np.asarray(js.io.read_image(f"m_frames/0000{number}.png").color) for number in (1, 2, 3)]
     assert all(image.max() > 0.1 and image[0].max() == 0 and image[:, 0].max() == 0 for image in images)  # nothing is cut off
     assert not np.array_equal(images[0], images[2])
+
+
+@pytest.fixture
+def cameras(monkeypatch):
+    """Those that frames would be rendered by, and their scene or snapshots."""
+    found = types.SimpleNamespace()
+
+    def render(sources, cameras, settings, client=None, output=None):
+        found.cameras, found.source = [*cameras], sources
+        return iter(())
+
+    monkeypatch.setattr(cli_movie, "render_frames", render)
+    return found
+
+
+def looked_at(camera, place):
+    """How wide the picture is at the depth of a place, and how far that lies from its middle."""
+    right, up, depth = np.asarray(camera.axes, np.float64) @ (np.asarray(place) - camera.exact_eye())
+    wide = 2 * float(camera.half_height) * camera.width / camera.height
+    return wide * (depth if camera.is_perspective else 1), max(abs(right), abs(up)), depth
+
+
+@pytest.mark.parametrize("view", [[], ["--view", "x"]], ids=["iso", "x"])
+@pytest.mark.parametrize("of", ["one file", "a sequence"])
+def test_a_camera_that_goes_around_keeps_center_and_width(sequence, cameras, capsys, view, of):
+    files = sequence[:1] if of == "one file" else sequence
+    place, asked = (0.5, -0.25, 0.125), ["--width", "0.75", *view]
+    if of == "one file":
+        asked += ["--center", "0.5,-0.25,0.125"]
+    assert run(capsys, *files, *asked, "--orbit", 90, "--frames", 3, *TINY, "-o", "m.mp4")[0] == 0
+    place = place if of == "one file" else np.mean(cameras.source[0].snapshots.bounds(), 0)
+    for camera in cameras.cameras:
+        wide, off, depth = looked_at(camera, place)
+        assert wide == pytest.approx(0.75, rel=1e-4) and off < 1e-4 and float(camera.near) < depth < float(camera.far)
+    assert cameras.cameras[0].exact_eye() @ cameras.cameras[-1].exact_eye() != pytest.approx(1)
+
+
+def test_a_camera_that_goes_around_a_clip_has_depths_of_it(sequence, cameras, capsys):
+    corners = np.array([[-0.5, -0.25, -0.5], [0.5, 0.25, 0.25]])
+    clip = "box:" + ",".join(map(str, corners.ravel()))
+    assert run(capsys, sequence[0], "--clip", clip, "--orbit", 360, "--frames", 5, *TINY, "-o", "m.mp4")[0] == 0
+    reach = np.linalg.norm(corners[1] - corners[0]) / 2
+    for camera in cameras.cameras:
+        wide, off, depth = looked_at(camera, corners.mean(0))
+        assert float(camera.near) > depth - 1.01 * reach and float(camera.far) < depth + 1.01 * reach and off < 1e-4
+        assert 1 < wide < 6
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_matter_across_the_faces_of_a_box_is_in_the_middle_of_a_movie(sequence, cameras, capsys, number):
+    for name in sequence:
+        columns = dict(np.load(name))
+        columns["position"] = np.mod(0.02 * columns["position"], 10).astype(np.float32)
+        np.savez(name, **columns | {"support": np.full(90, 0.05, np.float32)})
+    more = ["--box-size", "10,10,10", "--orbit", 90, "--frames", 3, *TINY, "-o", "m.mp4"]
+    code, out, _ = run(capsys, *sequence[:number], *more)
+    assert code == 0 and "lies across its faces" in out
+    for camera in cameras.cameras:
+        wide, off, _ = looked_at(camera, np.round(camera.exact_eye() / 10) * 10)
+        assert 0.1 < wide < 0.6 and off < 0.05
+    shown = cameras.source.scene if number == 1 else cameras.source[1]()
+    assert np.ptp(shown.particles.to_numpy()["position"], 0).max() < 0.3
 
 
 @pytest.mark.slow

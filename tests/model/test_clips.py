@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
+from jaxsph.model.camera.snug import corners_of
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
@@ -123,6 +124,38 @@ def test_what_is_said_of_boxes_holds_for_each_of_their_points(seed, name, size):
     for found, held in jax.tree.map(np.asarray, said[name]):
         assert (held | ~found.holds).all()
         assert (~held | found.meets).all()
+
+
+@examples(30)
+@given(WHERE, st.sampled_from(list(CLIPS)))
+def test_what_is_in_a_box_lies_between_its_ends_along_any_direction(seed, name):
+    rng = np.random.default_rng(seed)
+    lower = rng.uniform(-1.2, 0.5, 3)
+    upper, along = lower + rng.uniform(0.1, 2, 3), rng.normal(size=3)
+    along /= np.linalg.norm(along)
+    place = lower + rng.choice([0, 1, *rng.uniform(size=6)], (600, 3)) * (upper - lower)
+    for clip, held in ((CLIPS[name], inside(CLIPS[name], place)), (~CLIPS[name], ~inside(CLIPS[name], place))):
+        low, high = clip.ends(along, lower, upper)
+        there = place[held] @ along
+        assert ((there >= low - 1e-6) & (there <= high + 1e-6)).all()
+        corners = corners_of(lower, upper) @ along
+        assert not low < high or (low >= corners.min() - 1e-6 and high <= corners.max() + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("clip", "ends"),
+    [
+        (js.Plane((0, 0.5, 0), (0, 1, 1)), (-0.5, 1)),
+        (js.Box((-3, -3, -0.25), (3, 3, 0.5)), (-0.25, 0.5)),
+        (js.Sphere((0, 0, -1), 0.5), (-1, -0.5)),
+        (js.Plane((0, 0, 0.25), (0, 0, 1)) | js.Sphere((0, 0, -0.5), 0.25), (-0.75, 1)),
+        (js.Plane((0, 0, 0.5), (0, 0, -1)) & ~js.Plane((0, 0, -0.125), (0, 0, -1)), (-0.125, 0.5)),
+        (js.Sphere((9, 0, 0), 0.5), (np.inf, -np.inf)),
+    ],
+)
+def test_ends_are_those_of_what_is_left_of_a_cube(clip, ends):
+    low, high = clip.ends(np.array([0.0, 0.0, 1.0]), np.full(3, -1.0), np.full(3, 1.0))
+    assert (low, high) == pytest.approx(ends, abs=1e-6)
 
 
 def test_a_corner_far_from_the_origin_keeps_the_digits_of_float64():

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from jaxsph import io
 from jaxsph.cli import voice
-from jaxsph.cli.console import IMAGES, UsageError, largest, refuse, require_writable
+from jaxsph.cli.console import IMAGES, UsageError, largest, refuse, require_writable, tell_if_unseen
 from jaxsph.cli.options import groups
 from jaxsph.cli.options.groups import output
 from jaxsph.cli.voice import say
@@ -69,3 +69,4 @@ def merge(
         kind = "certified" if image.certified else "estimated"
         say("error", f"at most {largest(image.error_bound):.2g} ({kind}), tolerance {tolerance:g}")
     voice.written(asked.output, size=[width, height], parts=len(files))
+    tell_if_unseen("merge", asked.output, [image.color])

@@ -40,6 +40,9 @@ from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.path import middle
+from jaxsph.model.camera.snug import corners_of
+from jaxsph.model.clips.clips import Clip
+from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
@@ -50,6 +53,8 @@ MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
 """What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
+MARGIN = 1.05
+"""Of a picture in parallel rays over what is in it."""
 ANSWER = 30.0
 """Seconds within which a scheduler must answer."""
 EVERY = 5.0
@@ -115,14 +120,13 @@ def movie(
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown = (
-            snapshots_of(options, gaps=options.gaps, strict=options.strict) if len(options.source) > 1 else _still(options)
-        )
+        sources, camera, shown, center = _sequence(options) if len(options.source) > 1 else _still(options)
         path = _path(options, camera, shown, sized)
         number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = _number_of_frames(options, path, number)
         if options.orbit is not None:
-            path = _orbit(options, camera, shown, frames / options.fps)
+            within = sources.scene.within if isinstance(sources, Still) else sources.within
+            path = _orbit(options, camera, shown, within, center, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
         voice.release()
@@ -202,17 +206,24 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Still, Camera, Bounded]:
-    """One source, its camera, and what there is to see from all sides."""
+def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any]:
+    """Snapshots, their camera, what there ever is to see, and what is asked to be in the middle."""
+    sources, camera, shown = snapshots_of(options, gaps=options.gaps, strict=options.strict)
+    return sources, camera, shown, None if options.width is None else np.mean(shown.bounds(), 0)
+
+
+def _still(options: Any) -> tuple[Still, Camera, Bounded, Any]:
+    """One source, its camera, what there is to see from all sides, and what is asked to be in the middle."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
-    scene, camera, _ = cli_scene.scene_of(options)
+    opened = cli_scene.opened_of(options)
+    scene, camera = opened.scene, opened.camera
     if scene.parts and not scene.media:
-        return Still(scene), camera, cli_where.framed(scene, options)
+        return Still(scene), camera, cli_where.left_by(scene.within, bulk_of_period(scene) or scene), opened.center
     near, far = float(camera.near), float(camera.far)  # media do not say how large they are: what the camera sees of depth
     wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
     center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
-    return Still(scene), camera, cli_where.framed(BoundingBox(center - reach, center + reach), options)
+    return Still(scene), camera, cli_where.left_by(scene.within, BoundingBox(center - reach, center + reach)), opened.center
 
 
 def _moments(sources: Still | Snapshots, frames: int) -> Still | Sequence[Source]:
@@ -258,33 +269,44 @@ class _OnPath(Sequence[Camera]):
         return self._path.at(self._path.start + self._frames[frame] / self._fps)
 
 
-def _orbit(options: Any, camera: Camera, shown: Bounded, seconds: float) -> CameraPath:
-    """Around the middle of all there is, or the target, from where all is in view from every side unless the eye is given.
+def _orbit(options: Any, camera: Camera, shown: Bounded, within: Clip | None, center: Any, seconds: float) -> CameraPath:
+    """Around the middle of all there is, or the target, from where all is in view from every side; around what is asked to be in
+    the middle, or at the width or from the eye that is given, as near as a picture of it is.
 
     It ends where its next frame would begin anew.
     """
-    lower, upper = shown.bounds()
-    center = (lower + upper) / 2 if options.target is None else np.asarray(options.target, np.float64)
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower
-    radius = float(np.linalg.norm(corners - center, axis=1).max()) or 0.5
+    placed = center is not None or options.eye is not None
+    center = options.target if center is None else center
+    around = np.mean(shown.bounds(), 0) if center is None else np.asarray(center, np.float64)
+    radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
     up = options.up or (0.0, 1.0, 0.0)
-    if options.eye is None:
+    if within is not None:  # a ball in its box
+        depths = [np.subtract(within.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
+        radius = min(radius, float(np.abs(depths).max()))
+    if not placed:
         camera = _all_round(camera, shown, up)
     with wrong_usage():
-        return CameraPath.orbit(camera, options.orbit, center=center, radius=radius, up=up, seconds=seconds)
+        return CameraPath.orbit(camera, options.orbit, center=around, radius=radius, up=up, seconds=seconds)
 
 
 def _all_round(camera: Camera, shown: Bounded, up: Any) -> Camera:
     """A camera with the same line of sight, as far away as the side that needs it most asks for."""
     forward = np.array(camera.axes, np.float64)[2]
-    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
-    how: dict[str, Any] = {"up": up, "fov_degrees": 2 * math.degrees(math.atan(float(camera.half_height)))}
-    how |= {"width": camera.width, "height": camera.height}
-    turns = [Rotation.from_rotvec(2 * np.pi * side / DIRECTIONS * axis).apply(forward) for side in range(DIRECTIONS)]
+    how: dict[str, Any] = {"up": up, "width": camera.width, "height": camera.height}
     center = np.mean(shown.bounds(), 0)
-    views = [Camera.framing(shown, direction=direction, **how) for direction in turns]
+    if not camera.is_perspective:
+        tall = MARGIN * float(np.linalg.norm(np.ptp(shown.bounds(), 0))) * max(1, camera.height / camera.width)
+        return Camera.orthographic(center - tall * forward, center, view_height=tall, near=0.5 * tall, far=1.5 * tall, **how)
+    how["fov_degrees"] = 2 * math.degrees(math.atan(float(camera.half_height)))
+    views = [Camera.framing(shown, direction=direction, **how) for direction in _turns(camera, up)]
     distance = max(float(np.linalg.norm(view.exact_eye() - center)) for view in views)
     return Camera.look_at(center - distance * forward, center, **how, near=0.5 * distance, far=2 * distance)
+
+
+def _turns(camera: Camera, up: Any) -> list[np.ndarray]:
+    """Lines of sight of a camera that goes around."""
+    forward, axis = np.array(camera.axes, np.float64)[2], np.asarray(up, np.float64) / np.linalg.norm(up)
+    return [Rotation.from_rotvec(2 * np.pi * side / DIRECTIONS * axis).apply(forward) for side in range(DIRECTIONS)]
 
 
 def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: int) -> tuple[list[Path], FramesError | None]:

@@ -145,6 +145,7 @@ def _render(options: Any) -> None:
         image = dataclasses.replace(image, metadata=(*image.metadata, words.header("render", options.words, part=False)))
         _save(image, options, output)
         _say_written(output, image, camera, settings, options)
+        tell_if_unseen(options.command, output, [image.color])
         return
     scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
     say("camera", camera_line(camera, options))

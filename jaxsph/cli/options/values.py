@@ -156,25 +156,19 @@ class Named:
     Attributes:
         text: as it was written.
         clip: what is shown; None where everything is.
-        ends: lower and upper corner of what it leaves, where that is bounded.
     """
 
     text: str
     clip: Clip | None
-    ends: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 Numbers = tuple[float, ...]
-SHAPES: dict[str, tuple[str, Callable[[Numbers], Clip], Callable[[Numbers], tuple[Numbers, Numbers] | None]]] = {
-    "box": ("X0,Y0,Z0,X1,Y1,Z1", lambda given: Box(given[:3], given[3:]), lambda given: (given[:3], given[3:])),
-    "sphere": (
-        "X,Y,Z,R",
-        lambda given: Sphere(given[:3], given[3]),
-        lambda given: (tuple(one - given[3] for one in given[:3]), tuple(one + given[3] for one in given[:3])),
-    ),
-    "plane": ("X,Y,Z,NX,NY,NZ", lambda given: Plane(given[:3], given[3:]), lambda given: None),
+SHAPES: dict[str, tuple[str, Callable[[Numbers], Clip]]] = {
+    "box": ("X0,Y0,Z0,X1,Y1,Z1", lambda given: Box(given[:3], given[3:])),
+    "sphere": ("X,Y,Z,R", lambda given: Sphere(given[:3], given[3])),
+    "plane": ("X,Y,Z,NX,NY,NZ", lambda given: Plane(given[:3], given[3:])),
 }
-"""Of each: its numbers, the clip that they make, and corners of the box around it, where it is bounded."""
+"""Of each: its numbers, and the clip that they make."""
 
 
 def clip(text: str) -> Named:
@@ -183,17 +177,16 @@ def clip(text: str) -> Named:
         return Named(text, None)
     kind, _, given = text.removeprefix("~").partition(":")
     if kind not in SHAPES:
-        kinds = ", ".join(f"{name}:{names}" for name, (names, *_) in SHAPES.items())
+        kinds = ", ".join(f"{name}:{names}" for name, (names, _) in SHAPES.items())
         raise ValueError(
             f"must be {kinds}, with ~ before it for what is outside, or none; got {text!r}{did_you_mean(kind, SHAPES)}"
         )
-    names, make, ends = SHAPES[kind]
+    names, make = SHAPES[kind]
     try:
-        found = numbers(names)(given)
-        made = make(found)
+        made = make(numbers(names)(given))
     except ValueError as error:
         raise ValueError(f"{text}: {str(error).replace('`', '')}") from None
-    return Named(text, ~made) if text.startswith("~") else Named(text, made, ends(found))
+    return Named(text, ~made if text.startswith("~") else made)
 
 
 def plane(text: str) -> Plane:

@@ -19,7 +19,7 @@ from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, look_of
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface, within_surface
-from jaxsph.io.opening.views import Said, camera_and_clip, place_of
+from jaxsph.io.opening.views import Said, framed, place_of
 from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
 from jaxsph.io.settle.quantities import LOG_PREFIX
@@ -29,6 +29,7 @@ from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.preview.frame import across_faces
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -70,12 +71,14 @@ class Opened:
         camera: framed.
         labels: for a key.
         said: what was chosen, for people: pairs of a word and a sentence.
+        center: (3,) what is in the middle of the picture, where that or a width was asked for.
     """
 
     scene: Scene
     camera: Camera
     labels: Labels
     said: tuple[tuple[str, str], ...]
+    center: np.ndarray | None = None
 
 
 def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
@@ -142,13 +145,10 @@ def staged(
     transfer, called = look_of(colored, loaded.quantity, look, by_log=(loaded.opacity_by or "").lower().startswith(LOG_PREFIX))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows = _rows(loaded, source, view)
-    if isinstance(loaded.shown, Particles) and loaded.shown.box is not None and view.center is not None:
-        place: Any = place_of(scene, view.center, rows)
-        scene = dataclasses.replace(scene, particles=loaded.shown.centered(place))
-        view = dataclasses.replace(view, center=tuple(place))
-    framed = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
-    camera, clip, said = camera_and_clip(framed, view, rows)
-    scene = dataclasses.replace(scene, within=both(scene.within, clip))
+    scene, view, moved = _in_one_piece(scene, view, rows, beside)
+    seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
+    camera, clip, said, center = framed(seen, view, rows)
+    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *said]
     if surface is None:
         scene = exposed(scene, camera, look)
     else:
@@ -157,7 +157,26 @@ def staged(
     values = np.asarray(scene.looks[0].values)
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
-    return Opened(scene, camera, labels or _labels(loaded), tuple(said))
+    return Opened(scene, camera, labels or _labels(loaded), tuple(said), center)
+
+
+def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
+    """A periodic set with its period around what is to be in the middle; or, where nothing says that, around matter that lies
+    across faces: eyes and clips are placed among coordinates as they are, and so is what shares the picture.
+    """
+    if scene.particles is None or scene.particles.box is None:
+        return scene, view, []
+    said: Said = []
+    place: Any = place_of(scene, view.center, table)
+    if place is not None:
+        view = dataclasses.replace(view, center=tuple(place))
+    elif view.eye is None and not view.clips and (beside is None or not beside.parts):
+        place = across_faces(scene)
+        if place is not None:
+            said = [("box", f"its middle is {' '.join(f'{one:.6g}' for one in place)}, as what is shown lies across its faces")]
+    if place is None:
+        return scene, view, said
+    return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

@@ -10,7 +10,7 @@ import functools
 import math
 import operator
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.spatial
@@ -23,7 +23,7 @@ from jaxsph.io.units import CodeUnit
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips.clips import Clip, both
 from jaxsph.model.clips.shapes import Sphere
 from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
@@ -69,7 +69,22 @@ def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str 
     return number / factor, f"{number:g} {called}"
 
 
-def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None) -> tuple[Camera, Clip | None, Said]:
+class Framed(NamedTuple):
+    """How a scene is seen.
+
+    Attributes:
+        camera, clip: from where, and what is shown of it.
+        said: what was chosen.
+        center: (3,) what is in the middle of the picture, where that or a width was asked for.
+    """
+
+    camera: Camera
+    clip: Clip | None
+    said: Said
+    center: np.ndarray | None = None
+
+
+def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Framed:
     """The camera that is asked for, where it shows the scene, and what was chosen.
 
     Args:
@@ -81,8 +96,9 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
         ValueError: a center where there is nothing, a length that is none, what the particles do not hold.
     """
     clip = functools.reduce(operator.and_, view.clips) if view.clips else None
+    shown = dataclasses.replace(scene, within=both(scene.within, clip))
     if view.eye is not None:
-        return _from_eye(scene, view), clip, []
+        return Framed(_from_eye(shown, view), clip, [])
     said: Said = []
     unit = None if table is None else table.units.length
     center = place_of(scene, view.center, table)
@@ -90,18 +106,17 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
         said.append(("center", " ".join(f"{value:.6g}" for value in center)))  # type: ignore[union-attr]
     direction = direction_of(view, table, center)
     if view.frame_all:
-        return _all_of(scene, direction, center), clip, said
+        return Framed(_all_of(shown, direction, center), clip, said, center)
     if view.width is None:
-        camera = fitted(_within(scene, clip), direction, center)
+        camera = fitted(shown, direction, center)
         outside = num_outside(scene, camera)
         if outside and clip is None:
             count = scene.particle_set.num_particles
             said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --width all shows them"))
-        return camera, clip, said
+        return Framed(camera, clip, said, center)
     width, told = length_of(view.width, "width", unit)
     if center is None:
-        found = fitted(_within(scene, clip), direction)
-        center = np.array(middle(found))
+        center = np.array(middle(fitted(shown, direction)))
     said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
     height = width * view.size[1] / view.size[0]
     reach = math.inf
@@ -109,12 +124,11 @@ def camera_and_clip(scene: Scene, view: View, table: ParticleTable | None = None
         reach = REACH * max(width, height)
         clip = Sphere(tuple(center), reach)
         said.append(("clip", f"what is farther than {reach:.4g} from the middle is left out; --clip none shows it"))
-    camera = direction.camera(center, height, scene, reach)
-    return camera, clip, said
+    return Framed(direction.camera(center, height, shown, reach), clip, said, center)
 
 
 def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **view: Any) -> Camera:
-    """See `Camera.fitted`: the camera of `camera_and_clip`, which leaves nothing of the scene out."""
+    """See `Camera.fitted`: the camera of `framed`, which leaves nothing of the scene out."""
     known = {"center", "view", "up", "fov_degrees", "frame_all"}
     if not known >= set(view):
         raise ValueError(
@@ -122,7 +136,7 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
         )
     if scene.parts:
         scene.check()
-    return camera_and_clip(scene, View(size=size, width=across, clips=(), **view))[0]
+    return framed(scene, View(size=size, width=across, clips=(), **view)).camera
 
 
 def direction_of(view: View, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
@@ -232,7 +246,3 @@ def _all_of(scene: Scene, direction: Direction, center: np.ndarray | None) -> Ca
     width, height = direction.size
     half = math.radians(direction.fov_degrees or 0) / 2
     return direction.camera(middle, 2 * reach * max(1, height / width) / math.cos(half), scene)
-
-
-def _within(scene: Scene, clip: Clip | None) -> Scene:
-    return scene if clip is None else dataclasses.replace(scene, within=clip)

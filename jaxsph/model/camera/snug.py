@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.numerics.checks import array_of, is_traced
 
 NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
@@ -40,7 +40,8 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
         raise ValueError(
             "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
         )
-    found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *getattr(shown, "parts", (shown,)))
+    parts = getattr(shown, "parts", (shown,))
+    found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *parts, clip=getattr(shown, "within", None))
     ends = (camera.near, found.near), (camera.far, found.far)
     near, far = (array_of(own if given is None else given, camera.dtype) for given, own in ends)
     if not float(near) < float(far):
@@ -50,10 +51,25 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
     return dataclasses.replace(camera, near=near, far=far)
 
 
-def snug(camera: Camera, *parts: Any) -> Camera:
-    """`camera` with near and far moved to supports, radii and boxes of parts; unchanged where none lies in front of the eye."""
+def snug(camera: Camera, *parts: Any, clip: Any = None) -> Camera:
+    """`camera` with near and far moved to supports, radii and boxes of parts, as far as a clip shows them; unchanged where none
+    lies in front of the eye.
+    """
     spans = [span for part in parts if (span := _span(camera, part)) is not None]
-    return _between(camera, min(near for near, _ in spans), max(far for _, far in spans)) if spans else camera
+    if not spans:
+        return camera
+    ends = min(near for near, _ in spans), max(far for _, far in spans)
+    return _between(camera, *clipped(ends, camera, clip, *parts))
+
+
+def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -> tuple[float, float]:
+    """Depths at which a clip shows what lies between two; these where it is None, or shows nothing there."""
+    if clip is None:
+        return ends
+    shown = clip.ends(np.asarray(camera.axes, np.float64)[2], *BoundingBox.around(parts))
+    origin = float(_depth(camera, np.zeros(3)))
+    near, far = max(ends[0], shown[0] + origin), min(ends[1], shown[1] + origin)
+    return (near, far) if near < far else ends
 
 
 def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:

@@ -13,14 +13,18 @@ import abc
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import corners_of
 from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.trees import tree
 
 Place = tuple[Float[Array, "..."], ...]
 """Coordinates x, y and z of points."""
+Ends = tuple[float, float]
+"""Least and greatest coordinate; of nothing they descend."""
 
 
 class Spans(NamedTuple):
@@ -65,6 +69,10 @@ class Clip(abc.ABC):
     def over(self, lower: Place, upper: Place) -> Overlap:
         """Which boxes it meets, and which it holds: both are right whatever is rounded here and in `contains`."""
 
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """Between which coordinates along a direction lies what of a box is in it, or is not `inside`; at most (host side)."""
+        return ends_of(corners_of(lower, upper) @ along)
+
 
 @tree()
 class Outside(Clip):
@@ -91,6 +99,10 @@ class Outside(Clip):
         inner = self.clip.over(lower, upper)
         return Overlap(~inner.holds, ~inner.meets)
 
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`."""
+        return self.clip.ends(along, lower, upper, not inside)
+
 
 @tree()
 class Both(Clip):
@@ -115,6 +127,16 @@ class Both(Clip):
         """See `Clip`."""
         first, second = self.first.over(lower, upper), self.second.over(lower, upper)
         return Overlap(first.meets & second.meets, first.holds & second.holds)
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`."""
+        begins, ends = zip(*(one.ends(along, lower, upper, inside) for one in (self.first, self.second)), strict=True)
+        return (max(begins), min(ends)) if inside else (min(begins), max(ends))
+
+
+def ends_of(coordinates: np.ndarray) -> Ends:
+    """Of points."""
+    return float(coordinates.min(initial=np.inf)), float(coordinates.max(initial=-np.inf))
 
 
 def both(first: Clip | None, second: Clip | None) -> Clip | None:

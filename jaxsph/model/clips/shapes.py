@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip, Overlap, Place, Spans, ascending, common
+from jaxsph.model.camera.snug import corners_of
+from jaxsph.model.clips.clips import Clip, Ends, Overlap, Place, Spans, ascending, common, ends_of
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.given import plain
@@ -77,6 +78,18 @@ class Plane(Clip):
         """See `Clip`."""
         low, high = _heights(self.point, self.normal, lower, upper)
         return Overlap(high >= 0, low >= 0)
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`: of the corners on its side, and of where it cuts edges."""
+        corners = corners_of(lower, upper)
+        point, normal = (np.asarray(vector, np.float64) for vector in (self.point, self.normal))
+        height = (corners - point - np.asarray(self.rest, np.float64)) @ (normal if inside else -normal)
+        first, last = np.array([(k, k | bit) for bit in (1, 2, 4) for k in range(8) if not k & bit]).T
+        cut = (height[first] >= 0) != (height[last] >= 0)
+        first, last = first[cut], last[cut]
+        share = (height[first] / (height[first] - height[last]))[:, None]
+        crossed = corners[first] + share * (corners[last] - corners[first])
+        return ends_of(np.concatenate([corners[height >= 0], crossed]) @ along)
 
     def _height(self, place: Place) -> Array:
         return _along(self.normal, place, self.point)
@@ -157,6 +170,13 @@ class Box(_Boxed):
         """Lower and upper corner in float64 (host side)."""
         rest = np.asarray(self.rest, np.float64)
         return np.asarray(self.lower, np.float64) + rest[0], np.asarray(self.upper, np.float64) + rest[1]
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`."""
+        if inside:
+            low, high = self.corners()
+            lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+        return super().ends(along, lower, upper) if (lower <= upper).all() else (np.inf, -np.inf)
 
     def of_dtype(self, dtype: Any) -> Box:
         """The same in float32 or float64 (host side)."""
@@ -253,6 +273,15 @@ class Sphere(Clip):
             slack = slack + jnp.maximum(jnp.abs(low), jnp.abs(high)) + jnp.abs(own)
         slack = ROUNDING * jnp.finfo(self.radius.dtype).eps * (slack + jnp.abs(self.radius))
         return Overlap(jnp.sqrt(_square(near)) <= self.radius + slack, jnp.sqrt(_square(far)) <= self.radius - slack)
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`: of the box around it, and of the ball."""
+        if not inside:
+            return super().ends(along, lower, upper)
+        radius, center = float(self.radius), np.asarray(self.center, np.float64) + np.asarray(self.rest, np.float64)
+        begin, end = Box((center - radius).tolist(), (center + radius).tolist()).ends(along, lower, upper)
+        middle = float(center @ along)
+        return max(begin, middle - radius), min(end, middle + radius)
 
     def _from_center(self, place: Place) -> list[Array]:
         return [at - own for at, own in zip(place, self.center, strict=True)]

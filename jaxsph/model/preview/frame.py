@@ -15,8 +15,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import corners_of
+from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.snug import clipped, corners_of
 from jaxsph.model.preview.glimpse import glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -122,6 +122,42 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
     return camera
 
 
+def bulk_of_period(scene: Scene) -> BoundingBox | None:
+    """Around the central 99 % of the light of a periodic set, across faces, too (host side); a whole side of the box along axes
+    where the bulk fills more than half of it. None where it does so along all of them, or there is no light.
+    """
+    scene = _evenly_lit(scene)
+    particles = scene.particles
+    if particles is None or particles.box is None or not (light := _strength(scene) * np.asarray(particles.valid)).any():
+        return None
+    lower, upper = particles.box.corners()
+    found = light > 0
+    share, ends = light[found] / light.sum(), []
+    margin = float(np.asarray(particles.support, np.float64)[found] @ share)
+    for axis, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        place, side = particles.exact_position()[found, axis], high - low
+        begin, length = _arc(place, share, side)
+        if length > side / 2:
+            ends.append((low, high))
+            continue
+        middle = low + (begin + length / 2 - low) % side
+        around = middle + (place - middle + side / 2) % side - side / 2
+        first, last = _quantiles(around, share, ((1 - CENTRAL) / 2, (1 + CENTRAL) / 2))
+        ends.append((first - margin, last + margin))
+    box = BoundingBox(*np.array(ends).T)
+    return None if (box.upper - box.lower >= upper - lower).all() else box
+
+
+def across_faces(scene: Scene) -> np.ndarray | None:
+    """The middle of a period, (3,), in which the bulk of a periodic set is whole; None where it is so already."""
+    bulk, particles = bulk_of_period(scene), scene.particles
+    if bulk is None or particles is None or particles.box is None:
+        return None
+    lower, upper = particles.box.corners()
+    beyond = (bulk.lower < lower) | (bulk.upper > upper)
+    return np.where(beyond, (bulk.lower + bulk.upper) / 2, (lower + upper) / 2) if beyond.any() else None
+
+
 def num_outside(scene: Scene, camera: Camera) -> int:
     """Particles whose middle is not in the picture (host side)."""
     if scene.particles is None:
@@ -154,6 +190,7 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
     if not ends:
         return camera
     near, far = max(min(front for front, _ in ends), between[0]), min(max(back for _, back in ends), between[1])
+    near, far = clipped((near, far), camera, scene.within, *scene.parts)
     if camera.is_perspective and far <= 0:
         return camera
     if camera.is_perspective:
@@ -216,6 +253,19 @@ def _quantiles(values: np.ndarray, share: np.ndarray, at: tuple[float, float]) -
     order = np.argsort(values)
     summed = np.cumsum(share[order]) - share[order] / 2
     return np.interp(at, summed, values[order])
+
+
+def _arc(values: np.ndarray, share: np.ndarray, side: float) -> tuple[float, float]:
+    """Where the shortest part of a circle begins that holds the bulk of values that weigh by shares of 1; and its length."""
+    turned = values % side
+    order = np.argsort(turned)
+    twice = np.concatenate([turned[order], turned[order] + side])
+    summed = np.cumsum(np.tile(share[order], 2))
+    before = np.append(0, summed[: len(order) - 1])
+    last = np.minimum(np.searchsorted(summed, before + BULK[1] - BULK[0]), len(twice) - 1)
+    length = twice[last] - twice[: len(order)]
+    best = int(np.argmin(length))
+    return float(twice[best]), float(length[best])
 
 
 def _central(places: np.ndarray, light: np.ndarray) -> tuple[float, float]:

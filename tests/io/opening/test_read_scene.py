@@ -8,6 +8,7 @@ from jaxsph.io.opening.opened import load, staged
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import length_of
 from jaxsph.io.units import LENGTH, CodeUnit
+from jaxsph.model.preview.glimpse import glimpse
 
 h5py = pytest.importorskip("h5py")
 
@@ -147,6 +148,33 @@ def test_a_periodic_box_is_centred_where_it_is_asked_for(tmp_path):
         scene, camera = js.io.read_scene(path, center=center, width=0.5, view="z", size=SIZE)
         assert np.abs((middle_of(scene) + 0.5) % 1 - 0.5).max() < 0.1
         assert np.asarray(js.reference.render(scene, camera, SEEN).alpha)[16, 24] > 0.5
+
+
+@pytest.mark.parametrize("view", [{}, {"view": "z"}, {"view": "x", "width": 0.7}])
+def test_matter_across_the_faces_of_a_box_is_shown_in_one_piece(tmp_path, view):
+    """Wherever its middle is, the picture is the same."""
+    rng = np.random.default_rng(5)
+    away = 0.01 * rng.normal(size=(400, 3))
+    pictures = []
+    for nth, middle in enumerate(((0.4, 0.55, 0.5), (0.0, 0.55, 0.99), (0.5, 0.0, 0.5))):
+        columns = {"SmoothingLength": np.full(400, 0.02), "Density": np.ones(400), "Masses": np.ones(400)}
+        path = snapshot(tmp_path / f"{nth}.hdf5", {"Coordinates": np.mod(away + middle, 1.0), **columns}, BoxSize=1.0)
+        scene, camera = js.io.read_scene(path, size=SIZE, **view)
+        moved = [not np.allclose(low, 0) for low in scene.particles.bounds()[0]]
+        assert moved == [[False] * 3, [True, False, True], [False, True, False]][nth]
+        pictures.append(glimpse(scene, camera).picture())
+        np.testing.assert_allclose(pictures[nth], pictures[0], atol=0.05)
+    assert (pictures[0].max(-1) > 0.05).mean() > (0.002 if "width" in view else 0.1)
+
+
+@pytest.mark.parametrize("given", [{"eye": (0.5, 0.5, 3.0)}, {"clips": (js.Box((0.9, 0, 0), (1.0, 1, 1)),)}, {"filled": True}])
+def test_a_box_stays_where_a_place_in_it_is_said_and_where_it_is_filled(tmp_path, given):
+    filled, rng = given.pop("filled", False), np.random.default_rng(5)
+    position = rng.uniform(size=(400, 3)) if filled else np.mod(0.01 * rng.normal(size=(400, 3)), 1.0)
+    columns = {"SmoothingLength": np.full(400, 0.05), "Density": np.ones(400), "Masses": np.ones(400)}
+    path = snapshot(tmp_path / "box.hdf5", {"Coordinates": position, **columns}, BoxSize=1.0)
+    scene, _ = js.io.read_scene(path, size=SIZE, **given)
+    np.testing.assert_array_equal(scene.particles.bounds(), [np.zeros(3), np.ones(3)])
 
 
 def middle_of(scene):

@@ -9,6 +9,7 @@ import pytest
 import jaxsph as js
 from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.model.camera.snug import snug, with_depths
+from jaxsph.model.preview.frame import snug_in_picture
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -38,6 +39,26 @@ def test_depths_are_those_of_supports_radii_and_grids():
     between(
         3.5, 4.5, with_depths(OPEN, js.Particles.from_arrays(np.zeros((1, 3)), 0.1, 1.0, box=js.Box((-1, -1, -0.5), (1, 1, 0.5))))
     )
+
+
+@pytest.mark.parametrize(
+    ("within", "ends"),
+    [
+        (js.Box((-9, -9, 0.1), (9, 9, 0.3)), (3.7, 3.9)),
+        (js.Plane((0, 0, 0.2), (0, 0, -3)), (3.8, None)),
+        (js.Sphere((0, 0, 0.3), 0.1) | js.Sphere((0, 0, -0.2), 0.1), (3.6, 4.3)),
+        (js.Sphere((0, 0, 20), 0.1), (None, None)),
+    ],
+)
+def test_depths_follow_what_a_clip_shows(within, ends):
+    """Of an open camera, and of one that is fitted; a clip that shows nothing changes none."""
+    depth = 4 - POSITION[:, 2]
+    all_of = (depth - 0.3).min(), (depth + 0.3).max()
+    ends = tuple(of if end is None else end for end, of in zip(ends, all_of, strict=True))
+    shown = dataclasses.replace(SCENE, within=within)
+    between(*ends, with_depths(OPEN, shown))
+    wide = js.Camera.look_at(**VIEW, near=1, far=9)
+    assert snug_in_picture(wide, shown).near_and_far() == pytest.approx(ends, rel=3e-3)
 
 
 def test_what_is_given_stays():

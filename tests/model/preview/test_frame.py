@@ -1,5 +1,7 @@
 """Framing: what is lit fills most of the picture, and stray particles do not rule it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from examples import examples
@@ -7,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
+from jaxsph.model.preview.frame import Direction, across_faces, bulk_of_period, fitted, num_outside, snug_in_picture
 from jaxsph.model.preview.glimpse import exposure, glimpse
 
 OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
@@ -49,6 +51,28 @@ def test_stray_particles_do_not_rule_the_frame_and_are_counted(far):
     scene = scene_of(position, 0.12)
     camera = fitted(scene, Direction.along(OBLIQUE, UP, 30.0, (64, 64)))
     assert filled(scene, camera) >= 0.75 and num_outside(scene, camera) >= 2
+
+
+@examples(20)
+@given(st.tuples(*[st.floats(-2, 2)] * 3), st.tuples(*[st.sampled_from([0.1, 0.3, 1.0])] * 3))
+def test_the_bulk_of_a_periodic_set_is_found_wherever_its_period_begins(moved, sides):
+    """Along axes that it does not fill, it is as long, and holds nearly all; one that is whole is left where it is."""
+    position, box = (block(sides=sides, count=500) + moved) % 1, np.ones(3)
+    scene = scene_of(position, 0.02)
+    scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, box=js.Box(0 * box, box)))
+    bulk, place, small = bulk_of_period(scene), across_faces(scene), np.array(sides) < 1
+    assert (bulk is None) == (not small.any())
+    if bulk is None:
+        assert place is None
+        return
+    np.testing.assert_allclose((bulk.upper - bulk.lower)[~small], 1)
+    np.testing.assert_allclose((bulk.upper - bulk.lower)[small], np.array(sides)[small] + 0.04, atol=0.02)
+    assert (((position - bulk.lower) % 1 <= bulk.upper - bulk.lower) | ~small).all(1).mean() > 0.96
+    if place is not None:
+        centred = scene.particles.centered(place)
+        lower, upper = centred.bounds()
+        assert across_faces(dataclasses.replace(scene, particles=centred)) is None and (bulk.upper <= upper + 1).all()
+        assert (np.abs(place - 0.5)[~small] < 1e-6).all() and (upper - lower == 1).all()
 
 
 def test_one_large_support_does_not_rule_the_frame():
