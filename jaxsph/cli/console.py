@@ -169,7 +169,7 @@ def camera_line(camera: Camera, options: Any = None) -> str:
         for at, said in zip(computed, given, strict=True)
     ]
     place = " --target ".join(texts)
-    return f"--eye {place} --fov {fov:.4g}, depths {near:.5g} to {far:.5g}"
+    return f"--eye {place} --fov {fov:.4g}{_up(options)}, depths {near:.5g} to {far:.5g}"
 
 
 def _parallel(camera: Camera, options: Any) -> str:
@@ -179,7 +179,13 @@ def _parallel(camera: Camera, options: Any) -> str:
     center = given if isinstance(given, tuple) else middle(camera)
     place = ",".join(f"{value:.6g}" for value in center)
     view = getattr(options, "view", None) or "z"
-    return f"--view {view} --center {place} --width {tall * camera.width / camera.height:.6g}, depths {near:.5g} to {far:.5g}"
+    wide = tall * camera.width / camera.height
+    return f"--view {view} --center {place} --width {wide:.6g}{_up(options)}, depths {near:.5g} to {far:.5g}"
+
+
+def _up(options: Any) -> str:
+    up = getattr(options, "up", None)
+    return "" if up is None else f" --up {','.join(f'{value:.6g}' for value in up)}"
 
 
 def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:

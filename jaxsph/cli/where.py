@@ -13,11 +13,11 @@ import numpy as np
 
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.voice import say
-from jaxsph.io.opening.views import FOV_DEGREES, OBLIQUE, UP, length_of
+from jaxsph.io.opening.views import FOV_DEGREES, length_of
 from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
-from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.camera.snug import snug, snug_box
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.preview.frame import Direction
@@ -54,22 +54,23 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
         at = (lower + upper) / 2 if middle is None else middle
         if across is not None:
             tall = length_of(across, "width", unit)[0] * height / width
-            made = Direction.along(OBLIQUE, _up(options), _fov(options), options.size).camera(at, tall, Scene())
+            made = Direction.along(*sight("iso", _up(options)), _fov(options), options.size).camera(at, tall, Scene())
             return snug_box(made, lower, upper)
         if middle is not None:
             shown = BoundingBox(at - (upper - lower) / 2, at + (upper - lower) / 2)
-        return Camera.framing(shown, up=_up(options), fov_degrees=_fov(options), width=width, height=height)
+        forward, up = sight("iso", _up(options))
+        return Camera.framing(shown, direction=forward, up=up, fov_degrees=_fov(options), width=width, height=height)
 
 
 def _along(shown: Bounded, options: Any, middle: Any, depths: tuple[float, float] | None, unit: CodeUnit | None) -> Camera:
     """With parallel rays along an axis; `depths` are coordinates along it."""
     width, height = options.size
-    whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths)
+    whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths, up=_up(options))
     across = getattr(options, "width", None)
     if across is None and middle is None:
         return whole
     tall = 2 * float(whole.half_height) if across is None else length_of(across, "width", unit)[0] * height / width
-    forward, up = np.asarray(VIEWS[options.view], np.float64)
+    _, up, forward = np.asarray(whole.axes, np.float64)
     eye = whole.exact_eye()
     at = eye if middle is None else middle
     moved = eye + (at - eye) - ((at - eye) @ forward) * forward
@@ -95,7 +96,8 @@ def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) 
     width, height = options.size
     target = (lower + upper) / 2 if options.target is None else options.target
     near, far = depths or (1e-3, 1.0)
-    made = Camera.look_at(options.eye, target, _up(options), _fov(options), width, height, near=near, far=far)
+    up = upright(np.subtract(target, options.eye), _up(options))
+    made = Camera.look_at(options.eye, target, up, _fov(options), width, height, near=near, far=far)
     if depths is not None:
         return made
     return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)

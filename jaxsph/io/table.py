@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.units import NO_UNITS, FileUnits
+from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.kernels import by_name
 
 SUPPORT_NAMES = ("support", "support_radius")
@@ -99,6 +100,12 @@ class ParticleTable:
         columns = {name: column[which] for name, column in self.columns.items()}
         support, volume = (None if column is None else column[which] for column in (self.support, self.volume))
         return dataclasses.replace(self, position=self.position[which], columns=columns, support=support, volume=volume)
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Which way is up: z in files of codes that have it so, as Phantom and DualSPHysics do, else y."""
+        z = self.source.startswith("Phantom") or self.named("Rhop") is not None
+        return (0.0, 0.0, 1.0) if z else UP
 
     @property
     def scalars(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
-from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.framing import sight
 from jaxsph.model.camera.path import middle
 from jaxsph.model.scene import Scene
 
@@ -23,7 +23,6 @@ HALF_TURN = 180.0
 """Degrees that a pointer's way over the height of the picture turns the view by."""
 MIN_ZOOM, MAX_ZOOM = 1e-3, 1e3
 """Of the distance that a view begins at, how far it may come near or go away."""
-OBLIQUE = (-0.45, -0.35, -1.0)
 NARROWEST, WIDEST = 1.0, 150.0  # degrees of perspective that a parallel view is given back as
 
 
@@ -39,6 +38,7 @@ class Pose:
         perspective: whether rays spread from the eye; else half the visible height is `distance * tangent`.
         pole: (3,) axis that a sideways motion turns about.
         start: distance of the first view, by which zooming is bounded.
+        up: (3,) which way is up: the axis of the world that was most so in the first view.
     """
 
     target: np.ndarray
@@ -48,6 +48,7 @@ class Pose:
     perspective: bool
     pole: np.ndarray
     start: float
+    up: np.ndarray
 
     @classmethod
     def of(cls, camera: Camera, scene: Scene) -> Pose:
@@ -61,7 +62,9 @@ class Pose:
         distance = ahead if ahead > 0 else reach
         half = float(camera.half_height)
         tangent = half if camera.is_perspective else half / distance
-        return cls(eye + distance * axes[2], axes, distance, tangent, camera.is_perspective, axes[1].copy(), distance)
+        most = np.abs(axes[1]).argmax()
+        up = np.eye(3)[most] * np.sign(axes[1, most])
+        return cls(eye + distance * axes[2], axes, distance, tangent, camera.is_perspective, axes[1].copy(), distance, up)
 
     @property
     def eye(self) -> np.ndarray:
@@ -107,9 +110,9 @@ class Pose:
 
     def along(self, name: str) -> Pose:
         """Seen along an axis, `"x"`, `"y"` or `"z"`, from the other side with a minus before it; or `"iso"`."""
-        forward, up = VIEWS[name.lstrip("-")] if name != "iso" else (OBLIQUE, (0.0, 1.0, 0.0))
-        ahead = np.asarray(forward, np.float64) * (-1 if name.startswith("-") else 1)
-        axes = _looking(ahead / np.linalg.norm(ahead), np.asarray(up, np.float64))
+        forward, up = sight(name.lstrip("-"), self.up)
+        ahead = forward * (-1 if name.startswith("-") else 1)
+        axes = _looking(ahead / np.linalg.norm(ahead), up)
         return dataclasses.replace(self, axes=axes, pole=axes[1].copy())
 
     def fitted(self, lower: np.ndarray, upper: np.ndarray, aspect: float) -> Pose:

@@ -10,6 +10,7 @@ from jaxsph.cli.commands import project as command
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
+UPWARD = (0.0, 1.0, 0.0)
 COUNT = 60
 
 
@@ -80,7 +81,7 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
 
 def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
     particles, given, volume = gas()
-    camera = js.Camera.along_axis(particles, "x", 18, 12)
+    camera = js.Camera.along_axis(particles, "x", 18, 12, up=UPWARD)
     ray = {"pixel": "ray"}
     for arguments, of, weight, more in (
         (["--of", "number"], np.ones(COUNT), None, {}),
@@ -91,7 +92,7 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
         (["--depth-range", "0.4,0.6"], given["mass"], None, {"depth_range": (0.4, 0.6)}),
     ):
         found, _ = values(capsys, file, "--view", "x", "--pixel", "ray", *arguments)
-        view = js.Camera.along_axis(particles, "x", 18, 12, **more) if more else camera
+        view = js.Camera.along_axis(particles, "x", 18, 12, up=UPWARD, **more) if more else camera
         truth = js.reference.project(particles, view, of, weight, **ray).values
         there = np.isfinite(truth) & np.isfinite(found)
         assert (np.isfinite(truth) != np.isfinite(found)).mean() < 0.03  # within rounding of a support's edge

@@ -243,5 +243,5 @@ def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, by_re
     assert (code, err) == (0, [])
     particles = io.read_particles(file)
     plane = js.Plane((0.5, 0.5, 0.4), (1, 0, 0))
-    expected = js.slice(particles, plane, center=(0.5, 0.5, 0.4), view_height=0.4, width=24, height=16)
+    expected = js.slice(particles, plane, center=(0.5, 0.5, 0.4), up=(0, 1, 0), view_height=0.4, width=24, height=16)
     np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)

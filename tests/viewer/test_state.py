@@ -77,6 +77,16 @@ def test_a_plane_follows_the_view_until_it_is_held_and_cuts_what_is_before_it(st
     assert state.scene.within is None and state.told()["cut"] is None
 
 
+@pytest.mark.parametrize(("up", "eye"), [((0, 1, 0), (1.5, 1.2, 3)), ((0, 0, 1), (1.5, -3, 1.2))])
+def test_what_is_up_in_the_first_view_is_so_along_all_axes(up, eye):
+    scene, _ = js.scenes.load("radial", 60, width=12, height=8)
+    state = State(scene, js.Camera.look_at(eye, (0, 0, 0), up, width=12, height=8))
+    for along in ("x", "-x", "y", "z", "iso"):
+        state.do({"do": "axis", "name": along}, nowhere)
+        right, upright, ahead = state.pose.axes @ up
+        assert abs(right) < 1e-9 and (upright > 0.5 or ahead == -1)
+
+
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_a_box_and_a_sphere_are_sized_around_the_middle_of_the_view(state, kind):
     state.do({"do": "cut", "kind": kind, "share": 0.2}, nowhere)

@@ -90,5 +90,9 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
 
 
 def _camera(loaded: Loaded) -> Camera:
-    """The camera that `render` would choose."""
-    return staged(loaded, Look(), View()).camera
+    """The camera that `render` would choose, and what of it is said."""
+    opened = staged(loaded, Look(), View())
+    for what, text in opened.said:
+        if what in ("surface", "box", "up"):
+            say(what, text)
+    return opened.camera

@@ -120,13 +120,13 @@ def movie(
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown, center = _sequence(options) if len(options.source) > 1 else _still(options)
+        sources, camera, shown, center, up = _sequence(options) if len(options.source) > 1 else _still(options)
         path = _path(options, camera, shown, sized)
         number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = _number_of_frames(options, path, number)
         if options.orbit is not None:
             within = sources.scene.within if isinstance(sources, Still) else sources.within
-            path = _orbit(options, camera, shown, within, center, frames / options.fps)
+            path = _orbit(dataclasses.replace(options, up=options.up or up), camera, shown, within, center, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
         voice.release()
@@ -206,24 +206,26 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any]:
-    """Snapshots, their camera, what there ever is to see, and what is asked to be in the middle."""
+def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any, Any]:
+    """Snapshots, their camera, what there ever is to see, what is asked to be in the middle, and what is up."""
     sources, camera, shown = snapshots_of(options, gaps=options.gaps, strict=options.strict)
-    return sources, camera, shown, None if options.width is None else np.mean(shown.bounds(), 0)
+    center = None if options.width is None else np.mean(shown.bounds(), 0)
+    return sources, camera, shown, center, sources.survey.report.up
 
 
-def _still(options: Any) -> tuple[Still, Camera, Bounded, Any]:
-    """One source, its camera, what there is to see from all sides, and what is asked to be in the middle."""
+def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
+    """The same of one source."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)
     scene, camera = opened.scene, opened.camera
-    if scene.parts and not scene.media:
-        return Still(scene), camera, cli_where.left_by(scene.within, bulk_of_period(scene) or scene), opened.center
-    near, far = float(camera.near), float(camera.far)  # media do not say how large they are: what the camera sees of depth
-    wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
-    center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
-    return Still(scene), camera, cli_where.left_by(scene.within, BoundingBox(center - reach, center + reach)), opened.center
+    shown: Bounded = bulk_of_period(scene) or scene
+    if not scene.parts or scene.media:  # media do not say how large they are: what the camera sees of depth
+        near, far = float(camera.near), float(camera.far)
+        wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
+        center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
+        shown = BoundingBox(center - reach, center + reach)
+    return Still(scene), camera, cli_where.left_by(scene.within, shown), opened.center, opened.up
 
 
 def _moments(sources: Still | Snapshots, frames: int) -> Still | Sequence[Source]:
@@ -279,7 +281,7 @@ def _orbit(options: Any, camera: Camera, shown: Bounded, within: Clip | None, ce
     center = options.target if center is None else center
     around = np.mean(shown.bounds(), 0) if center is None else np.asarray(center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
-    up = options.up or (0.0, 1.0, 0.0)
+    up = options.up
     if within is not None:  # a ball in its box
         depths = [np.subtract(within.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
         radius = min(radius, float(np.abs(depths).max()))

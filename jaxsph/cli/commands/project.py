@@ -305,6 +305,7 @@ def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Came
         assert place is not None
         say("center", " ".join(f"{value:.6g}" for value in place))
         options = dataclasses.replace(options, center=tuple(place))
+    options = dataclasses.replace(options, up=options.up or table.up)
     return cli_where.camera_of(particles, options, depths, table.units.length)
 
 

@@ -31,7 +31,7 @@ from jaxsph.io.opening.views import length_of, place_of
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.model import Particles, Scene, TransferFunction
-from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips.shapes import Plane
 
 
@@ -78,7 +78,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     if cli_look.has_key(options):
         cli_look.require_figure(output, (".png",))
     particles, transfer, loaded = _shown(options)
-    center, plane = _place(particles, transfer, loaded, options)
+    center, plane, up = _place(particles, transfer, loaded, options)
     width, height = options.size
     unit = None if loaded is None or loaded.table is None else loaded.table.units.length
     started = time.perf_counter()
@@ -89,7 +89,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         plane,
         within=cli_where.clip_of(options),
         center=center,
-        up=options.up,
+        up=up,
         view_height=across,
         width=width,
         height=height,
@@ -149,16 +149,17 @@ def _labels(loaded: Loaded | None, options: Any) -> Labels:
     return cli_look.label_file(loaded.table, loaded.quantity, cli_look.values_of(loaded.shown), options)
 
 
-def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane]:
-    """What is in the middle of the picture, and the plane."""
+def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane, Any]:
+    """What is in the middle of the picture, the plane, and what is up."""
     center = options.center
     if center is not None:
         with wrong_usage():
             center = place_of(Scene(particles=particles, transfer=transfer), center, None if loaded is None else loaded.table)
         assert center is not None
         say("center", " ".join(f"{value:.6g}" for value in center))
+    up = options.up or (UP if loaded is None or loaded.report is None else loaded.report.up)
     if options.plane is not None:
-        return center, options.plane
+        return center, options.plane, upright(options.plane.normal, up)
     middle = np.mean(particles.bounds(), 0) if center is None else center
-    forward, _ = VIEWS[options.view or "z"]
-    return center, Plane(tuple(middle), tuple(-np.asarray(forward, np.float64)))
+    forward, up = sight(options.view or "z", up)
+    return center, Plane(tuple(middle), tuple(-forward)), up

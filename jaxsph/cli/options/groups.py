@@ -194,7 +194,7 @@ def require_length(text: str) -> None:
 
 
 _SIZE = option("--size", "WxH", values.size, CAMERA, "pixels (default 512x512)")
-_UP = option("--up", "X,Y,Z", values.place, CAMERA, "upward direction (default 0,1,0)")
+_UP = option("--up", "X,Y,Z", values.place, CAMERA, "upward direction (default: that of the kind of file, else 0,1,0)")
 _CENTER = option("--center", "X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass")
 _WIDTH = option("--width", "LENGTH", str, CAMERA, "across the picture, as 30 or 30kpc, or all (default: what is lit)")
 _CLIP = option(

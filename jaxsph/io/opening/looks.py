@@ -7,7 +7,7 @@ Flow: Particles or Volume, names of quantities, Look -> [looks] -> TransferFunct
 | `density` | density, rho, mass, pressure, column densities | over decades, from dark red |
 | `temperature` | temperature, internal energy, entropy | over decades, from violet to yellow |
 | `velocity` | components of vectors, and all that has both signs | diverging, even about 0 |
-| `magnetic` | speed and strengths of fields | from blue to white |
+| `speed`, `magnetic` | speed and Mach number; strengths of fields | from blue to white |
 | `fluid` | concentrations, dyes, all else | viridis |
 
 Opacity follows the logarithm of its quantity where that is positive and spreads over more than a decade.
@@ -41,7 +41,8 @@ from jaxsph.numerics.checks import array_of
 KINDS = {
     "temperature": (*ROLES["temperature"], *ROLES["internal_energy"], "entropy", "energy"),
     "density": (*ROLES["density"], *ROLES["mass"], "pressure", "numberdensity", "metallicity"),
-    "magnetic": ("speed", "mach", "machnumber", "fieldstrength"),
+    "speed": ("speed", "mach", "machnumber"),
+    "magnetic": ("fieldstrength",),
 }
 """Names by which the kind of a quantity is known, but for case and punctuation."""
 TAILS = (0.5, 99.5)

@@ -27,6 +27,7 @@ from jaxsph.io.settle.selection import chosen
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import across_faces
@@ -72,6 +73,7 @@ class Opened:
         labels: for a key.
         said: what was chosen, for people: pairs of a word and a sentence.
         center: (3,) what is in the middle of the picture, where that or a width was asked for.
+        up: (3,) which way is up.
     """
 
     scene: Scene
@@ -79,6 +81,7 @@ class Opened:
     labels: Labels
     said: tuple[tuple[str, str], ...]
     center: np.ndarray | None = None
+    up: Any = UP
 
 
 def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
@@ -157,7 +160,12 @@ def staged(
     values = np.asarray(scene.looks[0].values)
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
-    return Opened(scene, camera, labels or _labels(loaded), tuple(said), center)
+    up = UP if rows is None else rows.up
+    if view.up is None and rows is not None:
+        said.append(
+            ("up", "y; --up 0,0,1 has z" if up == UP else f"z, as in other files like this ({rows.source}); --up 0,1,0 has y")
+        )
+    return Opened(scene, camera, labels or _labels(loaded), tuple(said), center, view.up or up)
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:

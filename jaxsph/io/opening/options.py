@@ -141,9 +141,10 @@ class View:
         center: what is in the middle of the picture: x, y and z in the file's lengths; "densest" or "mass".
         width: across the picture at the middle, a length of the file or with a unit, as `"30 kpc"`. What is farther than that
             from the middle is left out, unless clips are given.
-        view: "x", "y" or "z": parallel rays along an axis; "face-on" or "edge-on": parallel rays along or across the angular
-            momentum; "iso": perspective from obliquely above.
-        eye, target, up: of a perspective view from a place.
+        view: "x", "y" or "z": parallel rays along an axis, from above along that which is up; "face-on" or "edge-on": parallel
+            rays along or across the angular momentum; "iso": perspective from obliquely above.
+        eye, target: of a perspective view from a place.
+        up: which way is up in the picture; None is z for files of codes that have it so, as Phantom and DualSPHysics do, else y.
         fov_degrees: vertical field of view of a perspective view, in (0, 180).
         size: width and height in pixels.
         clips: parts of space that are shown, all of them together; None leaves `width` to choose, () shows everything.

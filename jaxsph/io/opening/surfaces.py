@@ -24,7 +24,7 @@ from jaxsph.model.particles.surface import Surface
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
-OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY"
+OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY", "ParaView table", "DualSPHysics table"
 """Formats that liquids are kept in, by tools that draw their surface: points that lie evenly are one, without supports, too."""
 ALSO = (*OF_LIQUIDS, "NumPy archive")
 """Formats in which particles with supports may be a liquid."""

@@ -21,6 +21,7 @@ from jaxsph.io.settle.unit_names import named
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import CodeUnit
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips.clips import Clip, both
@@ -28,8 +29,6 @@ from jaxsph.model.clips.shapes import Sphere
 from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 
-OBLIQUE = (-0.45, -0.35, -1.0)
-UP = (0.0, 1.0, 0.0)
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75
@@ -98,7 +97,7 @@ def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Fram
     clip = functools.reduce(operator.and_, view.clips) if view.clips else None
     shown = dataclasses.replace(scene, within=both(scene.within, clip))
     if view.eye is not None:
-        return Framed(_from_eye(shown, view), clip, [])
+        return Framed(_from_eye(shown, view, table), clip, [])
     said: Said = []
     unit = None if table is None else table.units.length
     center = place_of(scene, view.center, table)
@@ -141,11 +140,9 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
 
 def direction_of(view: View, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
     """The line of sight that is asked for."""
-    forward: Any
-    upward: Any
+    upward: Any = view.up if view.up is not None else UP if table is None else table.up
     if view.view in ALONG:
-        forward, upward = ALONG[view.view]
-        return Direction.along(forward, upward if view.up is None else view.up, None, view.size)
+        return Direction.along(*sight(view.view, upward), None, view.size)
     if view.view in ("face-on", "edge-on"):
         spin = angular_momentum(table, center, view.view)
         across = np.cross(spin, UP if abs(spin[1]) < 0.9 * np.linalg.norm(spin) else (1.0, 0.0, 0.0))
@@ -154,7 +151,7 @@ def direction_of(view: View, table: ParticleTable | None = None, center: np.ndar
     fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
     if not 0 < fov < 180:
         raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov:g}; it is the vertical field of view")
-    return Direction.along(OBLIQUE, UP if view.up is None else view.up, fov, view.size)
+    return Direction.along(*sight("iso", upward), fov, view.size)
 
 
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:
@@ -225,7 +222,7 @@ def _masses(table: ParticleTable) -> np.ndarray:
     return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
 
 
-def _from_eye(scene: Scene, view: View) -> Camera:
+def _from_eye(scene: Scene, view: View, table: ParticleTable | None) -> Camera:
     """The camera at the eye that is asked for, snug to what is in its picture."""
     lower, upper = scene.bounds()
     target = (lower + upper) / 2 if view.target is None and view.center is None else view.target
@@ -233,7 +230,9 @@ def _from_eye(scene: Scene, view: View) -> Camera:
         target = place_of(scene, view.center, None)
     width, height = view.size
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
-    up = UP if view.up is None else view.up
+    up = view.up
+    if up is None:
+        up = upright(np.subtract(target, view.eye), UP if table is None else table.up)
     made = Camera.look_at(view.eye, target, up, fov, width, height, near=1e-3, far=1.0)
     return snug_in_picture(made, scene)
 

@@ -20,6 +20,7 @@ from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel
 from jaxsph.io.settle.unit_names import written
 from jaxsph.io.settle.where import evaluated, select
 from jaxsph.io.table import ParticleTable
+from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import plain
 
@@ -57,6 +58,7 @@ class Report:
         kernel: the smoothing kernel, and why it is that one.
         notes: further sentences: what was left out, periodic boxes, rounding.
         evenly: whether supports are chosen, as those of particles that lie about evenly.
+        up: which way is up, see `ParticleTable`.
     """
 
     source: str
@@ -71,6 +73,7 @@ class Report:
     opacity_by: str | None = None
     kernel: str = ""
     evenly: bool = False
+    up: tuple[float, float, float] = UP
 
     def __str__(self) -> str:
         lines = [
@@ -196,6 +199,7 @@ def _assemble(
         opacity_by=opacity_by,
         kernel=kernel_origin,
         evenly=support_origin.endswith(EVENLY),
+        up=table.up,
     )
     return particles, report
 

@@ -24,7 +24,7 @@ from jaxsph.io.table import ParticleTable, plain, refuse_rows
 from jaxsph.numerics.nearest import did_you_mean
 
 ROLES: dict[str, tuple[str, ...]] = {
-    "density": ("density", "densities", "rho", "gas_density", "den"),
+    "density": ("density", "densities", "rho", "rhop", "gas_density", "den"),
     "mass": ("mass", "masses", "particle_mass", "m"),
     "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
     "temperature": ("temperature", "temperatures", "temp"),
@@ -36,8 +36,10 @@ LOG_PREFIX = "log10:"
 LOG_DECADES = 2.0
 """Positive quantities that span more decades than this are shown by their logarithm when nobody chose."""
 
-LIQUID = 1.5
-"""Ratio of densities, between the 5th and 95th percentile, up to which they tell less than speeds do."""
+LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
+"""Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's
+free surface misses what is beyond it.
+"""
 
 Gather = Callable[[], Float[np.ndarray, " particles"]]
 
@@ -49,7 +51,8 @@ def choose_quantity(
 
     Without a name, the first of these that the table has and that is not the same for all particles: a concentration
     or dye, temperature, internal energy, stored density unless it hardly varies and there are velocities, speed, summed
-    density. Temperature, internal energy and density become `log10:...` when they are
+    density unless there are velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its speed,
+    as it is when it moves. Temperature, internal energy and density become `log10:...` when they are
     positive and span more than two decades.
 
     Args:
@@ -128,10 +131,10 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
     scaled = [name for name in telling if name is not None and table.columns[name].ndim == 1]
     speed = ["speed"] if velocity_name(table) else []
     stored = table.named(*ROLES["density"])
+    summed = density is not None and stored not in scaled and not (speed and table.named(*ROLES["mass"]) is None)
     if speed and stored in scaled and _hardly_varies(table.columns[stored]):
         scaled.remove(stored)
-    candidates = [*dyes, *scaled, *speed, *(["density"] if density is not None and stored not in scaled else [])]
-    candidates = candidates or ["z"]
+    candidates = [*dyes, *scaled, *speed, *(["density"] if summed else [])] or ["z"]
     for candidate in candidates:
         values, full_name = choose_quantity(table, candidate, density=density)
         if len(values) == 0 or values.min() < values.max():
@@ -143,7 +146,7 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
 
 def _hardly_varies(values: np.ndarray) -> bool:
     """Whether a density is that of a liquid, which is nearly the same everywhere."""
-    low, high = np.percentile(values, (5, 95)) if len(values) else (0.0, 0.0)
+    low, high = np.percentile(values, LIQUID_BETWEEN) if len(values) else (0.0, 0.0)
     return bool(low > 0 and high < LIQUID * low)
 
 

@@ -219,6 +219,7 @@ class Camera:
         *,
         margin: float = 1.0,
         depth_range: tuple[float, float] | None = None,
+        up: Any = None,
     ) -> Camera:
         """Orthographic camera along an axis that shows all of what there is (host side).
 
@@ -229,11 +230,12 @@ class Camera:
             width, height: size in pixels.
             margin: 1 fills the image to its edge, larger leaves a border.
             depth_range: coordinates along the axis between which rays are followed; by default all.
+            up: (3,) direction that is up instead, seen from above along that.
 
         Raises:
             ValueError: another axis, or coordinates that do not ascend.
         """
-        view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range)
+        view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range, up)
         return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
 
     @classmethod

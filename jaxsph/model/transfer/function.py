@@ -151,7 +151,7 @@ class TransferFunction:
         """One that suits a kind of data.
 
         Args:
-            name: `"fluid"`, `"density"`, `"temperature"`, `"velocity"`, `"magnetic"` or `"scan"`.
+            name: `"fluid"`, `"density"`, `"temperature"`, `"velocity"`, `"speed"`, `"magnetic"` or `"scan"`.
             shown: particles or a volume.
             more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
         """

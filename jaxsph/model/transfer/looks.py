@@ -8,7 +8,8 @@ Flow: Particles or Volume, colour map or kind of data -> [looks] -> TransferFunc
 | `density` | heat | log | rises with the cube from 0: what is dense shows through thin gas | gas and dark matter, over decades |
 | `temperature` | coolwarm | log | rises with the square | hot gas within cold |
 | `velocity` | coolwarm | linear; 0 in the middle where signs change | high at both ends, or rising: flows, no rest | components |
-| `magnetic` | ice | log | rises with the square | field strengths, energies |
+| `speed` | ice, as water | log | rises with the square | speeds |
+| `magnetic` | the same | log | rises with the square | field strengths, energies |
 | `scan` | gray | percentile | none below a quarter, then rising | CT and MRI: air and noise are not shown |
 
 Extinction is made such that typical columns have a given optical depth (`fitted`), and a map of colours has 16 control points:
@@ -81,6 +82,7 @@ PRESETS: dict[str, Preset] = {
     "density": Preset("heat", "log", _rising(3, 0), lift=0.25),
     "temperature": Preset("coolwarm", "log", _rising(STEEPNESS)),
     "velocity": Preset("coolwarm", "linear", _rising(STEEPNESS, 0), lambda place: np.abs(2 * place - 1) ** 1.5),
+    "speed": Preset("ice", "log", _rising(STEEPNESS)),
     "magnetic": Preset("ice", "log", _rising(STEEPNESS)),
     "scan": Preset("gray", "percentile", lambda place: np.clip((place - 0.25) / 0.75, 0, 1) ** STEEPNESS),
 }
@@ -210,6 +212,8 @@ def preset(
     else:
         range, shown = tuple(shown), None
     given, ramp = _ends(range), chosen.ramp
+    if chosen.domain == "log" and quantity is not None and not quantity.any():  # nothing of these kinds is below 0
+        given = {"low": max(given["low"] or 0.0, 0.0), "high": given["high"] or 1.0}
     if norm is None:
         norm = chosen.domain
         low, high = range or (np.percentile(quantity, TAILS) if quantity is not None and quantity.size else (0.0, 0.0))

@@ -69,6 +69,54 @@ def test_with_no_options_the_disc_fills_the_picture(galaxy):
     assert scene.particles.extinction_quantity is not None
 
 
+@pytest.mark.parametrize(("column", "k"), [("rho", 1), ("Rhop", 2)], ids=["y is up", "z is up, as DualSPHysics has it"])
+@pytest.mark.parametrize("view", [{}, {"view": "x"}, {"eye": (9, 0.1, 0.2)}, {"up": (1, 0, 0)}])
+def test_up_is_y_unless_the_kind_of_file_has_z_or_it_is_said(tmp_path, column, k, view):
+    rng = np.random.default_rng(2)
+    path = tmp_path / "table.csv"
+    np.savetxt(path, rng.uniform(size=(60, 4)), header=f"x,y,z,{column}", comments="", delimiter=",")
+    opened = staged(load(path), view=View(size=SIZE, **view))
+    up = np.eye(3)[0 if "up" in view else k]
+    np.testing.assert_array_equal(opened.up, up)
+    right, upright, ahead = np.asarray(opened.camera.axes, np.float64) @ up
+    assert abs(right) < 1e-6 and upright > 0.7 and ahead < 0.1
+    told = dict(opened.said).get("up", "")
+    assert told.startswith("" if "up" in view else "yz"[k - 1]) and ("--up" in told) == ("up" not in view)
+
+
+LIQUIDS = {
+    "ParaView": ("Points:0,Points:1,Points:2,pressure,velocity:0,velocity:1,velocity:2", 1.0, ""),
+    "DualSPHysics by ParaView": ("Points:0,Points:1,Points:2,Rhop,Vel:0,Vel:1,Vel:2", 1000.0, "Rhop"),
+    "DualSPHysics": ("Pos.x [m],Pos.y [m],Pos.z [m],Rhop [kg/m^3],Vel.x [m/s],Vel.y [m/s],Vel.z [m/s]", 1000.0, "Rhop"),
+}
+
+
+@pytest.mark.parametrize("name", LIQUIDS)
+@pytest.mark.parametrize("moves", [True, False])
+def test_tables_of_liquids_are_surfaces_coloured_by_speed_with_their_density(tmp_path, name, moves):
+    header, density, called = LIQUIDS[name]
+    steps = 0.1 * np.stack(np.meshgrid(*[np.arange(7.0)] * 3), -1).reshape(-1, 3)
+    rows = np.concatenate([steps, density + steps[:, :1], moves * steps], 1)
+    np.savetxt(tmp_path / "water.csv", rows, header=header, comments="", delimiter=",")
+    loaded = load(tmp_path / "water.csv")
+    opened = staged(loaded, view=View(size=SIZE))
+    assert opened.scene.surface is not None and loaded.quantity == "speed"
+    said = dict(opened.said)
+    assert "(speed)" in said["colours"] and "= -" not in said["colours"]
+    assert not any("sum of kernels" in note for note in loaded.report.notes)
+    if called:
+        named = js.io.read_particles(tmp_path / "water.csv", quantity="density").to_numpy()["quantity"]
+        np.testing.assert_allclose(named, rows[:, 3])
+
+
+def test_a_line_of_sight_along_what_is_up_needs_no_other_word(tmp_path):
+    path = tmp_path / "table.csv"
+    np.savetxt(path, np.random.default_rng(2).uniform(size=(60, 4)), header="x,y,z,Rhop", comments="", delimiter=",")
+    for view in ({"view": "z"}, {"eye": (0.5, 0.5, 9), "target": (0.5, 0.5, 0)}):
+        _, camera = js.io.read_scene(path, size=SIZE, **view)
+        np.testing.assert_allclose(camera.axes, [[1, 0, 0], [0, 1, 0], [0, 0, -1]], atol=1e-6)
+
+
 def test_what_was_chosen_is_said(galaxy):
     said = dict(staged(load(galaxy), view=View(size=SIZE)).said)
     assert "temperature" in said["colours"] and "InternalEnergy" in said["colours"]

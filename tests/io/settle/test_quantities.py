@@ -104,12 +104,22 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"density": 1000 + one_to_three}, "density"),
         ({"density": 10.0 ** (2 * one_to_three)}, "log10:density"),
         ({"density": np.ones(3), "velocity": velocity}, "speed"),
+        ({"Rhop": 1000 + one_to_three, "Vel": velocity}, "speed"),
+        ({"Rhop": 1000 + one_to_three, "Vel": 0 * velocity}, "speed"),
+        ({"density": 1000 - 900 * (one_to_three == 1), "velocity": np.ones((3, 3))}, "density"),
+        ({"velocity": np.ones((3, 3))}, "speed"),
         ({"velocity": velocity}, "speed"),
         ({"id": one_to_three}, "z"),
     ],
 )
 def test_without_a_name_the_most_telling_quantity_is_picked(columns, expected):
     assert choose_quantity(table(**columns))[1] == expected
+
+
+def test_massless_particles_that_have_velocities_are_not_shown_by_a_sum_of_kernels():
+    still = {"velocity": np.ones((3, 3))}
+    assert choose_quantity(table(**still), density=lambda: one_to_three)[1] == "speed"
+    assert choose_quantity(table(mass=one_to_three, **still), density=lambda: one_to_three)[1] == "density"
 
 
 def test_bare_points_are_shown_by_density_and_its_logarithm_where_they_cluster():

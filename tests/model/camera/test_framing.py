@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.model.camera.framing import VIEWS, sight
+from jaxsph.model.preview.frame import Direction
 
 
 class Bounds:
@@ -21,6 +23,27 @@ THERE = Bounds((-1, 2, 10), (3, 3, 16))
 def test_axes_point_to_the_right_and_upwards(axis, right, up, ahead):
     axes = np.asarray(js.Camera.along_axis(THERE, axis, 30, 20).axes)
     np.testing.assert_allclose(axes, [np.eye(3)[right], np.eye(3)[up], ahead * np.eye(3)["xyz".index(axis)]], atol=1e-7)
+
+
+@pytest.mark.parametrize("view", ["iso", "x", "y", "z"])
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, -2, 0), (0.3, 1, -0.2)])
+def test_what_is_up_is_so_in_the_picture_or_seen_from_above(view, up):
+    forward, upward = sight(view, up)
+    axes, up = Direction.along(forward, upward, None, (8, 8)).axes, np.array(up) / np.linalg.norm(up)
+    right, upright, ahead = axes @ up
+    assert abs(right) < 1e-9 and upright >= -1e-9 and ahead <= 1e-9
+    if view == "iso":
+        assert ahead == pytest.approx(-0.35 / np.linalg.norm((0.45, 0.35, 1)))
+        return
+    np.testing.assert_array_equal(np.abs(axes[2]), np.abs(VIEWS[view][0]))
+    if upright < 1e-9 and abs(up[0]) < 1:
+        np.testing.assert_allclose(axes[0], (1, 0, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize(("axis", "up", "rows"), [("x", 1, (-3, 2, -1)), ("y", 1, (1, -3, -2)), ("z", 2, (1, 2, -3))])
+def test_an_axis_is_seen_with_what_is_said_to_be_up(axis, up, rows):
+    axes = js.Camera.along_axis(THERE, axis, 30, 20, up=np.eye(3)[up]).axes
+    np.testing.assert_allclose(axes, [np.sign(row) * np.eye(3)[abs(row) - 1] for row in rows], atol=1e-7)
 
 
 @pytest.mark.parametrize("axis", "xyz")

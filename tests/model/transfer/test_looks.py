@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lookups import look_up
 
+import jaxsph as js
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
 from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, default_transfer, opacity_by_second, value_range
 from jaxsph.model.transfer.maps import colormap
@@ -40,6 +41,14 @@ def test_extinction_rises_with_the_quantity_over_the_range():
 def test_a_constant_quantity_has_a_range(values):
     low, high = value_range(values)
     assert low < values.min() and high > values.max() and np.float32(low) < np.float32(high)
+
+
+@pytest.mark.parametrize("name", ["speed", "density", "temperature", "magnetic"])
+@pytest.mark.parametrize("value", [0.0, 2.5])
+def test_what_is_never_negative_has_colours_from_0_up_where_it_is_constant(name, value):
+    shown = js.Particles.from_arrays(np.random.default_rng(0).random((20, 3)), 0.3, np.full(20, value))
+    values = np.asarray(js.TransferFunction.preset(name, shown).values)
+    assert 0 <= values[0] <= value <= values[-1] and values[0] < values[-1]
 
 
 def test_a_few_odd_values_do_not_take_the_colours():
