@@ -26,6 +26,8 @@ from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.trees import tree
 
+STEPS = 32  # roundings of the thickness of a sample, from sums over particles to the mean of its extinction
+
 
 @tree()
 class RayResult:
@@ -137,12 +139,25 @@ def segments_of(
     return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))
 
 
+def rounding_of(batches: Batches) -> Float[Array, "packets 1 1"]:
+    """What rounding may add to the errors of the rays of packets; nothing where nothing is marched.
+
+    A slab that is put into a ray rounds colour and transmittance by a half of eps, which are at most 1, and so does its product
+    with the light in front. Its thickness is wrong by a half of eps of itself for each sample that is added up, and for `STEPS`
+    before: of all slabs together that is as much of the light, as thicknesses take no more of it than there is.
+    """
+    dtype, plan = batches.half_steps.dtype, batches.plan
+    filled = batches.schedule.filled.sum(0).astype(dtype)
+    halves = 2 * filled + (plan.slab_samples << plan.doublings) + STEPS
+    return jnp.where(filled > 0, halves, 0)[:, None, None] * (jnp.finfo(dtype).eps / 2)
+
+
 def result_of(rays: RayState, batches: Batches) -> RayResult:
     """Rays in the order of packets, as rows and columns."""
     rank, shape = batches.compacted.bundle_rank, batches.packets.shape
     color, transmittance, depth = (
         field[..., rank, :].reshape(*field.shape[:-2], -1, *shape) for field in (rays.color, rays.transmittance, rays.depth)
     )
-    error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape))
+    error = None if rays.square is None else CAUTION * jnp.sqrt(rays.square[rank].reshape(-1, *shape)) + rounding_of(batches)
     stop = None if rays.stop is None else rays.stop[:, rank].reshape(4, -1, *shape)
     return RayResult(color, transmittance, depth, error=error, stop=stop)

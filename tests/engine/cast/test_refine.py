@@ -55,6 +55,19 @@ def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled, qui
     assert np.asarray(images[1].error_bound).mean() < np.asarray(images[0].error_bound).mean()
 
 
+@pytest.mark.parametrize("thin", [1e-5, 1e-7, 1e-9])
+def test_where_errors_are_small_rounding_belongs_to_what_is_told(frames, quick_programs, thin) -> None:
+    """Of what hardly takes light, whose segments differ by less than float32 rounds sums of light by."""
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    settings = dataclasses.replace(SEGMENTS, samples=frames.samples)
+    plan = js.plan(scene, camera, settings)
+    scene = dataclasses.replace(scene, transfer=dataclasses.replace(scene.transfer, extinction=thin * scene.transfer.extinction))
+    image = js.render(scene, camera, settings, plan=plan)
+    told = np.asarray(image.error_bound, np.float64)[2::4, 2::4]
+    assert (errors(image, scene, camera) <= told).all() and told.max() < 1e-4 and not int(image.faults)
+
+
 @pytest.mark.slow
 def test_gaps_between_two_samples_that_see_particles_are_seen_by_what_supports_cover() -> None:
     """Two particles behind one another, half of a first sample apart: both resolutions that are compared miss the gap."""
