@@ -9,8 +9,8 @@ Samples of a finer level lie evenly between those of the first.
 
 Errors of slabs are of either sign, as they come from how the field bends here and there: those of a ray add up as independent
 ones do, $\epsilon^2 = \sum_k (T_k e_k)^2$. So of n slabs that a bundle has, each may have $\mathrm{REACH} / \sqrt n$ of the
-tolerance; most have less. `CAUTION` times the sum, and what rounding may add (`march.rounding_of`), is the estimate: it was found on scenes that no benchmark reports
-(`benchmarks/calibrate_segments.py`), and is no bound.
+tolerance; most have less. `CAUTION` times the sum, and what rounding may add (`march.rounding_of`), is the estimate: it was
+found on scenes that no benchmark reports (`benchmarks/calibrate_segments.py`), and is no bound.
 """
 
 from __future__ import annotations
