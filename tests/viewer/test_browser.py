@@ -275,6 +275,46 @@ def test_where_there_is_little_width_the_panel_is_below_the_picture(page):
         assert page.ask(write.format(longest)) == page.ask(write.format("full"))
 
 
+@pytest.mark.parametrize(
+    ("size", "direction"), [((780, 480), "row"), ((600, 400), "row"), ((500, 700), "column"), ((400, 420), "column")]
+)
+def test_in_small_windows_all_controls_can_be_reached(page, size, direction):
+    page.size(*size)
+    page.until(f"getComputedStyle(document.querySelector('.whole')).flexDirection === '{direction}'")
+    reach = """(() => { const p = document.querySelector('.panel'); p.scrollTop = p.scrollHeight;
+      const r = p.getBoundingClientRect(), last = [...p.querySelectorAll('button')].pop().getBoundingClientRect();
+      const c = document.querySelector('.picture').getBoundingClientRect();
+      return [r.top, r.bottom, last.bottom, innerHeight, r.height, c.height]; })()"""
+    top, bottom, last, window, panel, picture = page.ask(reach)
+    assert 0 <= top < bottom <= window + 1 and last <= bottom + 1 and panel > 120 and picture > 60
+    page.size(1280, 800)
+
+
+def test_nothing_says_that_a_picture_is_final_until_it_is_that_of_the_view(page):
+    """From what is asked for on, in the very moment that it is known."""
+    told = "[document.querySelector('.chip').textContent, document.body.dataset.final]"
+    page.ask(f"""(window.told = [], new MutationObserver(() => window.told.push([...{told}, +document.body.dataset.version]))
+      .observe(document.body, {{subtree: true, childList: true, characterData: true, attributes: true}}), 1)""")
+    before = page.ask("+document.body.dataset.version")
+    x, y = page.middle(".picture")
+    page.click(x, y)
+    changed(page, lambda: page.key("2", text="2", code="Digit2"))
+    told = page.ask("window.told")
+    first = next(nth for nth, (_, final, _) in enumerate(told) if final == "false")
+    waited = [row for row in told[first:] if row[2] == before]
+    assert waited and all(final == "false" for _, final, _ in waited)
+    assert not any(chip in ("full", "tolerance") for chip, _, _ in waited[1:])
+
+
+def test_code_is_copied(page):
+    page.ask("document.querySelector('button[title=\"Python\"]').click()")
+    page.until("document.querySelector('dialog[open] .code')?.textContent")
+    page.ask("document.querySelector('button[title=\"copy to the clipboard\"]').click()")
+    page.until("document.querySelector('dialog[open] output').textContent")
+    assert page.ask("getSelection().toString()").strip().startswith("import")
+    page.ask("document.querySelector('dialog[open] form button').click()")
+
+
 def luminance(color):
     red, green, blue = (
         part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in (one / 255 for one in color)

@@ -8,10 +8,11 @@ import { timer } from "./time.js";
 const MAPS = ["viridis", "heat", "ice", "coolwarm", "gray", "magma", "inferno", "plasma", "cividis", "turbo",
   "cmocean:thermal", "crameri:batlow"];
 const NICE = [1, 2, 5];
+const LONG = 700; // milliseconds after which a picture that is not there waits for a compiler, or a slow machine
 
 export function mount(root, link) {
   root.classList.add("jaxsph");
-  let state = null, shown = null, drawing = 0;
+  let state = null, shown = null, drawing = 0, late = 0;
   const send = (message) => link.send(message);
 
   const picture = made("canvas", { class: "picture", tabindex: 0, role: "img", "aria-label": "rendered view", width: 4, height: 3 });
@@ -42,8 +43,9 @@ export function mount(root, link) {
     made("div", { class: "row" }, button("Undo", "undo (u)", () => send({ do: "undo" })), button("Redo", "redo (y)", () => send({ do: "redo" })), button("Reset", "as it was", () => send({ do: "reset_look" }))));
   const numbers = made("dl", { class: "numbers" }, made("dt", {}, "click the picture"), made("dd", {}, "for its numbers"));
   const pixel = section("Pixel", numbers);
-  const code = made("pre", { class: "code", tabindex: 0 });
-  const texts = made("dialog", { class: "dialog", "aria-label": "code" }, made("h2", {}, "This view, again"), code, closing());
+  const code = made("pre", { class: "code", tabindex: 0 }), copied = made("output", { class: "value" });
+  const texts = made("dialog", { class: "dialog", "aria-label": "code" }, made("h2", {}, "This view, again"), code,
+    made("div", { class: "row" }, closing(), button("Copy", "copy to the clipboard", copy), copied));
   const help = made("dialog", { class: "dialog", "aria-label": "help" }, made("h2", {}, "Help"),
     made("table", {}, ...KEYS.map(([keys, does]) => made("tr", {}, made("th", { scope: "row" }, keys), made("td", {}, does)))),
     made("p", {}, "A draft has a fraction of the pixels and samples. Once nothing moves, every pixel gets its ray, then the tolerance is kept. The words below the picture say which of these you see, and how far it may be off. Bars behind the control points: what rays of the last view that stood still met (pale), and what took their light (bright); heights are roots. A surface is opaque: its bars are where rays met it, and its points have colours alone."), closing());
@@ -63,6 +65,16 @@ export function mount(root, link) {
   }
   function turnRays() {
     if (state) send({ do: "projection", name: state.pose.perspective ? "parallel" : "perspective" });
+  }
+  async function copy() {
+    const chosen = getSelection();
+    chosen.selectAllChildren(code);
+    try {
+      await navigator.clipboard.writeText(code.textContent);
+      copied.textContent = "copied";
+    } catch { // where a page may not write there
+      copied.textContent = document.execCommand("copy") ? "copied" : "press Ctrl+C: it is selected";
+    }
   }
   function save() {
     const to = made("a", { download: "view.png" });
@@ -94,13 +106,30 @@ export function mount(root, link) {
     brush.imageSmoothingQuality = "high";
     brush.drawImage(bitmap, 0, 0, width, height);
     bitmap.close();
+    clearTimeout(late);
+    late = 0;
+    root.dataset.stage = header.stage;
+    root.dataset.version = header.version;
+    const old = Boolean(state) && header.version < state.version; // than the view that is asked for
+    root.dataset.final = header.final && !old;
+    if (old) awaited();
+    if (old && header.stage !== "draft") return;
     const kind = header.stage === "tolerance" && header.over ? "over" : header.stage;
     chip.textContent = header.stage;
     chip.className = `chip ${kind}`;
     words.textContent = `${header.words.replace(/^(draft|full): /, "")} · ${header.milliseconds} ms`;
-    root.dataset.stage = header.stage;
-    root.dataset.final = header.final;
-    root.dataset.version = header.version;
+  }
+  function awaited() { // until the picture is that of the view, nothing says that it is
+    root.dataset.final = false;
+    if (root.dataset.stage !== "draft") {
+      chip.textContent = "drawing";
+      chip.className = "chip";
+    }
+    late ||= setTimeout(() => {
+      chip.textContent = "compiling";
+      chip.className = "chip";
+      words.textContent = "this view is not drawn yet: what is new in it is compiled, once";
+    }, LONG);
   }
   function place() {
     if (!state) return;
@@ -143,6 +172,7 @@ export function mount(root, link) {
     else if (message.is === "state") {
       if (numbers.children.length > 2 && state?.version !== message.version) numbers.classList.add("stale");
       state = message;
+      if (shown && shown.version < state.version) awaited();
       complain(message.told || message.frames?.why);
       edit.show(message.look);
       cut.show(message.cut);
@@ -156,9 +186,13 @@ export function mount(root, link) {
       place();
     } else if (message.is === "histogram") edit.over(message);
     else if (message.is === "picked") pick(message);
-    else if (message.is === "error") complain(message.text);
+    else if (message.is === "error") {
+      clearTimeout(late);
+      complain(message.text);
+    }
     else if (message.is === "code") {
       code.textContent = message.python;
+      copied.textContent = "";
       texts.showModal();
     } else if (message.is === "unlinked") {
       chip.textContent = "lost";
