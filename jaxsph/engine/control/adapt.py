@@ -1,6 +1,19 @@
-"""Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
+r"""Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
 
-Flow: slab windows -> probe -> [adapt: analysis -> levels -> merge] -> schedule -> cast -> image.
+Flow: slab windows -> probe -> [adapt: analysis -> candidates -> merge] -> schedule -> cast -> image.
+
+Errors of cells add up (`errors`), so a bundle has a budget to spend: choose a candidate for each cell such that the errors'
+sum stays within the tolerance and the evaluations saved are most. The multiplier rule does that up to one cell: for a price
+$\lambda$, each cell takes what maximises saving $- \lambda$ error; the least price that keeps the tolerance is found by
+bisection. A smaller tolerance has a higher price, at which no cell takes more error: it never spends less. The paper's order
+(section 4.4) spends the budget back to front, each cell taking the highest level that still fits.
+
+A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
+one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as
+it fits into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of
+them allow it. A cell whose neighbours do not falls back to the last level that fits, which costs the same and errs less.
+
+Decisions carry no gradient.
 """
 
 from __future__ import annotations
@@ -13,16 +26,166 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, coarser_windows, find_slab_windows
+from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, SlabWindows, Window, coarser_windows, find_slab_windows
 from jaxsph.engine.control.analysis import analyse
-from jaxsph.engine.control.errors import SUPER_PIXEL
-from jaxsph.engine.control.levels import bound, choose
-from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels
+from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, fits
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
+
+
+def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
+    """Kernel evaluations a ray and cell at every level, (cells, bundles); None where a level does not fit without merging."""
+    costs: list[Array | None] = []
+    fitting = fits(slab_samples)
+    for level, window in enumerate(windows):
+        count = window.length.sum(0).astype(jnp.float32) * slab_samples
+        if level <= fitting:
+            groups = CELL_SAMPLES // slab_samples >> level
+            costs.append(count.reshape(-1, groups, count.shape[1]).sum(1)[:num_cells])
+        else:
+            share = 1 << (level - fitting)
+            costs.append(jnp.repeat(count / share, share, 0)[:num_cells] if merge else None)
+    return costs
+
+
+def merged_levels(
+    chosen: Int[Array, "cells bundles"], free: Bool[Array, "cells bundles"], slab_samples: int
+) -> Int[Array, "cells bundles"]:
+    """Levels that neighbours agree on: above what fits into a cell, the highest that all of an aligned group allow.
+
+    Args:
+        chosen: candidate of every cell.
+        free: cells that no particle can touch, nor their borders: they allow any level.
+        slab_samples: samples of a slab.
+    """
+    fitting, num_cells = fits(slab_samples), chosen.shape[0]
+    lateral = chosen == SUPER_PIXEL
+    final = jnp.where(lateral, SUPER_PIXEL, jnp.minimum(chosen, fitting))
+    able = jnp.where(free, MAX_LEVEL, jnp.where(lateral, 0, chosen))
+    for level in range(fitting + 1, LEVELS):
+        share = 1 << (level - fitting)
+        groups = jnp.pad(able, ((0, -num_cells % share), (0, 0))).reshape(-1, share, able.shape[1])
+        final = jnp.where(jnp.repeat((groups >= level).all(1), share, 0)[:num_cells], level, final)
+    return final
+
+
+def coarse_schedule(
+    windows: list[Window],
+    levels: Int[Array, "cells bundles"],
+    references: tuple[Float[Array, "slabs bundles"], ...],
+    paint: Array | None,
+    slab_samples: int,
+) -> SlabSchedule:
+    """The schedule for the `levels` of cells, as `merged_levels` gives them.
+
+    Args:
+        references: of the slabs at full rate; coarser ones take those of the first filled slab they span.
+        paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
+    """
+    per_cell = CELL_SAMPLES // slab_samples
+    classes, slabs, bundles = windows[0].begin.shape
+    missing = slabs - levels.shape[0] * per_cell
+    level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, missing), (0, 0)))
+    place = jnp.arange(slabs, dtype=jnp.int32)[:, None]
+    painted = (level == SUPER_PIXEL) & (place % per_cell == 0)
+    begin = length = jnp.zeros((classes, slabs, bundles), jnp.int32)
+    for step, window in enumerate(windows):
+        here = (level == step) & (place % (1 << step) == 0)
+        begin = jnp.where(here, jnp.repeat(window.begin, 1 << step, 1), begin)
+        length = jnp.where(here, jnp.repeat(window.length, 1 << step, 1), length)
+    count = length.sum(0).astype(jnp.int32)
+    references = tuple(_shared_references(reference, windows, level) for reference in references)
+    level = jnp.where(level == SUPER_PIXEL, MAX_LEVEL, level)
+    if paint is None:
+        return SlabSchedule(count > 0, level, begin, length, count, references)
+    colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, missing), (0, 0)))
+    return SlabSchedule((count > 0) | painted, level, begin, length, count, references, painted, colors)
+
+
+def _shared_references(reference: Array, windows: list[Window], level: Array) -> Array:
+    """Of every item, that of the first filled slab that it spans."""
+    first = shared = jnp.pad(reference, ((0, level.shape[0] - reference.shape[0]), (0, 0)))
+    for step in range(1, LEVELS):
+        filled = windows[step - 1].length.sum(0) > 0
+        first = jnp.where(filled[::2], first[::2], first[1::2])
+        shared = jnp.where(level == step, jnp.repeat(first, 1 << step, 0), shared)
+    return shared
+
+
+CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
+HALVINGS = 20
+
+
+def choose(
+    errors: CellErrors,
+    saving: Float[Array, "candidates cells bundles"],
+    on_offer: Bool[Array, "candidates cells bundles"],
+    rounding: Float[Array, " bundles"],
+    tolerance: Float[Array, ""],
+    allocation: str,
+) -> Int[Array, "cells bundles"]:
+    """The candidate of every cell: level 0 to 4, or super-pixel.
+
+    Args:
+        errors: of all candidates.
+        saving: kernel evaluations a ray that a candidate saves against level 0.
+        on_offer: candidates that can be had; level 0 always can.
+        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
+        tolerance: largest error of a pixel.
+        allocation: `"budget"`, or `"greedy"` (back to front).
+    """
+    allowed = on_offer & (errors.strict + rounding <= tolerance)
+    error = jnp.where(allowed, errors.error, jnp.inf).at[0].set(0)
+    if allocation == "greedy":
+        chosen = _back_to_front(saving, error, tolerance - rounding)
+    else:
+        chosen = _at_best_price(saving, error, rounding, tolerance)
+    return lax.stop_gradient(chosen)
+
+
+def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
+    """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
+    taken = jnp.take_along_axis(error, chosen[None], 0)[0]
+    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0)
+
+
+def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Array]:
+    """The candidate of most `saving - price * error`, the first of equals, and its error; none with an infinite error."""
+    best, taken, chosen = saving[0], error[0], jnp.zeros(saving.shape[1:], jnp.int32)
+    for candidate in range(1, CANDIDATES):
+        possible = error[candidate] < jnp.inf
+        net = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
+        better = possible & (net > best)
+        best, taken = jnp.where(better, net, best), jnp.where(better, error[candidate], taken)
+        chosen = jnp.where(better, candidate, chosen)
+    return chosen, taken
+
+
+def _at_best_price(saving: Array, error: Array, rounding: Array, tolerance: Array) -> Array:
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        keeps = _best(saving, error, jnp.exp2(middle))[1].sum(0) + rounding <= tolerance
+        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
+
+    low, high = (jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST))
+    _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
+    chosen, taken = _best(saving, error, jnp.exp2(high))
+    return jnp.where(taken.sum(0) + rounding <= tolerance, chosen, 0)
+
+
+def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
+    def step(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
+        saving, error = cell
+        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
+        return left - taken, chosen
+
+    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
+    return lax.scan(step, left, cells, reverse=True)[1]
+
 
 EMPTY = -1  # what a cell without particles is given
 

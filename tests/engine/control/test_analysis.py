@@ -17,10 +17,9 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows, find_slab_windows
 from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels
 from jaxsph.engine.control.analysis import analyse
 from jaxsph.engine.control.errors import SUPER_PIXEL
-from jaxsph.engine.control.levels import bound
-from jaxsph.engine.control.merge import coarse_schedule, merged_levels
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from jaxsph.engine.control.adapt import bound, choose
 from jaxsph.engine.control.errors import CANDIDATES, CellErrors
-from jaxsph.engine.control.levels import bound, choose
 
 CELLS, BUNDLES = 4, 6
 UNIT = st.floats(0, 1, width=16)

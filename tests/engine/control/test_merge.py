@@ -16,8 +16,8 @@ from hypothesis.extra import numpy as hnp
 from windows import BUNDLES, CELLS, windows_of
 
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows
+from jaxsph.engine.control.adapt import coarse_schedule, evaluations_of_levels, merged_levels
 from jaxsph.engine.control.errors import SUPER_PIXEL, fits
-from jaxsph.engine.control.merge import coarse_schedule, evaluations_of_levels, merged_levels
 from jaxsph.engine.field.schedule import evaluations
 
 SLAB_SAMPLES = [4, 8, 16]

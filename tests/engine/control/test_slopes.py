@@ -11,7 +11,7 @@ import pytest
 from derivatives import QUICKLY
 
 import jaxsph as js
-from jaxsph.engine.control.slopes import BUCKETS, mean_square_slope, squared_slopes
+from jaxsph.engine.control.interpolation_error import BUCKETS, mean_square_slope, squared_slopes
 
 RANGES = 8  # of a program
 

@@ -9,7 +9,7 @@ import pytest
 from derivatives import QUICKLY
 
 import jaxsph as js
-from jaxsph.engine.planning.in_range import scene_in_range
+from jaxsph.engine.planning.viewing import scene_in_range
 from jaxsph.numerics import faults
 
 TRANSFER = js.TransferFunction.from_points([0.0, 0.5, 1.0], [[1, 0, 0], [0, 1, 0], [0, 0.5, 1]], [0.0, 2.0, 1.0])
