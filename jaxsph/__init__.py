@@ -12,6 +12,7 @@ from jaxsph.numerics.version import __version__ as __version__
 if TYPE_CHECKING:
     from jaxsph import io, reference, scale, scenes, sequence
     from jaxsph.analysis.explanation.explain import explain
+    from jaxsph.analysis.projection.plan import plan_projection
     from jaxsph.analysis.projection.project import project
     from jaxsph.analysis.resample import resample
     from jaxsph.analysis.slices import slice
@@ -58,6 +59,7 @@ __all__ = [
     "explain",
     "io",
     "plan",
+    "plan_projection",
     "prepare",
     "progressive",
     "project",
@@ -99,6 +101,7 @@ NAMES = {
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",
+    "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
     "explain": "jaxsph.analysis.explanation.explain:explain",

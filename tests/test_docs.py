@@ -67,7 +67,7 @@ def test_the_page_for_users_of_jax_runs_as_pasted():
     blocks = re.findall(r"```python\n(.*?)```", PAGES["docs/for_jax_users.md"], re.DOTALL)
     told = "import json\nprint(json.dumps([float(value), list(images.color.shape)]))"
     value, shape = ran("\n".join([*blocks, told]), devices=1)  # compiled quickly
-    assert len(blocks) == 4 and value > 0 and shape == [2, 16, 16, 3]
+    assert len(blocks) == 5 and value > 0 and shape == [2, 16, 16, 3]
 
 
 def test_there_are_blocks_to_run():

@@ -24,12 +24,14 @@ from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
 from jaxsph.numerics.given import in_unit
+from jaxsph.numerics.trees import on_host
 
 PAIRS = 1 << 19  # (particle, point) pairs of a chunk: its arrays stay in the caches
 ON_FACE = 1e-6  # of a spacing, that points may lie outside of a periodic box
 BEYOND = 4.0  # a squared distance in supports, at which every kernel is 0
 
 
+@on_host
 def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, int, int], *, fill: float = 0.0) -> Volume:
     r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid (host side, float64 sums).
 

@@ -31,6 +31,7 @@ from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, require_shape
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.labelled import PLANE, dataset, places
+from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
@@ -102,6 +103,7 @@ class Slice:
         return dataset({"values": (PLANE, self.values)}, where, self.metadata)
 
 
+@on_host
 def slice(
     particles: Particles,
     plane: Plane,

@@ -21,6 +21,7 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.trees import on_host
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
 from jaxsph.reference.media import AllOfVolume, AllParticles, Whole, at_nodes, met, parts_of
@@ -55,6 +56,7 @@ class VisibilityHistogram:
         return (self.edges[1:] + self.edges[:-1]) / 2
 
 
+@on_host
 def visibility_histogram(
     scene: Scene, camera: Camera, *, rays: int = 2000, bins: int = 64, part: int = 0, seed: int = 0
 ) -> VisibilityHistogram:

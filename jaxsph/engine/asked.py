@@ -12,26 +12,42 @@ import jax
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.trees import fitting
 
 
-def require_asked(scene: Any, camera: Any, settings: Any) -> None:
-    """Check the arguments of `render` and `plan`.
+def as_asked(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
+    """The scene and the camera that `render` and `plan` are given, with leaves that fit.
 
     Raises:
-        ValueError: one of another kind, numbers of settings that are none, or arrays of the scene that are sharded.
+        ValueError: one of another kind, a leaf that does not fit, numbers of settings that are none, or arrays that are sharded.
         NotImplementedError: within `jax.shard_map` that checks which values vary over its mesh.
     """
-    for name, value, kind in (("scene", scene, Scene), ("camera", camera, Camera), ("settings", settings, Settings)):
-        if not isinstance(value, kind):
-            raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`, got {type(value).__name__}")
-    settings.require_numbers()
+    scene, camera = fitting("scene", scene, Scene), fitting("camera", camera, Camera)
+    fitting("settings", settings, Settings).require_numbers()
     for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
-        if isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer) and not leaf.sharding.is_fully_replicated:
-            raise ValueError(
-                f"`scene{jax.tree_util.keystr(path)}` is sharded over {len(leaf.sharding.device_set)} devices, and each needs "
-                "all of it: put the scene on one device, or replicate it, and share out the work by `devices=`"
-            )
+        if isinstance(leaf, jax.Array):
+            _require_whole(path, leaf)
     _require_unvarying(scene, camera, settings)
+    return scene, camera
+
+
+def _require_whole(path: Any, leaf: Any) -> None:
+    """Raise where an array is sharded; of a trace over automatic axes, where XLA chooses, when it is compiled."""
+
+    def refuse(place: jax.sharding.Sharding) -> None:
+        if not place.is_fully_replicated:
+            raise ValueError(
+                f"`scene{jax.tree_util.keystr(path)}` is sharded over {place.num_devices} devices, and each needs all of it: put "
+                "the scene on one device, or replicate it, and share out the work by `devices=`"
+            )
+
+    if not isinstance(leaf, jax.core.Tracer):
+        return refuse(leaf.sharding)
+    refuse(place := jax.typeof(leaf).sharding)
+    while hasattr(leaf, "primal"):
+        leaf = leaf.primal
+    if jax.sharding.AxisType.Auto in place.mesh.axis_types and not hasattr(leaf, "batch_dim"):  # whose shards may be whole
+        jax.debug.inspect_array_sharding(leaf, callback=refuse)
 
 
 def _require_unvarying(*given: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.engine.asked import require_asked
+from jaxsph.engine.asked import as_asked
 from jaxsph.engine.frame.bands import Progress, Work
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import traced_image_of
@@ -33,7 +33,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import coverage_at_centers
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import as_usual, at_once, is_traced, require_plan
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
@@ -75,8 +75,8 @@ def render(
         raise `NotImplementedError`, as do second derivatives.
 
     Raises:
-        ValueError: bad data (NaN positions, a camera that sees nothing, ...), a plan for other shapes, no plan under a trace,
-            more devices than there are.
+        ValueError: bad data (NaN positions, leaves of other lengths, a camera that sees nothing, ...), a plan for other shapes,
+            no plan under a trace, more devices than there are.
         CapacityError: eager, when a given `plan` is too small for this frame.
 
     Warns:
@@ -87,17 +87,17 @@ def render(
         Hochstetter, Orthmann & Kolb 2016, sections 3 and 6.
     """
     settings = Settings() if settings is None else settings
-    if plan is not None and not isinstance(plan, Plan):
-        raise ValueError(f"`plan` must be a plan, got {type(plan).__name__}; make one with `jaxsph.plan`")
-    if is_traced(scene, camera, settings):
-        return _traced_image(scene, camera, settings, plan, devices)
-    clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
-    made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
-    work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
-    image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
-    if asked.scene.surface is not None:
-        _tell_if_unreached(scene, asked.scene.particle_set, image)
-    return image
+    require_plan("plan", plan, Plan, "plan")
+    with as_usual() if (traced := is_traced(scene, camera, settings)) else at_once():
+        if traced:
+            return _traced_image(scene, camera, settings, plan, devices)
+        clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
+        made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
+        work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
+        image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+        if asked.scene.surface is not None:
+            _tell_if_unreached(scene, asked.scene.particle_set, image)
+        return image
 
 
 def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
@@ -122,7 +122,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     Raises:
         ValueError: no plan, one for another image, or a quadtree over a mesh.
     """
-    require_asked(scene, camera, settings)
+    scene, camera = as_asked(scene, camera, settings)
     scene = widened(scene)
     camera = with_depths(camera, scene)
     if plan is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-from jaxsph.engine.asked import require_asked
+from jaxsph.engine.asked import as_asked
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
@@ -44,12 +44,8 @@ class Request(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
-        """Of concrete arrays.
-
-        Raises:
-            ValueError: arguments of other kinds, or a combination that nothing can render.
-        """
-        require_asked(scene, camera, settings)
+        """Of concrete arrays; `ValueError` of arguments of other kinds, and of combinations that nothing can render."""
+        scene, camera = as_asked(scene, camera, settings)
         scene = widened(scene)
         _require_marched(scene, settings)
         camera = with_depths(camera, scene)

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics import faults, short
-from jaxsph.numerics.checks import array_of, at_hand, is_traced
+from jaxsph.numerics import short
+from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.colors import rgb
 from jaxsph.numerics.labelled import PLANE, dataset
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import Traceable, tree
 
 
 @tree(static=("metadata",))
-class Image:
-    """A rendered image. Row 0 is the top, column 0 the left; the background is black.
+class Image(Traceable):
+    """A rendered image; of `jax.vmap` a batch of them, `image[0]` one. Row 0 is the top, column 0 the left; behind it is black.
 
     Attributes:
         color: premultiplied RGB in [0, 1], display-referred (sRGB) as colours of the transfer function are.
@@ -32,7 +32,7 @@ class Image:
         error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full
             rate, and at most 1. With a tolerance and `integrator="segments"`, the estimated error against the light integral;
             infinite where nothing is known: without a tolerance of other integrators than `"samples"`, and of surfaces, of which
-            samples may miss what is thin.
+            samples may miss what is thin; and in files that do not hold it.
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound.
         faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them. An image with a fault
@@ -46,6 +46,7 @@ class Image:
             None without one, and where pixels are interpolated.
     """
 
+    LAYER = "color", 3
     color: Float[Array, "height width 3"]
     transmittance: Float[Array, "height width"]
     depth: Float[Array, "height width"]
@@ -61,36 +62,16 @@ class Image:
     def __repr__(self) -> str:
         shape: tuple[int, ...] = getattr(self.color, "shape", ())
         size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else short.kind(self.color)
+        size = f"batch of {' x '.join(map(str, shape[:-3]))}, {size}" if len(shape) > 3 else size
         certified = short.known(self.certified)
         proven = None if certified is None else "certified" if certified.all() else "not certified"
-        words = f"transmittance {short.span(self.transmittance)}", f"error {short.span(self.error_bound)}"
+        error = short.span(self.error_bound).replace("inf", "unknown")
+        words = f"transmittance {short.span(self.transmittance)}", f"error {error}"
         return short.line("Image", size, *words, proven, f"faults {short.span(self.faults)}")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""
         return np.array(np.asarray(self.color), dtype, copy=copy)
-
-    def check(self) -> Image:
-        """The image itself, unless something went wrong with it under `jit`.
-
-        Returns:
-            This image, so that `jitted(scene).check().color` reads well.
-
-        Raises:
-            CapacityError: the plan had no room for the frame.
-            ValueError: any other fault, in words, with a remedy; or an image that is still traced: check it outside of `jit`.
-        """
-        if is_traced(self.faults):
-            raise ValueError("`Image.check` needs numbers: return the image, or its `faults`, from `jit` and check it outside")
-        for word in np.ravel(np.asarray(self.faults)):
-            faults.raise_for(int(word) & ~faults.TOLD)
-        return self
-
-    @property
-    def fault_messages(self) -> tuple[str, ...]:
-        """What went wrong in words, each with a remedy; nothing where all is well (host side)."""
-        word = int(np.bitwise_or.reduce(np.ravel(np.asarray(self.faults))))
-        return tuple(text for bit, text in faults.MESSAGES.items() if word & bit)
 
     @property
     def alpha(self) -> Float[Array, "height width"]:
@@ -99,8 +80,8 @@ class Image:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width)."""
-        return int(self.color.shape[0]), int(self.color.shape[1])
+        """(height, width), of a batch those of each."""
+        return int(self.color.shape[-3]), int(self.color.shape[-2])
 
     def over(self, background: Any) -> Float[np.ndarray, "height width 3"]:
         """The picture in front of a background of one colour: C + T B, with premultiplied C and transmittance T (host side).
@@ -114,7 +95,7 @@ class Image:
         Raises:
             ValueError: no colour; an image without transmittance, as one read from a PNG is.
         """
-        color, behind = np.asarray(self.color, np.float64), np.asarray(rgb(background))
+        color, behind = np.asarray(self.as_one("over").color, np.float64), np.asarray(rgb(background))
         transmittance = np.asarray(self.transmittance, np.float64)[..., None]
         if np.isnan(transmittance).any():
             raise ValueError("`over` needs the transmittance of the image, and a PNG does not hold it: write EXR to keep it")
@@ -133,11 +114,11 @@ class Image:
             camera: that of the picture, gives scale bar, axes and outline.
             more: `labels`, `target`, `outline`, `triad` and `title` of `jaxsph.plot.image_figure.image_figure`.
         """
-        return found("jaxsph.plot.image_figure:image_figure")(self, scene, camera, **more)
+        return found("jaxsph.plot.image_figure:image_figure")(self.as_one("figure"), scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""
-        color = np.nan_to_num(np.asarray(self.color, np.float64), nan=0.0)
+        color = np.nan_to_num(np.asarray(self.as_one("to_uint8").color, np.float64), nan=0.0)
         return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
 
     def to_xarray(self) -> Any:
@@ -146,7 +127,9 @@ class Image:
         Raises:
             ImportError: xarray is not installed.
         """
-        layers: dict[str, Any] = {"color": ((*PLANE, "channel"), np.asarray(self.color), {"long_name": "premultiplied colour"})}
+        layers: dict[str, Any] = {
+            "color": ((*PLANE, "channel"), np.asarray(self.as_one("to_xarray").color), {"long_name": "premultiplied colour"})
+        }
         for name in ("transmittance", "depth", "error_bound", "evaluations"):
             layers[name] = PLANE, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
         if self.normal is not None:
@@ -156,13 +139,15 @@ class Image:
 
     def _repr_html_(self) -> str:
         """The picture, and below it a line with size, time and error."""
-        height, width = self.shape
+        height, width = self.as_one("_repr_html_").shape
         told = [f"{width} &times; {height}"]
         seconds = self.stats.get("seconds")
         if isinstance(seconds, dict):
             told.append(f"{sum(float(value) for value in seconds.values()):.2g} s")
-        worst = float(np.max(np.nan_to_num(np.asarray(self.error_bound, np.float64)), initial=0))
-        if 0 < worst <= 1:
+        worst = float(np.max(np.asarray(self.error_bound, np.float64), initial=0))
+        if np.isinf(worst):
+            told.append("error unknown")
+        elif worst > 0:
             told.append(f"error at most {worst:.2g}, {'certified' if bool(self.certified) else 'estimated'}")
         if int(self.faults):
             told.append(f"faults {int(self.faults)}")

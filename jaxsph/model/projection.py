@@ -18,7 +18,7 @@ from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import short
 from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import Traceable, tree
 
 COLORS = 256  # of a map in a picture
 NORMS = ("log", "linear")
@@ -28,7 +28,7 @@ EMPTY = 0  # of a picture, where there is no value
 
 
 @tree(static=("perspective", "name", "unit", "metadata", "length_unit"))
-class Projection:
+class Projection(Traceable):
     """Integrals along rays. Row 0 is the top, column 0 the left.
 
     Attributes:
@@ -36,13 +36,14 @@ class Projection:
         weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without.
         pixel_area: of a pixel, length units squared; with perspective, at depth 1. In float64 where float32 might not hold it.
         perspective: whether rays spread with depth.
-        faults: 0 when all is well, else bits of `jaxsph.numerics.faults`.
+        faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them.
         name: of the values.
         unit: of the values; empty where it is not known.
         metadata: strings and numbers for the file header.
         length_unit: what the unit of lengths is called; empty where it is not known.
     """
 
+    LAYER = "values", 2
     values: Float[Array, "height width"]
     weight: Float[Array, "height width"] | None
     pixel_area: Float[Array, ""] | np.floating
@@ -59,8 +60,8 @@ class Projection:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width)."""
-        return int(self.values.shape[0]), int(self.values.shape[1])
+        """(height, width), of a batch those of each."""
+        return int(self.values.shape[-2]), int(self.values.shape[-1])
 
     def total(self) -> Float[Array, ""] | np.floating:
         """The amount in the image, such as its mass: the sum of values times the area of a pixel.
@@ -105,7 +106,7 @@ class Projection:
             norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
             range: values that the colours span; default nearly all.
         """
-        values: Any = np.asarray(self.values, np.float64)
+        values: Any = np.asarray(self.as_one("to_uint8").values, np.float64)
         log, (low, high) = self.span(norm, range)
         there = np.isfinite(values) & ((values > 0) | (not log))
         shown = np.where(there, values, high)

@@ -10,6 +10,7 @@ all else is out of its range of numbers: each medium takes from a list what is i
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,7 @@ from jaxsph.numerics.trees import tree
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
 MIXES = "extinction", "opacity"
+NO_PARTS = float | tuple | list | dict | np.ndarray | jax.Array
 
 
 class Formulas(NamedTuple):
@@ -44,9 +46,11 @@ class Formulas(NamedTuple):
     surfaces: bool = False
 
 
-@tree(static=("mix",))
+@tree(static=("mix",), unchecked=True)
 class Scene:
     """What is in a scene, and what its quantities look like.
+
+    A part may be a word or a whole number, until it is rendered: prefixes of scenes are `in_axes`, or labels of an optimiser.
 
     Attributes:
         particles: the particle set.
@@ -79,15 +83,15 @@ class Scene:
         several = {"volume": Volume, "volume_transfer": TransferFunction, "points": Points}
         for name, kind in (kinds | several).items():
             value = getattr(self, name)
-            wrong = [one for one in _all_of(value) if isinstance(one, str | int | float | tuple | list | dict)]
+            wrong = [one for one in _all_of(value) if isinstance(one, NO_PARTS) or (isinstance(one, str) and Path(one).suffix)]
             if wrong or (isinstance(value, tuple) and name in kinds):
                 given = type(wrong[0] if wrong else value).__name__
                 more = ", or a tuple of them" if name in several else ""
                 raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`{more}, got {given}")
-        if isinstance(self.within, str | int | float | tuple | list | dict):
+        if isinstance(self.within, NO_PARTS):
             raise ValueError(f"`within` must be a `jaxsph.Plane`, `Box`, `Sphere` or made of these, got {self.within!r}")
         media = self.media if isinstance(self.media, tuple) else (self.media,)
-        if isinstance(self.media, Medium) or any(isinstance(medium, str | int | float | list | dict) for medium in media):
+        if isinstance(self.media, Medium) or any(isinstance(medium, str | NO_PARTS) for medium in media):
             raise ValueError(f"`media` must be a tuple of media (`jaxsph.model.medium.Medium`), got {self.media!r}")
         each = ((name, one) for name in ("particles", "volume", "points") for one in _all_of(getattr(self, name)))
         units = {unit: name for name, one in each if (unit := getattr(one, "length_unit", None)) is not None}
@@ -109,6 +113,10 @@ class Scene:
                 raise ValueError(f"`{missing}` must be given with `{given}`, got None; give both to `jaxsph.Scene`, or neither")
         if self.surface is not None and self.particles is not None:
             self.surface.check(self.particles)
+        for shown in self.looks:
+            if shown.extinction_values is None and shown.extinction.shape != shown.values.shape:
+                told = f"`extinction` of a `TransferFunction` must have shape {shown.values.shape}, as its `values`"
+                raise ValueError(f"{told}, got {shown.extinction.shape}; or give `extinction_values`")
         volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")

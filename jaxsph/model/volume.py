@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Num
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import on_host, tree
 
 KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
 
@@ -83,13 +83,13 @@ class Volume:
                 "repeat a single plane to give it a thickness"
             )
         if not is_traced(given):
-            _require_finite_values(given, "repair them, or give them a number that the transfer function does not show")
+            require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
         with np.errstate(over="ignore"):  # what overflows is refused by name
             wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
             wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
             packed = array_of(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
-            _require_finite_values(packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
+            require_finite("values", packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
         exact = _vector("lower", lower, (3,), "give x, y and z of the first grid point")
         steps = _vector("spacing", spacing, (3,), "give one number, or one for each of x, y and z")
@@ -110,25 +110,11 @@ class Volume:
         """What it is rendered in: float32 or float64."""
         return self.lower.dtype
 
+    @on_host
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""
         lower = np.asarray(self.lower, np.float64) + np.asarray(self.lower_rest, np.float64)
         return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
-
-
-def _require_finite_values(values: Any, remedy: str) -> None:
-    """Raise `ValueError` with how many values are not finite, and the index of the first."""
-    host = np.asarray(values)
-    if host.dtype.kind in "iub" or np.isfinite(host.min() + host.max()):
-        return
-    bad = ~np.isfinite(host)
-    where = tuple(int(i) for i in np.unravel_index(int(bad.argmax()), host.shape))
-    at = ", ".join(map(str, where))
-    if not bad.any():  # their sum alone overflows
-        return
-    raise ValueError(
-        f"`values` must be finite, but {int(bad.sum())} of {host.size} are not, first values[{at}] = {host[where]}; {remedy}"
-    )
 
 
 def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:

@@ -7,8 +7,9 @@ on them each would be a program to compile for every shape; code that serves tra
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -37,6 +38,20 @@ def is_traced(*values: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(values))
 
 
+@contextlib.contextmanager
+def as_usual() -> Iterator[None]:
+    """Arrays of several dtypes and ranks go together as they do by default, whatever users forbid in code of their own."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@contextlib.contextmanager
+def at_once() -> Iterator[None]:
+    """What is known is computed as outside of any trace, though one may be under way: a target, say, in a jitted loss."""
+    with jax.core.eval_context(), as_usual():
+        yield
+
+
 def module_for(*values: Any) -> Any:
     """NumPy, where all is known and at hand in this machine's memory; else `jax.numpy`, also where a device was chosen."""
     arrays = [leaf for leaf in jax.tree.leaves(values) if isinstance(leaf, Array)]
@@ -55,7 +70,8 @@ def array_of(value: Any, dtype: Any = None) -> Array:
     if isinstance(value, Array) or is_traced(value):
         return jnp.asarray(value, dtype)
     kind = jax.dtypes.canonicalize_dtype(np.asarray(value).dtype if dtype is None else dtype)
-    return jnp.asarray(np.array(value, kind), kind)
+    with jax.core.eval_context():  # within a trace what is known stays so
+        return jnp.asarray(np.array(value, kind), kind)
 
 
 def product(one: Array, other: Any) -> Array:
@@ -70,6 +86,12 @@ def product(one: Array, other: Any) -> Array:
 
 def _normal(number: Any) -> Any:
     return number * (abs(number) >= np.finfo(number.dtype).tiny)
+
+
+def require_plan(name: str, value: Any, kind: type, maker: str) -> None:
+    """Raise `ValueError` where what is to be a plan, or None, is neither."""
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"`{name}` must be a plan, got {type(value).__name__}; make one with `jaxsph.{maker}`")
 
 
 def require_sizes(plan: Any, zero: tuple[str, ...] = ()) -> None:
@@ -99,10 +121,12 @@ def require_real(name: str, value: Any) -> None:
 def require_finite(name: str, value: Any, remedy: str = "remove or repair these entries") -> None:
     """Raise `ValueError` naming the first entry of `value` that is NaN or infinite."""
     value = np.asarray(value)
+    if value.dtype.kind in "iub" or np.isfinite([value.min(initial=0), value.max(initial=0)]).all():
+        return
     bad = ~np.isfinite(value)
     if bad.any():
-        first = _first(name, value, bad)
-        raise ValueError(f"`{name}` must be finite, but {int(bad.sum())} value(s) are not, first {first}; {remedy}")
+        first = f"{int(bad.sum())} of {value.size} are not, first {_first(name, value, bad)}"
+        raise ValueError(f"`{name}` must be finite, but {first}; {remedy}")
 
 
 def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True) -> None:

@@ -25,21 +25,13 @@ LIBRARIES = "such as `unyt.unyt_array(x)` or `astropy.units.Quantity(x)`"
 
 
 def own(name: str, value: Any) -> Any:
-    """Numbers in their own unit, if they have one: a carried quantity, which is looked up by numbers in the same unit.
-
-    Raises:
-        ValueError: a mask that hides any of them; a list of numbers that carry units one by one.
-    """
+    """Numbers in their own unit, if they have one; `ValueError` of a mask that hides any, and of a list of such with units."""
     _require_whole(name, value)
     return _native(value if unit_of(value) is None else _numbers(value))
 
 
 def plain(name: str, value: Any, why: str = "no unit is known here to convert it to", meant: str = POSITIONS) -> Any:
-    """Numbers that carry no unit, or whose unit is that of a pure number, such as percent.
-
-    Raises:
-        ValueError: a unit, a mask, or a list of numbers that carry units one by one.
-    """
+    """Numbers that carry no unit, or that of a pure number, such as percent; `ValueError` of a unit, and as `own`."""
     _require_whole(name, value)
     unit = unit_of(value)
     if unit is None:
@@ -51,11 +43,7 @@ def plain(name: str, value: Any, why: str = "no unit is known here to convert it
 
 
 def with_unit(name: str, value: Any) -> tuple[Any, Any]:
-    """Numbers in their own unit, and that; None where they carry none.
-
-    Raises:
-        ValueError: see `own`.
-    """
+    """Numbers in their own unit, and that; None where they carry none. Raises as `own`."""
     _require_whole(name, value)
     unit = unit_of(value)
     pure = None if unit is None else _pure(value, unit)

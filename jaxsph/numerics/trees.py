@@ -1,17 +1,37 @@
 """Frozen dataclasses that are pytrees, of which some fields are static: they fix what is compiled.
 
 Flow: [trees] -> all that is traced.
+
+Annotations are held to where a verb begins (`fitting`): until then there is in a leaf whatever `replace` or JAX puts there.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
+import re
+import typing
 from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from statistics import mode
+from typing import Any, ClassVar, NamedTuple, ParamSpec, Self, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import AbstractArray
+
+from jaxsph.numerics.checks import array_of, at_once, is_traced, module_for, require_real
+from jaxsph.numerics.faults import MESSAGES, TOLD, raise_for
+from jaxsph.numerics.given import plain
 
 Kind = TypeVar("Kind", bound=type)
+Part = TypeVar("Part")
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+MADE: set[type] = set()  # by `tree`
+OPEN = {"open": True}  # metadata of a field that may be None until a verb finds what belongs there
+FLOAT, SMALL = "float32", ("int8", "uint8", "int16", "uint16")  # integers that stay so where they may be: float32 holds them
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
@@ -30,6 +50,7 @@ def tree(
 
     def register(kind: Kind) -> Kind:
         made: Any = dataclasses.dataclass(frozen=True, **options)(kind)
+        MADE.add(made)
         names = [field.name for field in dataclasses.fields(made)]
         leaves = [name for name in names if (name not in static if traced is None else name in traced)]
         fixed_names = [name for name in names if name not in leaves]
@@ -63,3 +84,180 @@ def fill(made: Any, /, **fields: Any) -> None:
     """Set fields of what is frozen, and is being made."""
     for name, value in fields.items():
         object.__setattr__(made, name, value)
+
+
+def require_known(verb: str, **given: Any) -> None:
+    """Raise `ValueError` where arguments of a verb that needs numbers are traced."""
+    for name in (name for name, value in given.items() if is_traced(value)):
+        outside = "call it outside of jit, vmap and grad, and call `jaxsph.render` under jit"
+        raise ValueError(f"`{verb}` needs concrete arrays, and `{name}` is traced: {outside}")
+
+
+def on_host(verb: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Mark a verb that needs numbers: what is traced, and what does not fit, is refused by name; all else is done at once."""
+    names = list(inspect.signature(verb).parameters)
+    names = [verb.__qualname__.partition(".")[0].lower() if name == "self" else name for name in names]
+
+    def taken(name: str, value: Any) -> Any:
+        require_known(verb.__qualname__, **{name: value})
+        return fitting(name, value) if type(value) in MADE else value
+
+    @functools.wraps(verb)
+    def done(*given: Given.args, **more: Given.kwargs) -> Result:
+        with at_once():
+            first: Any = [*(taken(name, value) for name, value in zip(names, given, strict=False)), *given[len(names) :]]
+            others: Any = {name: taken(name, value) for name, value in more.items()}
+            return verb(*first, **others)
+
+    return done
+
+
+class Declared(NamedTuple):
+    """What a field is annotated to hold: an array of dtypes and axes, or parts; if `free` a plain number, if `open` None."""
+
+    name: str
+    dtypes: tuple[str, ...]
+    axes: tuple[int | str, ...]
+    parts: tuple[type, ...]
+    free: bool
+    open: bool
+
+
+@functools.cache
+def _declared(kind: type) -> tuple[Declared, ...]:
+    """Fields that hold arrays or parts; none of a class whose annotations cannot be looked up."""
+    try:
+        hints = typing.get_type_hints(kind)
+    except NameError:
+        return ()
+    found = []
+    for field in dataclasses.fields(kind):
+        members = _members(hints[field.name])
+        classes = list(dict.fromkeys(one for one in members if isinstance(one, type)))
+        array: Any = next((one for one in classes if issubclass(one, AbstractArray)), None)
+        parts = tuple(one for one in classes if dataclasses.is_dataclass(one) or one.__module__.startswith("jaxsph."))
+        how = Any in members, type(None) in members or "open" in field.metadata
+        if array is not None and re.fullmatch(r"[\w ]*", array.dim_str):  # no axes of any number, such as `*any`
+            axes = tuple(int(axis) if axis.isdigit() else axis for axis in array.dim_str.split())
+            found.append(Declared(field.name, tuple(array.dtypes), axes, (), *how))
+        elif array is None and parts and not how[0]:
+            found.append(Declared(field.name, (), (), parts, *how))
+    return tuple(found)
+
+
+def _members(hint: Any) -> list[Any]:
+    """All that a field may be, or may be a tuple or a dictionary of."""
+    return [member for one in typing.get_args(hint) if one is not Ellipsis for member in _members(one)] or [hint]
+
+
+def fitting(name: str, part: Part, kind: type[Part] | None = None) -> Part:
+    """A dataclass of arrays and parts with every leaf as it is annotated; under a trace, too, where shapes are known.
+
+    Plain numbers, lists and arrays of NumPy become arrays; what is neither float32 nor float64, where floats are meant, becomes
+    float32, and where some of a part's numbers are float64, all are.
+
+    Raises:
+        ValueError: naming what is of another shape than most that it goes with, holds no numbers, or is of another kind.
+    """
+    if kind is not None and not isinstance(part, kind):
+        raise ValueError(f"`{name}` must be a `jaxsph.{kind.__name__}`, got {type(part).__name__}")
+    given = [(one, getattr(part, one.name)) for one in _declared(type(part))]  # type: ignore[arg-type]
+    given = [(one, value) for one, value in given if value is not None or not one.open]
+    wide = jax.config.read("jax_enable_x64") and any(getattr(value, "dtype", None) == np.float64 for _, value in given)
+    made = {one.name: _held(one, one.name, name, value, wide) for one, value in given}
+    arrays = [(one, made[one.name]) for one, _ in given if one.dtypes]
+    shapes = [(one, np.shape(each)) for one, value in arrays for each in (value.values() if type(value) is dict else (value,))]
+    sizes: dict[Any, list[int]] = {}
+    for one, shape in shapes:
+        for axis, size in zip(one.axes, shape, strict=False):
+            sizes.setdefault(axis, []).append(size)
+    for one, shape in shapes:
+        wanted = tuple(axis if isinstance(axis, int) else mode(sizes.get(axis, [1])) for axis in one.axes)
+        if shape != wanted:
+            raise ValueError(
+                f"`{one.name}` of `{name}` must have shape {wanted}, got {shape}: arrays of a `{type(part).__name__}` go "
+                "together, padding included; give one of that shape, or make all of it anew; for a batch take `jax.vmap`"
+            )
+    if all(made[one.name] is value for one, value in given):
+        return part
+    return unchecked_of(type(part), **{field.name: getattr(part, field.name) for field in dataclasses.fields(part)} | made)  # type: ignore[arg-type]
+
+
+def _held(one: Declared, field: str, of: str, value: Any, wide: bool) -> Any:
+    """What a field holds, of what it was given: itself, where that may be."""
+    if isinstance(value, dict | tuple) and (one.parts or isinstance(value, dict)):
+        entries = value if isinstance(value, dict) else dict(enumerate(value))
+        kept = {key: _held(one, f"{field}[{key!r}]", of, each, wide) for key, each in entries.items()}
+        same = all(kept[key] is each for key, each in entries.items())
+        return value if same else kept if isinstance(value, dict) else tuple(kept.values())
+    told = f"`{field}` of `{of}` must"
+    if one.parts:
+        if not isinstance(value, one.parts):
+            kinds = " or ".join(f"`jaxsph.{kind.__name__}`" for kind in one.parts)
+            raise ValueError(f"{told} be a {kinds}, got {type(value).__name__}")
+        return fitting(f"{of}.{field}", value) if dataclasses.is_dataclass(value) else value
+    if not isinstance(value, jax.Array):
+        of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+        if one.free and not of_jax:
+            return value
+        value = plain(f"{of}.{field}", value)
+        try:
+            value = jnp.asarray(value) if of_jax else np.asarray(value)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{told} be an array of numbers, got {type(value).__name__}") from error
+    elif value.dtype == (np.float64 if wide else np.float32) and FLOAT in one.dtypes:
+        return value
+    if "bool" in one.dtypes and value.dtype != bool:
+        raise ValueError(f"{told} hold booleans, got dtype {value.dtype}; compare its numbers with something")
+    require_real(f"{field}` of `{of}", value)
+    as_it_is = FLOAT not in one.dtypes or (value.dtype.name in SMALL and value.dtype.name in one.dtypes)
+    dtype = value.dtype if as_it_is else np.float64 if wide else np.float32
+    if isinstance(value, jax.Array) and value.dtype == dtype:
+        return value
+    return array_of(module_for(value).asarray(value), dtype)
+
+
+class Traceable:
+    """What a verb gives, also from a trace: with a fault word, and of `jax.vmap` a batch, whose `LAYER` has more axes."""
+
+    LAYER: ClassVar[tuple[str, int]]
+    faults: Any
+
+    def check(self) -> Self:
+        """The same, for `jitted(scene).check().color`; if something went wrong under `jit`, that is raised with its remedy.
+
+        Raises:
+            CapacityError, ValueError: see `numerics.faults`; and of what is still traced: check it outside of `jit`.
+        """
+        if is_traced(self.faults):
+            raise ValueError("`check` needs numbers: return the image, or its `faults`, from `jit` and check it outside")
+        for word in np.ravel(np.asarray(self.faults)):
+            raise_for(int(word) & ~TOLD)
+        return self
+
+    @property
+    def fault_messages(self) -> tuple[str, ...]:
+        """What went wrong in words, each with a remedy; nothing where all is well (host side)."""
+        word = int(np.bitwise_or.reduce(np.ravel(np.asarray(self.faults))))
+        return tuple(text for bit, text in MESSAGES.items() if word & bit)
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """How many there are, along the axes that `jax.vmap` has put in front; nothing of one."""
+        field, rank = self.LAYER
+        return tuple(np.shape(getattr(self, field))[:-rank])
+
+    def __getitem__(self, index: Any) -> Self:
+        """One of a batch, or some."""
+        if not self.batch:
+            raise TypeError(f"this is one `{type(self).__name__}` and no batch of them; its layers are arrays: take one of these")
+        return jax.tree.map(lambda leaf: leaf[index], self)  # type: ignore[no-any-return]
+
+    def as_one(self, verb: str) -> Self:
+        """Itself, for a verb that needs one; `ValueError` of a batch, of what is traced, and of layers of several shapes."""
+        name = type(self).__name__
+        require_known(f"{name}.{verb}", **{name.lower(): self})
+        if self.batch:
+            raise ValueError(f"`{verb}` takes one `{name}`, this is a batch of {self.batch}, by `jax.vmap`; take one, by `[0]`")
+        fitting(name.lower(), self)
+        return self

@@ -29,7 +29,8 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import array_of, is_traced
+from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
@@ -39,6 +40,7 @@ OF_FILES = ("certified", "faults")
 """Names of the metadata that files add, each of its own part."""
 
 
+@on_host
 def render_tile(
     scene: Scene, camera: Camera, settings: Settings | None, index: int, count: int, *, progress: Progress | None = None
 ) -> Image:
@@ -111,8 +113,6 @@ def of_rows(measures: Measures, first: int, last: int) -> Measures:
 
 
 def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int, count: int) -> None:
-    if is_traced(scene, camera, settings):
-        raise ValueError("`render_tile` counts pairs and needs concrete arrays; call it outside jit")
     if settings.screen == "quadtree":
         raise ValueError(
             "`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges; "

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxsph.engine.asked import require_asked
+from jaxsph.engine.asked import as_asked
 from jaxsph.engine.request import along_rays
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.path import CameraPath
@@ -76,7 +76,7 @@ class Session:
         Raises:
             ValueError: a scene with nothing in it, or a camera that is none; a tolerance of a surface of particles.
         """
-        require_asked(scene, camera, DEFAULT if settings is None else settings)
+        scene, camera = as_asked(scene, camera, DEFAULT if settings is None else settings)
         scene.check()
         self.settings, self.told = default_of(scene) if settings is None else settings, ""
         if scene.surface is not None:

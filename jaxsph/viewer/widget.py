@@ -15,6 +15,7 @@ from jaxsph.io.libraries import require
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.trees import on_host
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import Picture
@@ -29,6 +30,7 @@ MAX_UNSEEN = 2
 """Frames that are on their way to a notebook: more would pile up where it is slow."""
 
 
+@on_host
 def view(scene: Scene | Snapshots, camera: Camera, settings: Settings | None = None) -> Any:
     """Look around in a notebook: a widget with the picture, its camera, and an editor of its transfer function.
 

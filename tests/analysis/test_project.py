@@ -288,6 +288,30 @@ def test_a_plan_that_is_too_small_is_refused_or_a_fault():
     assert int(word) & faults.LIST_OVERFLOW
 
 
+def test_a_plan_is_an_argument_of_jit_and_one_that_is_too_small_is_raised_by_check():
+    particles, camera = particles_of(14), camera_of()
+    plan = js.plan_projection(particles, camera, pixel="ray")
+    small = dataclasses.replace(plan, rays=dataclasses.replace(plan.rays, list_capacity=3))
+    made = jax.jit(lambda particles, plan: js.project(particles, camera, pixel="ray", plan=plan))(particles, small)
+    assert len(made.fault_messages) == 1
+    with pytest.raises(js.CapacityError):
+        made.check()
+    sound = js.project(particles, camera, pixel="ray", plan=plan)
+    assert sound.check() is sound and sound.fault_messages == ()
+
+
+@pytest.mark.parametrize("verb", [js.project, js.plan_projection])
+def test_arguments_of_other_kinds_and_leaves_that_do_not_fit_are_refused_by_name(verb):
+    particles, camera = particles_of(14), camera_of()
+    name = "plan" if verb is js.project else "like"
+    with pytest.raises(ValueError, match=rf"`{name}` must be a plan, got str; make one with `jaxsph\.plan_projection`"):
+        verb(particles, camera, **{name: "mine"})
+    with pytest.raises(ValueError, match=r"`volume` of `particles` must have shape \([0-9]+,\), got \(3,\)"):
+        verb(dataclasses.replace(particles, volume=jnp.ones(3)), camera)
+    with pytest.raises(ValueError, match=r"`axes` of `camera` must have shape \(3, 3\)"):
+        verb(particles, dataclasses.replace(camera, axes=jnp.ones((2, 3))))
+
+
 def test_nothing_is_nothing():
     empty = js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)
     image = js.project(empty, camera_of())

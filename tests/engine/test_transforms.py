@@ -80,6 +80,68 @@ def test_tracing_without_a_plan_says_how_to_make_one(frames):
         jax.jit(lambda s: js.plan(s, camera, frames.settings))(scene)
 
 
+def test_what_is_known_is_rendered_at_once_within_any_trace(frames):
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
+    wanted = js.render(scene, camera, frames.settings, plan=plan).color
+
+    def target(given):
+        made = dataclasses.replace(camera, eye=np.asarray(camera.eye).tolist())  # of numbers that are known, within the trace
+        image = js.render(scene, made, frames.settings, plan=plan)
+        assert image.certified is True and image.faults == 0
+        return given * image.color
+
+    ways = {
+        "jit": jax.jit(target),
+        "scan": lambda one: jax.lax.scan(lambda carry, _: (carry, target(carry)), one, None, length=2)[1][1],
+        "grad": jax.jit(jax.grad(lambda one: target(one).sum())),
+        "vmap": lambda one: jax.jit(jax.vmap(target))(jnp.stack([one, one]))[0],
+    }
+    for way, draw in ways.items():
+        expected = wanted.sum() if way == "grad" else wanted
+        np.testing.assert_allclose(draw(jnp.float32(1)), expected, rtol=1e-5, err_msg=way)
+
+
+def test_a_scene_that_is_made_within_a_trace_of_numbers_is_known_there(frames):
+    def framed(given):
+        particles = js.Particles.from_arrays(np.eye(3), 0.5, np.ones(3))
+        camera = js.Camera.along_axis(particles, width=21, height=18)
+        assert not isinstance(camera.eye, jax.core.Tracer) and js.plan_projection(particles, camera).width == 21
+        return given * js.project(particles, camera).total()
+
+    assert float(jax.jit(framed)(2.0)) == pytest.approx(6, rel=1e-3)
+
+
+@pytest.mark.parametrize("integrator", ["samples", "segments"])
+def test_users_may_forbid_promotion_in_code_of_their_own(frames, integrator):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    plan = dataclasses.replace(frames.plan(), integrator=integrator)
+    settings = dataclasses.replace(frames.settings, integrator=integrator)
+    draw = jax.jit(lambda one, seen_from: js.render(one, seen_from, settings, plan=plan).color.sum())
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        slopes = jax.eval_shape(jax.grad(draw, argnums=(0, 1), allow_int=True), scene, camera)  # rules are traced after `draw`
+        made = js.TransferFunction.from_points([0, 1], [(1, 0, 0), (0, 0, 1)], [0, 1.5])
+        assert js.plan(dataclasses.replace(scene, transfer=made), camera, settings).width == frames.width
+        jax.eval_shape(lambda eye: js.Camera.look_at(eye, (0, 0, 0), near=1, far=5), camera.eye)
+    assert slopes[0].particles.position.shape == scene.particles.position.shape
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_scenes_of_half_floats_are_rendered_in_float32_and_their_slopes_are_half_floats(frames, dtype):
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng), frames.camera(rng), frames.plan()
+    low = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == jnp.float32 else leaf, scene)
+    high = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == dtype else leaf, low)
+    draw = [js.render(one, camera, frames.settings, plan=plan).color for one in (low, high)]
+    assert draw[0].dtype == jnp.float32
+    np.testing.assert_array_equal(*draw)
+    slope = jax.eval_shape(
+        jax.grad(lambda one: js.render(one, camera, frames.settings, plan=plan).color.sum(), allow_int=True), low
+    )
+    assert slope.particles.position.dtype == slope.transfer.colors.dtype == dtype
+
+
 def test_importing_leaves_x64_alone():
     code = "import jax, jaxsph; assert not jax.config.jax_enable_x64"
     subprocess.run([sys.executable, "-c", code], check=True)

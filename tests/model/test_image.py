@@ -113,6 +113,40 @@ def test_jax_takes_it_for_a_tree_of_layers():
     assert isinstance(doubled, js.Image) and float(doubled.color[0, 0, 0]) == 1
 
 
+@pytest.mark.parametrize("count", [(2,), (3, 2)])
+def test_a_batch_says_that_it_is_one_and_is_written_image_by_image(tmp_path, count):
+    one = image(np.full((3, 5, 3), 0.5, np.float32))
+    several = jax.tree.map(lambda layer: np.broadcast_to(layer, count + np.shape(layer)), one)
+    assert several.shape == one.shape == (3, 5) and several.batch == count and one.batch == ()
+    assert f"batch of {' x '.join(map(str, count))}, 5 x 3" in repr(several) and "batch" not in repr(one)
+    verbs = {
+        "save": lambda: several.save(tmp_path / "a.png"),
+        "to_uint8": several.to_uint8,
+        "to_xarray": several.to_xarray,
+        "over": lambda: several.over("white"),
+        "figure": several.figure,
+        "_repr_html_": several._repr_html_,
+    }
+    for verb, call in verbs.items():
+        with pytest.raises(ValueError, match=rf"`{verb}` takes one `Image`, this is a batch of .* by `jax.vmap`; take one, by"):
+            call()
+    assert not (tmp_path / "a.png").exists()
+    np.testing.assert_array_equal(several[(0,) * len(count)].to_uint8(), one.to_uint8())
+    with pytest.raises(TypeError, match="this is one `Image`"):
+        one[0]
+
+
+def test_layers_of_several_shapes_are_refused_by_name(tmp_path):
+    given = dataclasses.replace(image(np.full((3, 5, 3), 0.5)), depth=np.zeros((3, 4)))
+    with pytest.raises(ValueError, match=r"`depth` of `image` must have shape \(3, 5\), got \(3, 4\)"):
+        given.save(tmp_path / "a.exr")
+
+
+def test_what_is_traced_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"`Image.save` needs concrete arrays, and `image` is traced"):
+        jax.eval_shape(lambda shown: shown.save(tmp_path / "a.png"), image(np.full((3, 5, 3), 0.5)))
+
+
 def test_alpha_is_what_is_not_transmitted():
     assert image(np.zeros((2, 2, 3))).alpha.tolist() == [[0, 0], [0, 0]]
 

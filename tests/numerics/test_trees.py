@@ -1,12 +1,15 @@
-"""Classes that `tree` makes are frozen, are pytrees, and are told apart by what is static."""
+"""Classes that `tree` makes are frozen pytrees, told apart by what is static; what is in them fits, or is refused by name."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import OPEN, fitting, on_host, tree
 
 
 @tree(static=("name",))
@@ -58,3 +61,133 @@ def test_what_is_unchecked_holds_whatever_a_transformation_puts_into_its_leaves(
     assert jax.tree.map(lambda _: None, Checked(value=1.0)).value is None
     with pytest.raises(ValueError, match="must be > 0"):
         Checked(value=0.0)
+
+
+@tree()
+class Inner:
+    """A part of a part."""
+
+    corner: Float[Array, "3"]
+
+
+@tree(static=("name",))
+class Held:
+    """One of all kinds of fields that there are."""
+
+    place: Float[Array, "rows 3"]
+    size: Float[Array, " rows"]
+    there: Bool[Array, " rows"]
+    counts: Num[Array, "x y"]
+    weight: Float[Array, " rows_of_columns"]
+    more: dict[str, Float[Array, " rows"]]
+    far: Float[Array, ""] = dataclasses.field(metadata=OPEN)
+    inner: Inner | tuple[Inner, ...] | None = None
+    second: Float[Array, " rows_of_columns"] | None = None
+    free: Float[Array, "3"] | Any = (1.0, 2.0, 3.0)
+    word: Int[Array, ""] | int = 0
+    name: str = "one"
+
+
+ROW = np.ones(4, np.float32)
+ROW_OF_JAX = jnp.asarray(ROW)
+WHOLE = jax.tree.map(
+    jnp.asarray,
+    Held(
+        np.ones((4, 3), np.float32),
+        ROW,
+        ROW > 0,
+        np.ones((2, 5), np.uint8),
+        ROW,
+        {"age": ROW},
+        ROW[0],
+        Inner(ROW[:3]),
+        None,
+        ROW[:3],
+    ),
+)
+
+
+def with_(**fields):
+    return dataclasses.replace(WHOLE, **fields)
+
+
+def test_what_fits_is_itself():
+    assert fitting("held", WHOLE) is WHOLE
+    assert fitting("held", with_(far=None)).far is None
+    several = with_(inner=(WHOLE.inner, WHOLE.inner), second=jnp.ones(7), weight=jnp.ones(7))
+    assert fitting("held", several) is several
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"size": jnp.ones(5)}, r"`size` of `held` must have shape \(4,\), got \(5,\)"),
+        ({"size": jnp.ones(())}, r"`size` of `held` must have shape \(4,\), got \(\)"),
+        ({"place": jnp.ones((7, 3))}, r"`place` of `held` must have shape \(4, 3\), got \(7, 3\)"),
+        ({"place": jnp.ones((4, 2))}, r"`place` of `held` must have shape \(4, 3\), got \(4, 2\)"),
+        ({"more": {"age": jnp.ones(3)}}, r"`more` of `held` must have shape \(4,\), got \(3,\)"),
+        ({"far": jnp.ones(2)}, r"`far` of `held` must have shape \(\), got \(2,\)"),
+        ({"free": (1.0, 2.0)}, r"`free` of `held` must have shape \(3,\), got \(2,\)"),
+        ({"inner": Inner(jnp.ones(2))}, r"`corner` of `held.inner` must have shape \(3,\), got \(2,\)"),
+        ({"inner": (WHOLE.inner, 2.0)}, r"`inner\[1\]` of `held` must be a `jaxsph.Inner`, got float"),
+        ({"size": None}, "`size` of `held` must hold real numbers"),
+        ({"size": "wide"}, "`size` of `held` must hold real numbers"),
+        ({"size": jnp.ones(4, complex)}, "`size` of `held` must hold real numbers, got dtype complex64"),
+        ({"size": [1.0, [2.0]]}, "`size` of `held` must be an array of numbers, got list"),
+        ({"there": jnp.ones(4)}, "`there` of `held` must hold booleans, got dtype float32"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name_also_under_a_trace(fields, said):
+    with pytest.raises(ValueError, match=said):
+        fitting("held", with_(**fields))
+    if {type(leaf) for leaf in jax.tree.leaves(fields)} == {type(ROW_OF_JAX)}:
+        with pytest.raises(ValueError, match=said):
+            jax.eval_shape(lambda given: fitting("held", with_(**given)), fields)
+
+
+def test_plain_numbers_and_lists_become_arrays_of_the_dtype_that_the_others_have():
+    made = fitting("held", with_(size=[1, 2, 3, 4], far=2.5, inner=Inner((0, 1, 2)), free=[1.0, 2.0, 3.0]))
+    assert made.size.tolist() == [1, 2, 3, 4] and made.far.tolist() == 2.5 and made.inner.corner.tolist() == [0, 1, 2]
+    assert {leaf.dtype for leaf in (made.size, made.far, made.inner.corner)} == {jnp.dtype("float32")}
+    assert made.free == [1.0, 2.0, 3.0] and made.word == 0
+    traced = jax.eval_shape(lambda number: fitting("held", with_(inner=Inner([number, 0.0, 1]))), 2.0).inner.corner
+    assert (traced.shape, traced.dtype) == ((3,), jnp.dtype("float32"))
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, jnp.int32])
+def test_narrow_floats_and_integers_become_float32_and_small_integers_stay_where_numbers_may_be_any(dtype):
+    narrow = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == jnp.float32 else leaf, WHOLE)
+    for made in (fitting("held", narrow), jax.eval_shape(lambda given: fitting("held", given), narrow)):
+        assert made.size.dtype == made.more["age"].dtype == made.inner.corner.dtype == jnp.float32
+        assert made.counts.dtype == jnp.uint8 and made.there.dtype == bool
+    assert fitting("held", with_(counts=jnp.ones((2, 5), dtype))).counts.dtype == jnp.float32
+
+
+def test_where_some_of_a_part_is_float64_all_is():
+    with jax.enable_x64(True):
+        made = fitting("held", with_(size=jnp.ones(4, jnp.float64), far=2.5))
+        assert made.place.dtype == made.far.dtype == made.more["age"].dtype == jnp.float64
+        assert made.inner.corner.dtype == jnp.float32  # a part of its own
+        assert fitting("held", with_(far=0.1)).far.dtype == jnp.float32
+
+
+def test_a_verb_of_the_host_refuses_what_is_traced_and_is_done_at_once_within_a_trace():
+    @on_host
+    def total(held, *, factor=1):
+        return float((jnp.asarray(held.size) * factor).sum())
+
+    for given in (lambda one: total(with_(size=one)), lambda one: total(WHOLE, factor=one[0])):
+        with pytest.raises(ValueError, match=r"total` needs concrete arrays, and `(held|factor)` is traced"):
+            jax.make_jaxpr(given)(WHOLE.size)
+    assert jax.jit(lambda one: one * total(WHOLE))(2.0) == 8
+    with pytest.raises(ValueError, match=r"`size` of `held` must have shape \(4,\)"):
+        total(held=with_(size=jnp.ones(2)))
+    with pytest.raises(TypeError, match="positional"):
+        total(WHOLE, 2)
+
+
+def test_other_rules_of_promotion_are_left_to_users():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        assert on_host(lambda held: float((held.place + held.size[:3] * jnp.int32(1)).sum()))(WHOLE) == 24
+        with pytest.raises(ValueError, match="rank_promotion"):
+            WHOLE.place + WHOLE.size[:3]

@@ -22,7 +22,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.trees import on_host
 from jaxsph.reference.along import TOLERANCE, along
 from jaxsph.reference.light_integral import integral
 
@@ -42,7 +42,7 @@ class Explanation:
             `"ended rays"`, light that rays still let through where they ended;
             `"rounding"`, by which two images of the same samples differ.
             Only those that the settings can have: none at full rate, which is what errors are measured against.
-        total: `image.error_bound` of the pixel; NaN where nothing is estimated.
+        total: `image.error_bound` of the pixel; infinite where nothing is estimated.
         certified: whether that is proven.
         note: what there is to say of that in words.
         levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
@@ -111,6 +111,7 @@ class Explanation:
         write_figure(self.figure(quantity, title), os.fspath(path))
 
 
+@on_host
 def explain(
     scene: Scene, camera: Camera, settings: Settings | None = None, *, pixel: tuple[int, int], plan: Plan | None = None
 ) -> Explanation:
@@ -134,8 +135,6 @@ def explain(
         UserWarning: where segments cannot keep a tolerance in the rows that were drawn.
     """
     settings = Settings() if settings is None else settings
-    if is_traced(scene, camera, settings):
-        raise ValueError("`explain` needs concrete arrays; call it outside of jit, vmap and grad")
     row, column = pixel_of(pixel, camera.width, camera.height)
     scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)

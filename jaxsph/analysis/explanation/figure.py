@@ -65,7 +65,7 @@ def _draw_ray(made: Any, axes: Any, quantity: str) -> None:
 
 def _draw_budget(made: Any, axes: Any) -> None:
     """A bar a source."""
-    known = not np.isnan(made.total)
+    known = not np.isinf(made.total)
     kind = "certified" if made.certified else "estimated"
     title = f"error bound {made.total:.2g},\n{kind}" if known else "error bound:\nno estimate"
     shares = sorted(made.sources.items(), key=lambda one: -one[1]) if known else []

@@ -21,7 +21,7 @@ LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range
 
 def note_of(settings: Settings, total: float) -> str:
     """What there is to say of an error bound; nothing where it speaks for itself."""
-    if np.isnan(total):
+    if np.isinf(total):
         remedy = "" if registry.estimates(settings.integrator) else 'integrator="segments" and '
         return f"no estimate, as nothing is compared without a tolerance: give {remedy}tolerance="
     of_samples, along_rays = settings.integrator == "samples", settings.tolerance is not None
@@ -51,7 +51,7 @@ def _line(what: str, text: str) -> str:
 
 
 def _budget(made: Any) -> list[str]:
-    if np.isnan(made.total):
+    if np.isinf(made.total):
         return [_line("error", made.note)]
     kind = "certified" if made.certified else "estimated"
     lines = [_line("error", f"{f'{made.total:.3g}':<11}{kind}{f': {made.note}' if made.note else ''}")]

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.analysis.projection.columns import column_between, pixel_shares, whole_column
 from jaxsph.engine.access.lists import BUNDLE, BundleLists
+from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.transposed import linear_map
 
@@ -95,6 +96,7 @@ def column_sums(method: ColumnMethod, inputs: ColumnInputs, lists: BundleLists) 
     return _sum(method, inputs, lists)
 
 
+@as_usual()
 def _differentiate(method: ColumnMethod, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     """Sums and their tangent, which is a linear map of the tangents with a transpose of its own."""
     inputs, lists = primals

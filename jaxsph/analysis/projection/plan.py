@@ -25,7 +25,8 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import between_faces, num_ghosts, past_faces, runs_through, sees_images, unfolded
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import require_plan
+from jaxsph.numerics.trees import on_host
 
 PIXELS = ("mean", "ray")
 SUBRAYS = 3  # of a pixel on each axis in means, where there are no shares: good to 3e-4 of the peak from 2 pixels a support on
@@ -34,9 +35,10 @@ SHARES = 0
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ProjectionPlan:
-    """Everything that fixes a shape: hashable, and shared by similar projections.
+    """Everything that fixes a shape: hashable, and shared by similar projections. A pytree without leaves.
 
     Attributes:
         width, height: of the image, pixels.
@@ -111,6 +113,7 @@ class ProjectionPlan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
+@on_host
 def plan_projection(
     particles: Particles,
     camera: Camera,
@@ -130,8 +133,7 @@ def plan_projection(
     Raises:
         ValueError: under a trace; when even a band of one row of tiles exceeds `memory_limit`.
     """
-    if is_traced(particles, camera):
-        raise ValueError("`plan_projection` needs concrete arrays to count; call it outside jit and pass `plan=` to `project`")
+    require_plan("like", like, ProjectionPlan, "plan_projection")
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     made = _measured(scaled(particles, digits), scaled_camera(camera, digits), pixel, memory)

@@ -36,10 +36,11 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import array_of, is_traced, module_for
+from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.given import in_unit
+from jaxsph.numerics.trees import fitting
 from jaxsph.numerics.version import __version__
 
 
@@ -59,30 +60,28 @@ def project(
     r"""Integrate what particles hold along the rays of an image.
 
     Without a weight a pixel is $\sum_j a_j F_j$: an amount a unit of area, such as a column density where $a_j$ is a mass. $F_j$
-    is the integral of the kernel, whose integral over space is 1, along the ray between two depths, in closed form. With a weight
-    it is the mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where no particle of any weight is. For $A \rho^n$ see
-    `jaxsph.model.particles.held.emission_measure`.
+    is the integral of the kernel, itself of integral 1, along the ray between two depths, in closed form. With a weight it is the
+    mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.held.emission_measure`.
 
     Args:
         particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.
         camera: where from, how large the image is, and the depths that rays begin and end at.
-        of: numbers of all particles in their order, or the name of a column of them, `"volume"` or `"quantity"`. Without
-            weight: the amounts $a_j$, default the volumes (which then must be true ones, and give the path length inside). With
-            weight: the values $q_j$, default the quantity.
+        of: numbers of all particles in their order, or `"volume"` or `"quantity"`. Without weight the amounts $a_j$, default the
+            volumes (true ones, which give the path length inside); with weight the values $q_j$, default the quantity.
         weight: the weights $w_j$, as for `of`: masses or volumes. Not negative.
-        pixel: `"mean"`: pixels are means over their area, and mass is kept however small a support is; `"ray"`: pixels are
-            values along the rays through their middles, which miss supports that are smaller than a pixel.
+        pixel: `"mean"` over its area, by which mass is kept however small a support is; or `"ray"`, the value along that through
+            its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
-        plan: as for `jaxsph.render`, by `plan_projection`.
-        name, unit: what the values are called, and their unit: by default that of `of` and of positions, where these carry one.
+        plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
+        name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
 
     Returns:
-        Values in the dtype of the particles, in units of `of`, over length squared without weight; as exact as said above.
+        Values in the dtype of the particles, in units of `of`, over length squared without weight.
 
     Differentiation:
-        By positions, supports, `of`, `weight` and the camera, depths included, in both modes. Which pixels a particle can touch
-        and by which rule is held fixed; there are no second derivatives.
+        By positions, supports, `of`, `weight` and the camera, in both modes. Which pixels a particle can touch and by which rule
+        is held fixed; there are no second derivatives.
 
     Raises:
         ValueError: bad data, no such column or rule, depths that do not ascend, a plan for other shapes, values beyond the dtype.
@@ -91,18 +90,20 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
-    held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
-    traced, planned = is_traced(particles, camera, held.amounts), plan is None
-    digits = 0 if traced else digits_to_scale(particles, camera)
-    given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
-    plan = plan or _planned(given[0], given[2], pixel, traced)
-    plan.check(particles, camera, pixel)
-    sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
-    told: Any = (("jaxsph.version", __version__), ("jaxsph.pixel", pixel), ("jaxsph.kernel", particles.kernel))
-    told += () if traced else (("jaxsph.camera", camera.describe()), ("jaxsph.middle", "{!r} {!r}".format(*middle_of(camera))))
-    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
-    return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=told, **named)
+    require_plan("plan", plan, ProjectionPlan, "plan_projection")
+    with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
+        particles, camera = fitting("particles", particles, Particles), fitting("camera", camera, Camera)
+        camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
+        held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
+        digits = 0 if traced else digits_to_scale(particles, camera)
+        given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
+        planned, plan = plan is None, plan or _planned(given[0], given[2], pixel, traced)
+        plan.check(particles, camera, pixel)
+        sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
+        named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
+        told = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
+        told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
+        return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
 
 
 def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock: Clock | None) -> tuple[Any, Any]:
@@ -117,7 +118,7 @@ def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock:
 
 def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
     if traced:
-        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `plan_projection(particles, camera)`")
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
     return plan_projection(particles, camera, pixel=pixel)
 
 

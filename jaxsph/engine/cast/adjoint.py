@@ -41,6 +41,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
 from jaxsph.numerics.trees import tree
@@ -160,6 +161,7 @@ def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted:
     return Within.of(ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), inputs.within), *media
 
 
+@as_usual()
 def _moved(
     method: CastMethod, primals: tuple[DiffInputs, NonDiffInputs], tangents: tuple[DiffInputs, NonDiffInputs]
 ) -> tuple[RayResult, RayResult]:

@@ -43,7 +43,7 @@ class Budget(NamedTuple):
     Attributes:
         color, transmittance, depth, total: of the pixel; `total` is its error bound.
         certified: whether that is proven.
-        sources: shares of it, that add up to it; NaN where nothing is known.
+        sources: shares of it, that add up to it; infinite where nothing is known.
         levels: what error control gave the cells along the pixel, front to back, see `Image.levels`; None without.
     """
 
@@ -57,11 +57,7 @@ class Budget(NamedTuple):
 
 
 def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None) -> Budget:
-    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans and compiled programs it shares).
-
-    Raises:
-        ValueError, CapacityError: as `jaxsph.render`.
-    """
+    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares)."""
     clock, asked = Clock(), Request.of(scene, camera, settings)
     planned = plan is None
     plan, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)

@@ -35,23 +35,9 @@ def image_of(
     planned: bool = True,
     **stats: Any,
 ) -> Image:
-    """The image that was drawn; faults raise.
+    """The image that stages have drawn and a clock has timed; faults raise, and warned is where a tolerance cannot be kept.
 
-    Args:
-        drawn: by stages that ran.
-        camera: in whose view.
-        settings: that were asked for.
-        plan: by which it was drawn.
-        formulas: of the scene.
-        clock: that the stages were timed by.
-        planned: whether capacities were made for this very frame.
-        stats: what else is known of it.
-
-    Raises:
-        CapacityError, ValueError: see `numerics.faults`.
-
-    Warns:
-        UserWarning: where segments cannot keep a tolerance everywhere.
+    `planned` is whether capacities were made for this very frame; `stats` have what else is known of it.
     """
     faults.raise_for(int(drawn.faults), planned)
     image, word = _image(drawn, settings, plan, formulas)

@@ -122,13 +122,13 @@ def of_band(band: OfShards, *, plan: Plan) -> Layers:
 def crop(bands: Layers, plan: Plan) -> Layers:
     """Join the layers of all bands, stacked, and cut off what lies beyond the image; levels of cells come first.
 
-    No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: NaN.
+    No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: inf.
     """
     joined = jax.tree.map(lambda layer: layer.reshape(-1, *layer.shape[2:]), bands)
     levels, joined = joined.levels, joined._replace(levels=None)
     image: Layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], joined)
     known = plan.integrator == REFERENCE or plan.cast.doublings
-    image = image._replace(bound=jnp.minimum(image.bound, 1) if known else jnp.full_like(image.bound, jnp.nan))
+    image = image._replace(bound=jnp.minimum(image.bound, 1) if known else jnp.full_like(image.bound, jnp.inf))
     if levels is None:
         return image
     rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))

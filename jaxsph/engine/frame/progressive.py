@@ -27,13 +27,15 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import array_of, is_traced
+from jaxsph.numerics.checks import array_of, at_once
+from jaxsph.numerics.trees import on_host
 
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 Bands = tuple[Decisions, ...]
 Queues = tuple[tuple[Queue, Queue], ...]
 
 
+@on_host
 def progressive(
     scene: Scene, camera: Camera, settings: Settings | None = None, *, worst: int | None = None, share: float = SHARE
 ) -> Progressive:
@@ -56,8 +58,6 @@ def progressive(
     Raises:
         ValueError: for a `worst` < 1, a `share` outside (0, 1], traced arguments, and what `jaxsph.render` raises it for.
     """
-    if is_traced(scene, camera, settings):
-        raise ValueError("`progressive` shows images as they come and needs concrete arrays; call `jaxsph.render` under jit")
     if worst is not None and not worst >= 1:
         raise ValueError(f"`worst` must be at least 1 leaf a stage, got {worst}; None splits by `share`")
     if not 0 < share <= 1:
@@ -90,6 +90,7 @@ class Progressive:
     def __iter__(self) -> Progressive:
         return self
 
+    @at_once()
     def __next__(self) -> Image:
         if self._stage is None:
             stage = self._begun()

@@ -45,6 +45,7 @@ from jaxsph.engine.lookups.tables import (
     widened,
 )
 from jaxsph.model.transfer.function import SELECT_ALL, at, locate
+from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.extremes import clamped, greater, lesser
 
 __all__ = ["MeanTables", "mean_light"]
@@ -78,6 +79,7 @@ def _packed(means: Callable[..., list[Array]], rows: range, *given: Any) -> Any:
 
 
 @_means.defjvp
+@as_usual()
 def _means_moved(rows: range, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[Array], list[Array]]:
     moved = jax.jvp(functools.partial(_smooth_means, rows), primals, tangents)[1]
     return _means(rows, *primals), moved

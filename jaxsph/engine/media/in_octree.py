@@ -23,9 +23,6 @@ def in_octree(scene: Scene) -> Scene:
     Integrators that choose for themselves where they ask media (`"step_doubling"`) take any scene so. `jaxsph.render` does this
     for them by itself, in each call. With `"samples"` scenes are faster as they are: there rays share what they find.
 
-    Args:
-        scene: any, of concrete arrays; volumes and media stay as they are.
-
     Differentiation:
         By all numbers of particles, transfer function and points that the scene given back holds in its media; which leaf has
         which is held fixed.

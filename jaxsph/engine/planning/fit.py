@@ -30,12 +30,14 @@ from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.particles.periodic import num_ghosts
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import require_plan
+from jaxsph.numerics.trees import on_host
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
 MAX_KEPT = 64
 
 
+@on_host
 def plan(
     scene: Scene,
     camera: Camera,
@@ -65,8 +67,7 @@ def plan(
         ValueError: under a trace; for less headroom or fewer bands than 1; when even a band of one row of tiles exceeds
             `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
-    if is_traced(scene, camera):
-        raise ValueError("`plan` needs concrete arrays to count; call it outside jit and pass `plan=` to `render`")
+    require_plan("like", like, Plan, "plan")
     if not headroom >= 1:
         raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
     if not bands >= 1:

@@ -36,7 +36,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import ROUNDED
+from jaxsph.numerics.checks import ROUNDED, as_usual
 
 
 def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
@@ -84,6 +84,7 @@ def _clipped(value: Array, lo: float, hi: float) -> Array:
 
 
 @_clipped.defjvp
+@as_usual()
 def _clipped_moved(lo: float, hi: float, primals: Any, tangents: Any) -> tuple[Array, Array]:
     return _clipped(*primals, lo, hi), tangents[0]
 
@@ -95,6 +96,7 @@ def _ascending(values: Array) -> Array:
 
 
 @_ascending.defjvp
+@as_usual()
 def _ascending_moved(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return _ascending(*primals), tangents[0]
 

@@ -70,8 +70,8 @@ def write(path: Path, image: Image) -> None:
 def read(path: Path) -> Image:
     """Read an image that `write` wrote, or any OpenEXR image with `R`, `G` and `B`.
 
-    Layers that the file lacks are NaN. `stats` is empty: the sums of a render are not in the file. Colours are as displayed: of
-    linear light its sRGB encoding, to 1e-6 what was written. See `scene_linear` for files that do not say what they have.
+    Layers that the file lacks are NaN, an error bound infinite. `stats` is empty: sums of a render are not in it. Colours are as
+    displayed: of linear light its sRGB encoding, to 1e-6 what was written. See `scene_linear` for files that do not say.
 
     Raises:
         ValueError: damaged, without colour, or with colours of an unknown kind.
@@ -91,7 +91,7 @@ def read(path: Path) -> Image:
             color=array_of(color_of(color) if is_light(header) else color),
             transmittance=array_of(1 - layers.get("A", unknown)),
             depth=array_of(layers.get("Z", unknown)),
-            error_bound=array_of(layers.get("error.bound", unknown)),
+            error_bound=array_of(layers.get("error.bound", np.full_like(unknown, np.inf))),
             evaluations=array_of(layers.get("work.evaluations", unknown)),
             certified=metadata.get("certified") is True,
             faults=int(metadata.get("faults") or 0),

@@ -31,7 +31,7 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
     Raises:
         ValueError: another suffix, a place that cannot be written to, no colour, or a colour behind an EXR.
     """
-    file = Path(path)
+    file, image = Path(path), image.as_one("save")
     form = _format(file)
     if form is exr and background not in (None, "transparent"):
         raise ValueError(

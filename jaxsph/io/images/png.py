@@ -60,7 +60,7 @@ def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) ->
 
 
 def read(path: Path) -> Image:
-    """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file, and NaN.
+    """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file: NaN, and an infinite error bound.
 
     Raises `ValueError`: damaged or another format.
     """
@@ -71,5 +71,5 @@ def read(path: Path) -> Image:
         with pillow.open(path, formats=["PNG"]) as opened:
             color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
             metadata = tuple(getattr(opened, "text", {}).items())
-        unknown = array_of(np.full(color.shape[:2], np.nan, np.float32))
-        return Image(array_of(color), unknown, unknown, unknown, unknown, False, 0, {}, metadata)
+        unknown, bound = (array_of(np.full(color.shape[:2], value, np.float32)) for value in (np.nan, np.inf))
+        return Image(array_of(color), unknown, unknown, bound, unknown, False, 0, {}, metadata)

@@ -42,7 +42,7 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         ValueError: another suffix, a place that cannot be written to, values that float32 cannot hold (EXR).
         ImportError: OpenEXR is not installed, or astropy, for `.fits`.
     """
-    file = Path(path)
+    file, projection = Path(path), projection.as_one("save")
     if file.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{file}: projections are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
     if look and file.suffix.lower() != ".png":

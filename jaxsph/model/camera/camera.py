@@ -22,10 +22,10 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, is_traced, require_finite
+from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import OPEN, on_host, tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
 
@@ -79,8 +79,8 @@ class Camera:
     eye: Float[Array, "3"]
     axes: Float[Array, "3 3"]
     half_height: Float[Array, ""]
-    near: Float[Array, ""]
-    far: Float[Array, ""]
+    near: Float[Array, ""] = dataclasses.field(metadata=OPEN)
+    far: Float[Array, ""] = dataclasses.field(metadata=OPEN)
     width: int = 512
     height: int = 512
     projection: str = "perspective"
@@ -170,6 +170,7 @@ class Camera:
         return _make(eye, target, up, view_height * 0.5, width, height, near, far, "orthographic")
 
     @classmethod
+    @on_host
     def framing(
         cls,
         particles: Bounded,
@@ -210,6 +211,7 @@ class Camera:
         return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
 
     @classmethod
+    @on_host
     def along_axis(
         cls,
         shown: Bounded,
@@ -239,6 +241,7 @@ class Camera:
         return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
 
     @classmethod
+    @on_host
     def fitted(cls, scene: Any, *, width: int = 512, height: int = 512, **view: Any) -> Camera:
         """A camera that shows a scene, by default the central 99 % of what is lit in most of the picture (host side).
 
@@ -353,6 +356,7 @@ def _axes(forward: Any, up: Any, xp: Any) -> Any:
     return xp.stack([right, xp.cross(right, forward), forward])
 
 
+@as_usual()
 def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str) -> Camera:
     for name, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= MAX_SIDE:

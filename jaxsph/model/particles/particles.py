@@ -23,7 +23,7 @@ from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import on_host, tree
 
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
 VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
@@ -286,6 +286,7 @@ class Particles:
         rest = None if rest is None else array_of(rest + (left + turns * left_of_sides))
         return dataclasses.replace(self, position=array_of(position), position_rest=rest)
 
+    @on_host
     def to_numpy(self) -> dict[str, np.ndarray]:
         """The particles that exist, without padding (host side): all `columns`."""
         valid = np.asarray(self.valid)
@@ -322,6 +323,7 @@ class Particles:
         position = np.asarray(self.position, np.float64)
         return position if self.position_rest is None else position + np.asarray(self.position_rest, np.float64)
 
+    @on_host
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around every support, (3,) and (3,), float64, length units (host side).
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import scipy.spatial
+from jaxtyping import Array, Float
 
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
@@ -79,13 +80,13 @@ class Surface:
             [0, 1], a direction without length.
     """
 
-    level: Any = 0.5
+    level: Float[Array, ""] | Any = 0.5
     of: str = "coverage"
-    smoothing: Any = 1.0
-    color: Any = COLOR
-    ambient: Any = AMBIENT
-    opacity: Any = None
-    light: Any = None
+    smoothing: Float[Array, ""] | Any = 1.0
+    color: Float[Array, "3"] | Any = COLOR
+    ambient: Float[Array, ""] | Any = AMBIENT
+    opacity: Float[Array, ""] | Any | None = None
+    light: Float[Array, "3"] | Any | None = None
 
     def __post_init__(self) -> None:
         if self.of not in FIELDS:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
@@ -53,6 +53,7 @@ class TransferFunction:
         )
 
     @classmethod
+    @as_usual()
     def from_points(cls, values: Any, colors: Any, extinction: Any, extinction_values: Any = None) -> TransferFunction:
         """Check and pack control points.
 
@@ -175,6 +176,7 @@ class TransferFunction:
         """
         return found("jaxsph.plot.transfer_figure:transfer_figure")(self, scene, camera, **more)
 
+    @as_usual()
     def __call__(
         self, quantity: Float[Array, "..."], extinction_quantity: Float[Array, "..."] | None = None
     ) -> tuple[Float[Array, "... 3"], Float[Array, "..."]]:
@@ -405,6 +407,7 @@ def _evenly(segments: Segments, quantity: Array) -> tuple[Array, Array]:
 
 
 @_evenly.defjvp
+@as_usual()
 def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) -> tuple[Any, Any]:
     """Control points that move one by one are evenly spaced no more, so the place within a segment changes as in any other."""
     (segments, quantity), (segments_dot, quantity_dot) = primals, tangents

@@ -31,6 +31,7 @@ from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product
+from jaxsph.numerics.trees import on_host
 
 __all__ = ["COLORMAPS", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
 
@@ -180,6 +181,7 @@ def domain_transfer(
     return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
 
+@on_host
 def preset(
     name: str,
     shown: Any,

@@ -127,7 +127,7 @@ def test_layers_that_a_foreign_image_lacks_are_unknown(tmp_path):
     OpenEXR.File({}, {"R": layer, "G": layer, "B": layer}).write(str(tmp_path / "a.exr"))
     got = io.read_image(tmp_path / "a.exr")
     np.testing.assert_array_equal(got.color, np.ones((2, 2, 3)))
-    assert np.isnan(got.transmittance).all() and got.certified is False
+    assert np.isnan(got.transmittance).all() and np.isinf(got.error_bound).all() and got.certified is False
 
 
 def test_an_image_without_colour_is_refused(tmp_path):

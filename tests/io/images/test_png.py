@@ -26,7 +26,7 @@ def test_colours_come_back_within_half_a_step_and_other_layers_are_unknown(tmp_p
     io.write_image(tmp_path / "a.png", make_image(color))
     got = io.read_image(tmp_path / "a.png")
     np.testing.assert_allclose(got.color, color, rtol=0, atol=0.5 / 255 + np.finfo(np.float32).eps)
-    assert np.isnan(got.transmittance).all() and got.certified is False
+    assert np.isnan(got.transmittance).all() and np.isinf(got.error_bound).all() and got.certified is False
 
 
 def test_a_cut_image_is_refused_by_name(tmp_path):
