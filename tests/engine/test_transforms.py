@@ -1,6 +1,7 @@
 """Promises about JAX: eager, jit and vmap are one image; one program serves all similar frames; x64 is never switched on."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 
@@ -140,6 +141,19 @@ def test_scenes_of_half_floats_are_rendered_in_float32_and_their_slopes_are_half
         jax.grad(lambda one: js.render(one, camera, frames.settings, plan=plan).color.sum(), allow_int=True), low
     )
     assert slope.particles.position.dtype == slope.transfer.colors.dtype == dtype
+
+
+@pytest.mark.parametrize("surface", [None, js.Surface(0.3)], ids=["medium", "surface"])
+def test_float64_beside_float32_is_rendered_in_float64(frames, surface):
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        scene = dataclasses.replace(frames.scene(rng), surface=surface)
+        wide = dataclasses.replace(scene.particles, volume=scene.particles.volume.astype(jnp.float64))
+        cameras = [frames.camera(np.random.default_rng(1), dtype=dtype) for dtype in (np.float64, np.float32)]
+        for one, camera in ((scene, cameras[0]), (dataclasses.replace(scene, particles=wide), cameras[1])):
+            plan = js.plan(one, camera, frames.settings)
+            draw = functools.partial(js.render, settings=frames.settings, plan=plan)
+            assert jax.eval_shape(draw, one, camera).color.dtype == jnp.float64
 
 
 def test_importing_leaves_x64_alone():

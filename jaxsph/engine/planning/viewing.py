@@ -132,6 +132,7 @@ def view_scene(
     scene, clipped = scene_in_range(scene)
     scene, folded = _unfolded(scene, capacity, margin)
     particles = spheres_of(scene).padded(capacity)
+    particles = jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, particles)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
     if transfer is not None:
         particles, transfer = in_units_of(particles, transfer)
@@ -141,7 +142,7 @@ def view_scene(
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
         seen = SurfaceLayers.seen_through if scene.surface.opacity is not None else ParticleSurface.seen
-        lit = _lit(scene.surface, camera)
+        lit = jax.tree.map(lambda leaf: leaf.astype(dtype), _lit(scene.surface, camera))
         media, transfer = (seen(lit, particles, viewed, transfer, clip), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.without_data() for medium in media)
