@@ -23,9 +23,8 @@ from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.trees import on_host
 from jaxsph.reference.chords import Rays, blocks, rays_of
-from jaxsph.reference.looks import INTEGRATION, AtNodes, Look, light_of
-from jaxsph.reference.media import AllOfVolume, AllParticles, Whole, at_nodes, met, parts_of
-from jaxsph.reference.portions import Portions
+from jaxsph.reference.looks import INTEGRATION, light_of
+from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
 
 BLOCK = 128  # rays that share arrays
 WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2
@@ -90,55 +89,33 @@ def visibility_histogram(
     if not 0 <= part < len(looks):
         there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
         raise ValueError(f"`part` must be the number of a part with a transfer function, got {part}; there are {there}")
-    parts, record = parts_of(scene, camera), Recording(looks[part])
-    looked = [one for one in (whole.bare for whole in parts) if isinstance(one, AllParticles | AllOfVolume)][part]
-    looked.look = record
+    parts = parts_of(scene, camera)
     pixels = np.random.default_rng(seed).choice(number, min(rays, number), replace=False)
     chosen = rays_of(camera, *np.unravel_index(pixels, (camera.height, camera.width)))
-    for some in blocks(chosen, BLOCK):
-        _cast(chosen.some(some), parts, record)
-    return _histogram(record, looks[part], bins, len(chosen.u))
+    found = [_cast(chosen.some(some), parts, part) for some in blocks(chosen, BLOCK)]
+    return _histogram(found, looks[part], bins, len(chosen.u))
 
 
-class Recording(Look):
-    """A transfer function that remembers what quantities it was asked for, and what it made of them."""
+def _cast(rays: Rays, parts: list[Part], part: int) -> tuple[np.ndarray, ...]:
+    """Of one block of rays, in portions as the reference first cuts them: what quantities of a part are met at nodes.
 
-    def __init__(self, transfer: TransferFunction):
-        super().__init__(transfer)
-        self.found: list[tuple[np.ndarray, ...]] = []
-        self._asked: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-
-    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
-        """See `Look`."""
-        before = seen.extinction[:, which].copy(), seen.emission[:, :, which].copy()
-        super().add(seen, which, quantities, portions, slant)
-        self._asked.append((which, quantities[0], seen.extinction[:, which] - before[0], seen.emission[:, :, which] - before[1]))
-
-    def weigh(self, path: np.ndarray, transmittance: np.ndarray) -> None:
-        """Keep what was asked for since, with the path length of each node and the transmittance in front of it."""
-        for which, quantity, extinction, emission in self._asked:
-            there = ~np.isnan(quantity)
-            length = np.where(there, path[:, which], 0)
-            seen = length * transmittance[:, which]
-            light = (seen * emission).transpose(1, 2, 0)[there]
-            self.found.append((quantity[there], length[there], (seen * extinction)[there], light))
-        self._asked.clear()
-
-
-def _cast(rays: Rays, wholes: list[Whole], record: Recording) -> None:
-    """One block of rays, in portions as the reference first cuts them."""
-    parts, portions = met(wholes, rays)
+    Returns:
+        The quantities, with the path length of each node, and what is absorbed and emitted (nodes, 3) there.
+    """
+    portions = roots_of(parts, rays)
     seen = at_nodes(parts, portions)
     half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
     thickness = light_of(seen, half_path).thickness
     before = np.cumsum(thickness[:, -1]) - thickness[:, -1]  # of all portions before each, which come in order
     front = np.exp(-(before - before[np.searchsorted(portions.ray, portions.ray)]))
-    record.weigh(WEIGHTS[:, None] * half_path, (front[:, None] * np.exp(-thickness)).T)
+    which, quantities, extinction, emission = seen.looked[part]
+    path = (WEIGHTS[:, None] * half_path)[:, which]
+    left = path * (front[:, None] * np.exp(-thickness)).T[:, which]
+    return quantities[0].ravel(), path.ravel(), (left * extinction).ravel(), (left * emission).reshape(3, -1).T
 
 
-def _histogram(record: Recording, transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:
-    columns = [np.concatenate(column) for column in zip(*record.found, strict=True)] if record.found else None
-    quantity, path, absorbed, emitted = columns or [np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3))]
+def _histogram(found: list[tuple[np.ndarray, ...]], transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:
+    quantity, path, absorbed, emitted = (np.concatenate(column) for column in zip(*found, strict=True))
     scale = Scale.of(np.asarray(transfer.values, np.float64))
     place = scale.place(quantity)
     finite = place[np.isfinite(place)]

@@ -109,10 +109,8 @@ class Spheres:
         seen &= (self.center[:, 2] + self.radius > rays.near) & (self.center[:, 2] - self.radius < rays.far)
         sphere, order = np.flatnonzero(seen), np.argsort(rays.u)
         first, last = np.searchsorted(rays.u[order], left[sphere]), np.searchsorted(rays.u[order], right[sphere], "right")
-        count = last - first
-        ends = np.cumsum(count)
-        for some in np.split(np.arange(len(sphere)), np.searchsorted(ends, np.arange(1, _parts(ends)) * MOST_CANDIDATES)):
-            which, ray = ranges(first[some], count[some])
+        for some in batches(last - first, MOST_CANDIDATES):
+            which, ray = ranges(first[some], last[some] - first[some])
             ray, of = order[ray], sphere[some][which]
             inside = (low[of] <= rays.v[ray]) & (rays.v[ray] <= high[of])
             yield ray[inside], of[inside]
@@ -124,8 +122,11 @@ def ranges(first: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> tuple[
     return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)
 
 
-def _parts(ends: np.ndarray) -> int:
-    return int(ends[-1]) // MOST_CANDIDATES + 1 if len(ends) else 1
+def batches(count: Int[np.ndarray, " n"], most: int) -> list[Int[np.ndarray, " some"]]:
+    """Numbers of things, as many at a time as have about `most` of what is counted together."""
+    ends = np.cumsum(count)
+    some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(most, ends[-1] if len(ends) else 0, most)))
+    return [part for part in some if len(part)]
 
 
 def _shadow(x: np.ndarray, z: np.ndarray, radius: np.ndarray, is_perspective: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles import kernels
 from jaxsph.model.points import Points
@@ -24,7 +23,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.points import thickness
-from jaxsph.reference.where import columns_of, ray_coordinates, to_view, to_world
+from jaxsph.reference.where import columns_of, ray_coordinates, seen_by, to_view, to_world
 from jaxsph.reference.where import inside as within
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
@@ -52,10 +51,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     settings = settings or Settings()
     if every < 1:
         raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
-    scene.check_without_surface("the reference")
-    if scene.media:
-        raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
-    camera = with_depths(camera, scene)
+    camera = seen_by(camera, scene)
     numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
     quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import Light, light_of, where_thickness
-from jaxsph.reference.media import Part, Whole, at_nodes, met, parts_of
+from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
 from jaxsph.reference.portions import Portions
+from jaxsph.reference.where import seen_by
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
@@ -75,12 +75,9 @@ def integral(
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2 (field). Kaehler, Abel & Hege 2007, equations 1 to 4 (parts).
     """
     started = time.perf_counter()
-    scene.check_without_surface("the reference")
-    if scene.media:
-        raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
     if not tolerance >= LEAST_TOLERANCE:
         raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
-    camera = with_depths(camera, scene)
+    camera = seen_by(camera, scene)
     rows, columns = _pixels(camera, pixels, every)
     rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
     found, counts = _all(rays, parts, tolerance, progress)
@@ -94,13 +91,16 @@ def integral(
 
 
 def _all(
-    rays: Rays, parts: list[Whole], tolerance: float, progress: Callable[[int, int], None] | None
+    rays: Rays, parts: list[Part], tolerance: float, progress: Callable[[int, int], None] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """See `_block`."""
+    """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
     found, counts, done = np.empty((len(rays.u), 7)), np.zeros(2, int), 0
-    for some in blocks(rays, BLOCK):
-        found[some], more = _block(rays.some(some), parts, tolerance)
-        counts, done = counts + more, done + len(some)
+    for which in blocks(rays, BLOCK):
+        some = rays.some(which)
+        portions, light, evaluations = refined(some, parts, roots_of(parts, some), tolerance)
+        found[which] = np.concatenate([_composite(some, portions, light), evaluations[:, None]], 1)
+        counts += sum(len(part.chords.ray) for part in parts), len(portions.ray)
+        done += len(which)
         if progress is not None:
             progress(done, len(rays.u))
     return found, counts
@@ -129,14 +129,6 @@ def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple
     return rows.astype(int), columns.astype(int)
 
 
-def _block(rays: Rays, wholes: list[Whole], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
-    parts, portions = met(wholes, rays)
-    portions, light, evaluations = refined(rays, parts, portions, tolerance)
-    chords = sum(len(part.chords.ray) for part in parts)
-    return np.concatenate([_composite(rays, portions, light), evaluations[:, None]], 1), np.array([chords, len(portions.ray)])
-
-
 def refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float) -> tuple[Portions, Light, np.ndarray]:
     """Split portions until the error of every ray is within tolerance, or no portion can be split."""
     count = len(rays.u)
@@ -162,11 +154,9 @@ def refined(rays: Rays, parts: list[Part], portions: Portions, tolerance: float)
         portions = Portions(*(np.repeat(column, times) for column in portions))
         portions.end[first], portions.start[first + 1] = where, where
         new = np.stack([first, first + 1], 1).ravel()
-        fresh = look(portions.some(new))
-        for name, column in vars(light).items():
-            column = np.repeat(column, times, axis=0)
-            column[new] = getattr(fresh, name)
-            setattr(light, name, column)
+        light = Light(*(np.repeat(column, times, axis=0) for column in light))
+        for column, fresh in zip(light, look(portions.some(new)), strict=True):
+            column[new] = fresh
     return portions, light, evaluations
 
 

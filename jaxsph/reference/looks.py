@@ -8,8 +8,7 @@ second of them says how good that is.
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -44,9 +43,8 @@ WITHIN = chebyshev.chebvander(PLACE[:-1, None] + np.diff(PLACE)[:, None] * [0.2,
 INTEGRATION, EVERY_SECOND = _integration(PLACE), _integration(PLACE[::2])
 
 
-@dataclasses.dataclass
-class AtNodes:
-    """What is at nodes of portions, summed over media; each medium adds its own.
+class AtNodes(NamedTuple):
+    """What is at nodes of portions, summed over the parts of a scene; each adds its own to the arrays.
 
     Attributes:
         extinction: a unit of path length.
@@ -55,6 +53,8 @@ class AtNodes:
         crossing: depth where a quantity crosses a control value, NaN where none does.
         weight: how much extinction changes there.
         evaluations: of kernels.
+        looked: of each part with a transfer function, in order: numbers of the portions where it is, and its quantities there,
+            and what extinction and emission it adds.
     """
 
     extinction: Float[np.ndarray, "nodes portions"]
@@ -63,18 +63,10 @@ class AtNodes:
     crossing: Float[np.ndarray, " portions"]
     weight: Float[np.ndarray, " portions"]
     evaluations: Float[np.ndarray, " portions"]
-
-    @classmethod
-    def nothing(cls, portions: int) -> AtNodes:
-        """Empty space."""
-        none = [np.zeros(portions) for _ in range(3)]
-        return cls(
-            np.zeros((NODES, portions)), np.zeros((3, NODES, portions)), none[0], np.full(portions, np.nan), none[1], none[2]
-        )
+    looked: list[tuple[np.ndarray, list[np.ndarray], np.ndarray, np.ndarray]]
 
 
-@dataclasses.dataclass
-class Light:
+class Light(NamedTuple):
     """What portions show from right in front of them.
 
     Attributes:
@@ -129,9 +121,11 @@ class Look:
         path = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
         looks = zip(self._tables, given if len(given) == len(self._tables) else given * len(self._tables), strict=True)
         channels = [channel for table, quantity in looks for channel in table.add(seen, which, quantity, portions, path)]
-        red, green, blue, extinction = channels
+        *color, extinction = channels
+        emission = np.stack(color) * extinction
         seen.extinction[:, which] += extinction
-        seen.emission[:, :, which] += np.stack([red, green, blue]) * extinction
+        seen.emission[:, :, which] += emission
+        seen.looked.append((which, given, extinction, emission))
 
 
 class _Table:

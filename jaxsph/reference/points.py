@@ -5,8 +5,6 @@ Flow: Points, rays, borders of samples -> [points] -> image.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax
 import numpy as np
 
@@ -16,22 +14,6 @@ from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Tabl
 from jaxsph.reference.where import integral_across, lines
 
 BLOCK = 4096  # places at which a function is asked at once: one program, whatever the number of rays
-
-
-class Chords(NamedTuple):
-    """Where rays pass one point; all but the rays' directions in radii of it.
-
-    Attributes:
-        foot: (rays, 3), from the centre to the nearest place of each ray, world axes.
-        direction: (rays, 3), of length 1, world axes.
-        half: (rays,), half of the length inside.
-        attributes: of the point, by name.
-    """
-
-    foot: np.ndarray
-    direction: np.ndarray
-    half: np.ndarray
-    attributes: dict[str, np.ndarray]
 
 
 def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,36 +44,42 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
         rows, columns = np.nonzero((foot**2).sum(-1) < radius**2)
         foot, slant, foot_depth = foot[rows, columns] / radius, slant[rows, columns], foot_depth[rows, columns]
         attributes = {name: np.asarray(values[point], np.float64) for name, values in points.attributes.items()}
-        half = np.sqrt(np.maximum(1 - (foot**2).sum(-1), 0))
-        chords = Chords(foot @ axes, directions[rows, columns] / slant[:, None] @ axes, half, attributes)
+        half = np.sqrt(np.maximum(1 - (foot**2).sum(-1), 0))[:, None]  # of the length inside
+        seen = points.profile, attributes, foot @ axes, directions[rows, columns] / slant[:, None] @ axes
         place = (edges - foot_depth[:, None]) * slant[:, None] / radius  # of borders along rays, from the foot on
-        spread = _spread(points, middle, camera.is_perspective)
-        if spread == "chords":
-            ends = np.clip(place, -half[:, None], half[:, None])
-            lengths = _integral(points.profile, chords, ends[:, :-1], ends[:, 1:])
+        away = np.linalg.norm(middle) if camera.is_perspective else middle[2]
+        is_splat = points.splats_beyond is not None and away > float(points.splats_beyond)
+        if points.spread == "chords" and not is_splat:
+            ends = np.clip(place, -half, half)
+            lengths = _integral(*seen, ends[:, :-1], ends[:, 1:])
         else:
-            at = foot_depth if spread == "feet" else np.full(len(rows), middle[2])
+            at = foot_depth if points.spread == "feet" and not is_splat else np.full(len(rows), middle[2])
             held = (edges[:-1] <= at[:, None]) & (at[:, None] < edges[1:])
-            lengths = held * _integral(points.profile, chords, -half[:, None], half[:, None])
+            lengths = held * _integral(*seen, -half, half)
         own = float(points.extinction[point]) * radius * lengths
         total[rows, columns] += own
         colored[rows, columns] += own[..., None] * np.asarray(points.color[point], np.float64)
     return total, colored
 
 
-def _spread(points: Points, middle: np.ndarray, perspective: bool) -> str:
-    away = np.linalg.norm(middle) if perspective else middle[2]
-    is_splat = points.splats_beyond is not None and away > float(points.splats_beyond)
-    return "centres" if is_splat else points.spread
+def _integral(
+    profile: Profile,
+    attributes: dict[str, np.ndarray],
+    foot: np.ndarray,
+    direction: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+) -> np.ndarray:
+    """Of the profile along rays from `start` to `end`, (rays, samples), in radii; split where a profile may have a kink.
 
-
-def _integral(profile: Profile, chords: Chords, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Of the profile along rays from `start` to `end`, (rays, samples), in radii; split where a profile may have a kink."""
+    Rays have their `foot`, (rays, 3), from the centre to the place that is nearest to it, and a `direction` of length 1, on world
+    axes.
+    """
 
     def value(t: np.ndarray) -> np.ndarray:
-        return at_offset(profile, chords.foot[:, None] + t[..., None] * chords.direction[:, None], chords.attributes)
+        return at_offset(profile, foot[:, None] + t[..., None] * direction[:, None], attributes)
 
-    return integral_across(kinks(profile), (chords.foot**2).sum(-1)[:, None], start, end, value)
+    return integral_across(kinks(profile), (foot**2).sum(-1)[:, None], start, end, value)
 
 
 def kinks(profile: Profile) -> np.ndarray:

@@ -14,7 +14,6 @@ from jaxsph.reference.chords import Chords, Rays, ranges
 
 LONGEST = 0.25  # of a support: see `borders`
 FEW = 4  # chords, see `borders`
-PAIRS = 1 << 12  # of a portion and a chord, whose nodes are looked at at once: what a cache holds
 
 
 class Portions(NamedTuple):
@@ -23,7 +22,7 @@ class Portions(NamedTuple):
     Attributes:
         ray: number of its ray.
         start, end: depths.
-        root: number of the portion of the first cut that it is a part of: lists are of those.
+        root: number of the portion of the first cut that it is a part of: what parts of a scene have there is told of those.
     """
 
     ray: Int[np.ndarray, " portions"]
@@ -34,30 +33,6 @@ class Portions(NamedTuple):
     def some(self, which: np.ndarray) -> Portions:
         """Those of the given numbers, or a mask."""
         return Portions(*(column[which] for column in self))
-
-
-class Lists(NamedTuple):
-    """Numbers of chords that lie over roots: `chord[first[i] : first[i] + length[i]]` over root i."""
-
-    first: Int[np.ndarray, " roots"]
-    length: Int[np.ndarray, " roots"]
-    chord: Int[np.ndarray, " pairs"]
-
-    def batches(self, root: Int[np.ndarray, " portions"]) -> list[np.ndarray]:
-        """Numbers of portions, as many at a time as have about `PAIRS` chords over them together."""
-        ends = np.cumsum(self.length[root])
-        pairs = int(ends[-1]) if len(ends) else 0
-        some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(PAIRS, pairs, PAIRS)))
-        return [part for part in some if len(part)]
-
-    def over(self, root: Int[np.ndarray, " portions"]) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of a portion (a place in `root`) and a chord, portion by portion."""
-        which, place = ranges(self.first[root], self.length[root])
-        return which, self.chord[place]
-
-    def some(self, which: np.ndarray) -> Lists:
-        """Of some of the roots."""
-        return self._replace(first=self.first[which], length=self.length[which])
 
 
 Cuts = tuple[np.ndarray, np.ndarray]
@@ -100,8 +75,8 @@ def cut(rays: Rays, cuts: list[Cuts]) -> Portions:
     return Portions(ray[:-1][held], start, end, np.arange(len(start)))
 
 
-def lists(rays: Rays, portions: Portions, chords: Chords) -> Lists:
-    """Which chords lie over which portions."""
+def lists(rays: Rays, portions: Portions, chords: Chords) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which chords lie over which portions: `chord[first[i] : first[i] + length[i]]` of the arrays over portion i."""
     width = 2 * (rays.far - rays.near)
 
     def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -117,4 +92,4 @@ def lists(rays: Rays, portions: Portions, chords: Chords) -> Lists:
     chord, portion = chord[over], portion[over]
     count = np.bincount(portion, minlength=len(portions.ray))
     small = portion.astype(np.uint16) if len(count) <= 1 << 16 else portion  # which sorts faster
-    return Lists(np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")])
+    return np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")]

@@ -16,11 +16,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
+
+
+def seen_by(camera: Camera, scene: Scene) -> Camera:
+    """The camera with depths, of a scene that the reference knows.
+
+    Raises:
+        ValueError: it does not know it.
+    """
+    scene.check_without_surface("the reference")
+    if scene.media:
+        raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
+    return with_depths(camera, scene)
 
 
 def ray_coordinates(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
