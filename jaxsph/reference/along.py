@@ -15,13 +15,12 @@ from jaxtyping import Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
-from jaxsph.reference.chords import Rays, rays_of
+from jaxsph.reference.chords import Portions, Rays, cut, rays_of
+from jaxsph.reference.columns import thickness
 from jaxsph.reference.image import sample_borders, sample_depths
 from jaxsph.reference.light_integral import refined
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, light_of
 from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of
-from jaxsph.reference.points import thickness
-from jaxsph.reference.portions import Portions, cut
 from jaxsph.reference.where import inside, places_of, seen_by, to_world
 
 TOLERANCE = 1e-6  # of the light integral, where that is what a ray is known by
@@ -64,9 +63,9 @@ def along(scene: Scene, camera: Camera, row: int, column: int, samples: int | No
     """
     camera = seen_by(camera, scene)
     rays, parts = rays_of(camera, np.array([row]), np.array([column])), parts_of(scene, camera)
-    roots = cut(rays, [part.meet(rays) for part in parts])
+    roots = cut(rays, [cuts for part in parts for cuts in part.meet(rays)])
     for part in parts:
-        part.lies_over(roots)
+        part.take(roots)
     first, found = parts[0], np.zeros(0, int)
     if isinstance(first, ParticlesPart):
         entry = places_of(scene.particle_set)[1]
@@ -114,7 +113,7 @@ def _sampled(scene: Scene, camera: Camera, rays: Rays, parts: list[Part], sample
     portions = Portions(np.zeros(samples, int), depth - POINT * path, depth + POINT * path, np.arange(samples))
     parts = parts[: len(scene.looks)]
     for part in parts:
-        part.lies_over(portions)
+        part.take(portions)
     seen, quantities, first = _looked(parts, portions)
     extinction = seen.extinction[MIDDLE]
     visible = inside(scene.within, to_world(rays.start + depth[:, None] * rays.direction, camera))

@@ -1,12 +1,13 @@
-"""Where rays pass spheres, in float64: rays of chosen pixels, and their entries into and exits from supports.
+"""Rays of chosen pixels in float64: their entries into and exits from spheres, and the portions that they are cut into.
 
-Flow: camera, pixels -> rays; rays, spheres -> [chords] -> portions, media.
+Flow: camera, pixels -> rays; rays, spheres -> chords; rays, cuts -> [chords] -> portions -> media.
+
+Nothing begins or ends inside of a portion, and lists say which chords lie over it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.reference.where import lines, ray_coordinates
 
 MOST_CANDIDATES = 1 << 20  # pairs of a ray and a sphere that are looked at at once
+LONGEST = 0.25  # of a support: see `borders`
+FEW = 4  # chords, see `borders`
 
 
 class Rays(NamedTuple):
@@ -23,40 +26,31 @@ class Rays(NamedTuple):
 
     Attributes:
         u, v: their lateral coordinates, as `model.camera` has them.
+        start: places at depth 0.
+        direction: change of place a unit of depth.
+        slant: path length a unit of depth.
         near, far: depths between which light is looked at.
-        is_perspective: whether all start at the eye.
     """
 
     u: Float[np.ndarray, " rays"]
     v: Float[np.ndarray, " rays"]
+    start: Float[np.ndarray, "rays 3"]
+    direction: Float[np.ndarray, "rays 3"]
+    slant: Float[np.ndarray, " rays"]
     near: float
     far: float
-    is_perspective: bool
-
-    @property
-    def start(self) -> Float[np.ndarray, "rays 3"]:
-        """Places at depth 0."""
-        return lines(self.u, self.v, self.is_perspective)[0]
-
-    @property
-    def direction(self) -> Float[np.ndarray, "rays 3"]:
-        """Change of place a unit of depth."""
-        return lines(self.u, self.v, self.is_perspective)[1]
-
-    @property
-    def slant(self) -> Float[np.ndarray, " rays"]:
-        """Path length a unit of depth."""
-        return np.sqrt(1 + self.u**2 + self.v**2) if self.is_perspective else np.ones_like(self.u)
 
     def some(self, which: Int[np.ndarray, " some"]) -> Rays:
         """Those of the given numbers."""
-        return self._replace(u=self.u[which], v=self.v[which])
+        u, v, slant = self.u[which], self.v[which], self.slant[which]
+        return Rays(u, v, self.start[which], self.direction[which], slant, self.near, self.far)
 
 
 def rays_of(camera: Camera, rows: Int[np.ndarray, " rays"], columns: Int[np.ndarray, " rays"]) -> Rays:
     """The rays through the middles of pixels."""
     u, v = ray_coordinates(camera, columns + 0.5, rows + 0.5)
-    return Rays(u, v, *camera.near_and_far(), camera.is_perspective)
+    slant = np.sqrt(1 + u**2 + v**2) if camera.is_perspective else np.ones_like(u)
+    return Rays(u, v, *lines(u, v, camera.is_perspective), slant, *camera.near_and_far())
 
 
 def blocks(rays: Rays, size: int) -> list[Int[np.ndarray, " some"]]:
@@ -99,21 +93,25 @@ class Spheres:
 
     def chords(self, rays: Rays) -> Chords:
         """All chords of `rays` between near and far; cut off there they are not."""
-        found = [_chords(rays, self.center, self.radius, *pairs) for pairs in self._candidates(rays)]
-        return Chords(*(np.concatenate(parts) for parts in zip(NO_CHORDS, *found, strict=True)))
-
-    def _candidates(self, rays: Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Numbers of rays and of spheres whose shadows they may be in, some at a time."""
         (left, right), (low, high) = self._shadow
         seen = (left <= rays.u.max()) & (right >= rays.u.min()) & (low <= rays.v.max()) & (high >= rays.v.min())
         seen &= (self.center[:, 2] + self.radius > rays.near) & (self.center[:, 2] - self.radius < rays.far)
-        sphere, order = np.flatnonzero(seen), np.argsort(rays.u)
-        first, last = np.searchsorted(rays.u[order], left[sphere]), np.searchsorted(rays.u[order], right[sphere], "right")
+        candidates, order = np.flatnonzero(seen), np.argsort(rays.u)
+        first, last = np.searchsorted(rays.u[order], left[candidates]), np.searchsorted(rays.u[order], right[candidates], "right")
+        found = [NO_CHORDS]
         for some in batches(last - first, MOST_CANDIDATES):
-            which, ray = ranges(first[some], last[some] - first[some])
-            ray, of = order[ray], sphere[some][which]
-            inside = (low[of] <= rays.v[ray]) & (rays.v[ray] <= high[of])
-            yield ray[inside], of[inside]
+            which, place = ranges(first[some], last[some] - first[some])
+            ray, sphere = order[place], candidates[some][which]
+            inside = (low[sphere] <= rays.v[ray]) & (rays.v[ray] <= high[sphere])
+            ray, sphere = ray[inside], sphere[inside]
+            slant, middle, start, direction = rays.slant[ray], self.center[sphere], rays.start[ray], rays.direction[ray]
+            foot = ((middle - start) * direction).sum(-1) / slant**2
+            apart = functools.reduce(np.add, ((start + foot[:, None] * direction - middle) ** 2).T)
+            half = np.sqrt(np.maximum(self.radius[sphere] ** 2 - apart, 0)) / slant
+            entry, exit = foot - half, foot + half
+            met = (entry < exit) & (exit > rays.near) & (entry < rays.far)
+            found.append(Chords(ray[met], sphere[met], entry[met], exit[met]))
+        return Chords(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
 def ranges(first: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
@@ -139,12 +137,80 @@ def _shadow(x: np.ndarray, z: np.ndarray, radius: np.ndarray, is_perspective: bo
     return np.where(ahead, (x * z - root) / margin, -np.inf), np.where(ahead, (x * z + root) / margin, np.inf)
 
 
-def _chords(rays: Rays, center: np.ndarray, radius: np.ndarray, ray: np.ndarray, sphere: np.ndarray) -> Chords:
-    slant, middle = rays.slant[ray], center[sphere]
-    start, direction = rays.start[ray], rays.direction[ray]
-    foot = ((middle - start) * direction).sum(-1) / slant**2
-    apart = functools.reduce(np.add, ((start + foot[:, None] * direction - middle) ** 2).T)
-    half = np.sqrt(np.maximum(radius[sphere] ** 2 - apart, 0)) / slant
-    entry, exit = foot - half, foot + half
-    met = (entry < exit) & (exit > rays.near) & (entry < rays.far)
-    return Chords(ray[met], sphere[met], entry[met], exit[met])
+class Portions(NamedTuple):
+    """Parts of rays, in order of rays and, within a ray, of depth.
+
+    Attributes:
+        ray: number of its ray.
+        start, end: depths.
+        root: number of the portion of the first cut that it is a part of: what parts of a scene have there is told of those.
+    """
+
+    ray: Int[np.ndarray, " portions"]
+    start: Float[np.ndarray, " portions"]
+    end: Float[np.ndarray, " portions"]
+    root: Int[np.ndarray, " portions"]
+
+    def some(self, which: np.ndarray) -> Portions:
+        """Those of the given numbers, or a mask."""
+        return Portions(*(column[which] for column in self))
+
+
+Cuts = tuple[np.ndarray, np.ndarray]
+"""Numbers of rays, and depths on them."""
+
+
+def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
+    """Entries and exits that rays are cut at from the start.
+
+    All where less than `FEW` chords are on one side: there the medium begins or ends, or a mean of few may change quickly. At the
+    others only a higher derivative jumps, and rays are cut where the error demands it. Of these the first in each of the bins
+    that are `LONGEST` of a support long (of the power of two below it): so no longer chord is overlooked between nodes.
+    """
+    ray, depth = np.tile(chords.ray, 2), np.concatenate([chords.entry, chords.exit])
+    step = np.repeat([1, -1], len(chords.ray))
+    order = np.lexsort((-step, depth, ray))
+    ray, depth, step = ray[order], depth[order], step[order]
+    covering = np.cumsum(step)
+    octave = np.frexp(np.tile(radius, 2)[order])[1]
+    place = np.floor(depth / np.ldexp(LONGEST, octave - 1))
+    first = np.zeros(len(ray), bool)
+    within = np.lexsort((depth, octave, ray))
+    keys = ray[within], octave[within], place[within]
+    first[within[1:]] = np.logical_or.reduce([key[1:] != key[:-1] for key in keys])
+    first[within[:1]] = True
+    kept = first | (np.minimum(covering, covering - step) < FEW)
+    return ray[kept], depth[kept]
+
+
+def cut(rays: Rays, cuts: list[Cuts]) -> Portions:
+    """What lies between neighbouring cuts of a ray, between near and far."""
+    count = len(rays.u)
+    ends = np.repeat([rays.near, rays.far], count)
+    ray = np.concatenate([np.tile(np.arange(count), 2), *(ray for ray, _ in cuts)])
+    depth = np.clip(np.concatenate([ends, *(depth for _, depth in cuts)]), rays.near, rays.far)
+    order = np.lexsort((depth, ray))
+    ray, depth = ray[order], depth[order]
+    held = (ray[1:] == ray[:-1]) & (depth[1:] > depth[:-1])
+    start, end = depth[:-1][held], depth[1:][held]
+    return Portions(ray[:-1][held], start, end, np.arange(len(start)))
+
+
+def lists(rays: Rays, portions: Portions, chords: Chords) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which chords lie over which portions: `chord[first[i] : first[i] + length[i]]` of the arrays over portion i."""
+    width = 2 * (rays.far - rays.near)
+
+    def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
+
+    last = len(portions.ray) - 1
+    first = np.searchsorted(key(portions.ray, portions.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
+    beyond = np.searchsorted(key(portions.ray, portions.start), key(chords.ray, chords.exit)) + 1
+    first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
+    chord, portion = ranges(first, np.maximum(beyond - first, 0))
+    over = (portions.ray[portion] == chords.ray[chord]) & (chords.entry[chord] < portions.end[portion])
+    over &= chords.exit[chord] > portions.start[portion]
+    chord, portion = chord[over], portion[over]
+    count = np.bincount(portion, minlength=len(portions.ray))
+    small = portion.astype(np.uint16) if len(count) <= 1 << 16 else portion  # which sorts faster
+    return np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")]

@@ -17,12 +17,11 @@ import numpy as np
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles import kernels
-from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.points import thickness
+from jaxsph.reference.columns import thickness
 from jaxsph.reference.where import columns_of, ray_coordinates, seen_by, to_view, to_world
 from jaxsph.reference.where import inside as within
 
@@ -59,16 +58,16 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     square = 1 + u[None, :] ** 2 + v[:, None] ** 2
     lengths = np.sqrt(square) if camera.is_perspective else np.ones_like(square)  # path length a unit of depth
     edges = sample_borders(camera, settings.samples)
-    places = None
+    shown = np.broadcast_to(True, inside.shape)
     if scene.particles_within is not None:
         places = _world(camera, settings.samples, every)
         inside &= within(scene.particles_within, places)
+        shown = within(scene.within, places)
     parts = [] if scene.transfer is None else [_in_medium(quantities, inside, scene.transfer, edges, lengths)]
-    others = [
-        _in_medium(*_in_volume(volume, camera, settings.samples, every), look, edges, lengths) for volume, look in scene.volumes
-    ]
-    others += [_of_points(points, camera, u, v, edges) for points in scene.point_sets]
-    parts += others if scene.within is None or places is None else [_clipped(one, within(scene.within, places)) for one in others]
+    for volume, look in scene.volumes:
+        quantity, there = _in_volume(volume, camera, settings.samples, every)
+        parts.append(_in_medium([quantity], there & shown, look, edges, lengths))
+    parts += [_of_points(*thickness(points, camera, u, v, edges), shown) for points in scene.point_sets]
     color, transmittance, depth = _composite(parts, edges, lengths.shape, scene.mix)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
     total = int(per_pixel.sum())
@@ -160,17 +159,7 @@ def _world(camera: Camera, samples: int, every: int) -> np.ndarray:
     return to_world(np.stack(np.broadcast_arrays(spread * u[None, :, None], spread * v[:, None, None], s), -1), camera)
 
 
-def _clipped(part: Part, shown: np.ndarray) -> Part:
-    """A part at those samples alone that are in a clip."""
-
-    def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
-        own, colored = part(i)
-        return np.where(shown[..., i], own, 0), np.where(shown[..., i, None], colored, 0)
-
-    return sample
-
-
-def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[list[np.ndarray], np.ndarray]:
+def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tuple[np.ndarray, np.ndarray]:
     """The trilinear quantity at every sample, and whether it is inside the grid; (height, width, samples) each."""
     at = (_world(camera, samples, every) - volume.bounds()[0]) / np.asarray(volume.spacing, np.float64)
     values: Any = np.asarray(volume.values, np.float64)
@@ -182,7 +171,7 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
     for corner in np.ndindex(2, 2, 2):
         share = np.where(corner, part, 1 - part).prod(-1)
         quantity += share * values[tuple(np.moveaxis(whole + corner, -1, 0))]
-    return [quantity], inside
+    return quantity, inside
 
 
 def _in_medium(
@@ -200,9 +189,8 @@ def _in_medium(
     return sample
 
 
-def _of_points(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edges: np.ndarray) -> Part:
-    total, colored = thickness(points, camera, u, v, edges)
-    return lambda i: (total[..., i], colored[..., i, :])
+def _of_points(total: np.ndarray, colored: np.ndarray, shown: np.ndarray) -> Part:
+    return lambda i: (np.where(shown[..., i], total[..., i], 0), np.where(shown[..., i, None], colored[..., i, :], 0))
 
 
 def _composite(parts: list[Part], edges: np.ndarray, shape: tuple[int, ...], mix: str) -> tuple[Any, ...]:

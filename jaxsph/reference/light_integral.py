@@ -17,10 +17,9 @@ from jaxtyping import Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.reference.chords import Rays, blocks, rays_of
+from jaxsph.reference.chords import Portions, Rays, blocks, rays_of
 from jaxsph.reference.looks import Light, light_of, where_thickness
 from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
-from jaxsph.reference.portions import Portions
 from jaxsph.reference.where import seen_by
 
 BLOCK = 128  # rays that share arrays

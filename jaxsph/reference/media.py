@@ -17,10 +17,9 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.chords import NO_CHORDS, Chords, Rays, Spheres, batches, ranges
+from jaxsph.reference.chords import NO_CHORDS, Chords, Cuts, Portions, Rays, Spheres, batches, borders, cut, lists, ranges
+from jaxsph.reference.columns import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
-from jaxsph.reference.points import at_offset, kinks
-from jaxsph.reference.portions import Cuts, Portions, borders, cut, lists
 from jaxsph.reference.where import columns_of, crossings, inside, to_view, to_world
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
@@ -41,31 +40,20 @@ class Part(abc.ABC):
     def __init__(self, camera: Camera, clip: Clip | None):
         self._camera, self._clip = camera, clip
 
-    def meet(self, rays: Rays) -> Cuts:
+    def meet(self, rays: Rays) -> list[Cuts]:
         """Where it begins or ends, and what else portions must not hold inside: each is in the clip or not, too."""
         self._rays, self._start = rays, to_world(rays.start, self._camera)
         self._direction = rays.direction @ np.asarray(self._camera.axes, np.float64)
-        ray, depth = self._cuts()
         if self._clip is None:
-            return ray, depth
-        faces = crossings(self._clip, self._start, self._direction)
-        through, place = np.nonzero(~np.isnan(faces))
-        return np.concatenate([ray, through]), np.concatenate([depth, faces[through, place]])
+            return []
+        depth = crossings(self._clip, self._start, self._direction)
+        ray, place = np.nonzero(~np.isnan(depth))
+        return [(ray, depth[ray, place])]
 
-    def lies_over(self, roots: Portions) -> np.ndarray:
-        """Find, and return, the mask of the roots that it has something in."""
+    def take(self, roots: Portions) -> None:
+        """Have these be the roots, of which others are parts, and find what it has in them."""
         middle = (roots.start + roots.end) / 2
-        place = self._start[roots.ray] + middle[:, None] * self._direction[roots.ray]
-        self.shown = self._lies_over(roots) & inside(self._clip, place)
-        return self.shown
-
-    @abc.abstractmethod
-    def _cuts(self) -> Cuts:
-        """`meet` without the clip."""
-
-    @abc.abstractmethod
-    def _lies_over(self, roots: Portions) -> np.ndarray:
-        """The same without the clip."""
+        self.shown = inside(self._clip, self._start[roots.ray] + middle[:, None] * self._direction[roots.ray])
 
     @abc.abstractmethod
     def add(self, seen: AtNodes, portions: Portions) -> None:
@@ -87,8 +75,10 @@ def parts_of(scene: Scene, camera: Camera) -> list[Part]:
 
 def roots_of(parts: list[Part], rays: Rays) -> Portions:
     """The portions that rays are first cut into: those that any part has something in."""
-    roots = cut(rays, [part.meet(rays) for part in parts])
-    return roots.some(np.logical_or.reduce([part.lies_over(roots) for part in parts]))
+    roots = cut(rays, [cuts for part in parts for cuts in part.meet(rays)])
+    for part in parts:
+        part.take(roots)
+    return roots.some(np.logical_or.reduce([part.shown for part in parts]))
 
 
 def at_nodes(parts: list[Part], portions: Portions) -> AtNodes:
@@ -109,9 +99,16 @@ class _SpheresPart(Part):
         super().__init__(camera, clip)
         self._spheres = Spheres(to_view(position, camera), radius, camera.is_perspective)
 
-    def _lies_over(self, roots: Portions) -> np.ndarray:
+    def meet(self, rays: Rays) -> list[Cuts]:
+        """See `Part`."""
+        self.chords = self._spheres.chords(rays)
+        return super().meet(rays)
+
+    def take(self, roots: Portions) -> None:
+        """See `Part`."""
+        super().take(roots)
         self._first, self._length, self._chord = lists(self._rays, roots, self.chords)
-        return self._length > 0
+        self.shown &= self._length > 0
 
     def _over(self, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of a portion (a place in `root`) and a chord, portion by portion."""
@@ -130,11 +127,12 @@ class ParticlesPart(_SpheresPart):
         self._columns = strength / max(strength.max(initial=0), np.finfo(float).tiny), *quantities
         self._kernel, self._look = kernels.by_name(particles.kernel), Look(transfer)
 
-    def _cuts(self) -> Cuts:
-        self.chords = self._spheres.chords(self._rays)
-        self._scale = self._rays.slant[self.chords.ray] / self._spheres.radius[self.chords.sphere]
+    def meet(self, rays: Rays) -> list[Cuts]:
+        """See `Part`."""
+        faces = super().meet(rays)
+        self._scale = rays.slant[self.chords.ray] / self._spheres.radius[self.chords.sphere]
         self._strength, *self._quantities = (column[self.chords.sphere] for column in self._columns)
-        return borders(self.chords, 1 / self._scale)
+        return [*faces, borders(self.chords, 1 / self._scale)]
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
         """See `Part`."""
@@ -218,8 +216,9 @@ class VolumePart(Part):
         self._lower, self._spacing = volume.bounds()[0], np.asarray(volume.spacing, np.float64)
         self._last = np.array(self._values.shape) - 1
 
-    def _cuts(self) -> Cuts:
-        """Planes of lattice points, inside the box alone."""
+    def meet(self, rays: Rays) -> list[Cuts]:
+        """At planes of lattice points, inside the box alone."""
+        faces = super().meet(rays)
         start, direction = (self._start - self._lower) / self._spacing, self._direction / self._spacing
         self._line = start, direction
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -229,13 +228,15 @@ class VolumePart(Part):
         enter = np.where(direction == 0, -np.inf, enter).max(1)
         leave = np.where(beside, -np.inf, np.where(direction == 0, np.inf, leave)).min(1)
         depth = np.concatenate([enter[:, None], leave[:, None], *planes], 1)
-        enter, leave = np.maximum(enter, self._rays.near), np.minimum(leave, self._rays.far)
+        enter, leave = np.maximum(enter, rays.near), np.minimum(leave, rays.far)
         ray, place = np.nonzero((depth >= enter[:, None]) & (depth <= leave[:, None]))
-        return ray, depth[ray, place]
+        return [*faces, (ray, depth[ray, place])]
 
-    def _lies_over(self, roots: Portions) -> np.ndarray:
+    def take(self, roots: Portions) -> None:
+        """See `Part`."""
+        super().take(roots)
         at = self._at(roots.ray, (roots.start + roots.end) / 2)
-        return np.asarray(np.all((at >= 0) & (at <= self._last), axis=-1))
+        self.shown &= np.all((at >= 0) & (at <= self._last), axis=-1)
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
         """A portion is in one cell, whose cubic polynomial holds up to its ends."""
@@ -266,17 +267,17 @@ class PointsPart(_SpheresPart):
         self._attributes = {name: np.asarray(value, np.float64)[there] for name, value in points.attributes.items()}
         super().__init__(points.exact_position()[there], radius, camera, clip)
 
-    def _cuts(self) -> Cuts:
-        """Ends, feet, and where rays cross spheres at which a profile may have a kink."""
-        chords = self.chords = self._spheres.chords(self._rays)
+    def meet(self, rays: Rays) -> list[Cuts]:
+        """At ends, feet, and where rays cross spheres at which a profile may have a kink."""
+        faces, chords = super().meet(rays), self.chords
         foot, half = (chords.entry + chords.exit) / 2, (chords.exit - chords.entry) / 2
-        scale = self._rays.slant[chords.ray] / self._spheres.radius[chords.sphere]
+        scale = rays.slant[chords.ray] / self._spheres.radius[chords.sphere]
         depths = []
         for kink in kinks(self._profile)[:-1]:
             ring = np.sqrt(np.maximum(half**2 - (1 - kink**2) / scale**2, 0))
             depths += [foot - ring, foot + ring]
         depths += [chords.entry, chords.exit]
-        return np.tile(chords.ray, len(depths)), np.concatenate(depths)
+        return [*faces, (np.tile(chords.ray, len(depths)), np.concatenate(depths))]
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
         """See `Part`."""

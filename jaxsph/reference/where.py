@@ -1,6 +1,6 @@
 """Where things are, in float64 NumPy: rays, views, clips at points and along rays, and periodic sets as explicit copies.
 
-Flow: scene, camera -> [where] -> image, chords, points, columns, media.
+Flow: scene, camera -> [where] -> image, chords, columns, media.
 
 Written apart from `model.camera`, `model.clips`, `model.clip_shapes` and `model.periodic`, which are judged by it: clips in world
 space, periodic sets with all copies of all particles.
@@ -9,7 +9,6 @@ space, periodic sets with all copies of all particles.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,6 @@ from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
-
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
 
 
 def seen_by(camera: Camera, scene: Scene) -> Camera:
@@ -58,26 +55,6 @@ def to_view(position: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.nd
 def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World coordinates of view coordinates."""
     return place @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
-
-
-def integral_across(
-    kinks: np.ndarray, square: np.ndarray, start: np.ndarray, end: np.ndarray, value: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Integral along rays from t = `start` to `end`, counted from the foot of a centre; by Gauss-Legendre quadrature.
-
-    Args:
-        kinks: distances from the centre, ascending from 0, between which what is integrated is smooth.
-        square: of the distance of the foot.
-        start, end: within the last kink, or cut off there.
-        value: at t.
-    """
-    rings = np.sqrt(np.maximum(kinks.reshape(-1, *[1] * square.ndim) ** 2 - square, 0))
-    total = np.zeros(np.broadcast_shapes(start.shape, end.shape))
-    for low, high in itertools.pairwise([*-rings[::-1], *rings]):
-        first, last = np.clip(start, low, high), np.clip(end, low, high)
-        for node, weight in zip(NODES, WEIGHTS, strict=True):
-            total += weight * (last - first) / 2 * value((first + last) / 2 + node * (last - first) / 2)
-    return total
 
 
 def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
