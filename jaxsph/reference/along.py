@@ -15,13 +15,13 @@ from jaxtyping import Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
-from jaxsph.reference.chords import Portions, Rays, cut, rays_of
+from jaxsph.reference.chords import Portions, Rays, rays_of
 from jaxsph.reference.columns import thickness
 from jaxsph.reference.image import sample_borders, sample_depths
 from jaxsph.reference.light_integral import refined
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, light_of
-from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of
-from jaxsph.reference.where import inside, places_of, seen_by, to_world
+from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of, roots_of
+from jaxsph.reference.where import asked_for, inside, to_world
 
 TOLERANCE = 1e-6  # of the light integral, where that is what a ray is known by
 POINT = 1e-9  # of a sample, the half of a portion about its middle by which a medium is asked for that place alone
@@ -45,8 +45,8 @@ class Ray(NamedTuple):
     quantities: tuple[Float[np.ndarray, " places"], ...]
     extinction: Float[np.ndarray, " places"]
     transmittance: Float[np.ndarray, " places"]
-    particles: Int[np.ndarray, " particles"]
-    added: Float[np.ndarray, " particles"]
+    particles: Int[np.ndarray, " particles"] = np.zeros(0, int)
+    added: Float[np.ndarray, " particles"] = np.zeros(0)
 
 
 def along(scene: Scene, camera: Camera, row: int, column: int, samples: int | None = None) -> Ray:
@@ -59,36 +59,24 @@ def along(scene: Scene, camera: Camera, row: int, column: int, samples: int | No
             `jaxsph.reference.integral` needs them for the light integral.
 
     Raises:
-        ValueError: a scene of nothing, or of media unknown here.
+        ValueError: a scene of nothing, of a surface, or of media unknown here.
     """
-    camera = seen_by(camera, scene)
+    camera = asked_for(scene, camera)
     rays, parts = rays_of(camera, np.array([row]), np.array([column])), parts_of(scene, camera)
-    roots = cut(rays, [cuts for part in parts for cuts in part.meet(rays)])
-    for part in parts:
-        part.take(roots)
-    first, found = parts[0], np.zeros(0, int)
-    if isinstance(first, ParticlesPart):
-        entry = places_of(scene.particle_set)[1]
-        entry = entry[np.asarray(scene.particle_set.volume)[entry] > 0][first.chords.sphere]  # of each chord
-        found = np.unique(entry[first.met_where_shown()])
-    portions, places, amounts = (
-        _integrated(rays, parts, roots) if samples is None else _sampled(scene, camera, rays, parts, samples)
-    )
+    roots = roots_of(parts, rays, empty=True)
+    ray, portions, amounts = _integrated(rays, parts, roots) if samples is None else _sampled(scene, camera, rays, parts, samples)
+    first = parts[0]
     if not isinstance(first, ParticlesPart):
-        return Ray(*places, found, np.zeros(0))
-    return Ray(*places, found, np.bincount(entry, first.shared(amounts, portions), scene.particle_set.capacity)[found])
+        return ray
+    entry = first.entry[first.chords.sphere]
+    added = np.bincount(entry, first.shared(amounts, portions), scene.particle_set.capacity)
+    first.take(roots)
+    found = np.unique(entry[first.over(np.flatnonzero(first.shown))[1]])
+    return ray._replace(particles=found, added=added[found])
 
 
-Places = tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray, np.ndarray]
-"""Depths, quantities, extinction and transmittance, see `Ray`."""
-
-
-def _integrated(rays: Rays, parts: list[Part], roots: Portions) -> tuple[Portions, Places, np.ndarray]:
-    """By quadrature; what a portion takes in all is dealt out to its nodes as what is integrated there.
-
-    Returns:
-        Portions, what is there, and what the first part takes at their nodes.
-    """
+def _integrated(rays: Rays, parts: list[Part], roots: Portions) -> tuple[Ray, Portions, np.ndarray]:
+    """By quadrature; with the portions, and what the first part takes at nodes: of a portion's loss what is integrated there."""
     portions, *_ = refined(rays, parts, roots, TOLERANCE)
     seen, quantities, own = _looked(parts, portions)
     middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
@@ -103,11 +91,11 @@ def _integrated(rays: Rays, parts: list[Part], roots: Portions) -> tuple[Portion
     depth[0], depth[-1] = portions.start, portions.end  # such that depths ascend
     at, *values, extinction, transmittance = (value.T.ravel() for value in (depth, *quantities, seen.extinction, left))
     transmittance = np.minimum.accumulate(transmittance)  # where rounding has it rise
-    return portions, (at, tuple(values), extinction, transmittance), each * taken * own
+    return Ray(at, tuple(values), extinction, transmittance), portions, each * taken * own
 
 
-def _sampled(scene: Scene, camera: Camera, rays: Rays, parts: list[Part], samples: int) -> tuple[Portions, Places, np.ndarray]:
-    """By samples, each of which stands for what lies around it; points as they lie there."""
+def _sampled(scene: Scene, camera: Camera, rays: Rays, parts: list[Part], samples: int) -> tuple[Ray, Portions, np.ndarray]:
+    """The same by samples, each of which stands for what lies around it; points as they lie there."""
     depth, borders = sample_depths(camera, samples), sample_borders(camera, samples)
     path = np.diff(borders) * rays.slant
     portions = Portions(np.zeros(samples, int), depth - POINT * path, depth + POINT * path, np.arange(samples))
@@ -125,7 +113,7 @@ def _sampled(scene: Scene, camera: Camera, rays: Rays, parts: list[Part], sample
     own = np.divide(lost, extinction, out=np.zeros(samples), where=extinction > 0)
     amounts = np.zeros((NODES, samples))
     amounts[MIDDLE] = own * first[MIDDLE]
-    return portions, (depth, tuple(quantity[MIDDLE] for quantity in quantities), extinction, left), amounts
+    return Ray(depth, tuple(quantity[MIDDLE] for quantity in quantities), extinction, left), portions, amounts
 
 
 def _looked(parts: list[Part], portions: Portions) -> tuple[AtNodes, np.ndarray, np.ndarray]:

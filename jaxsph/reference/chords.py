@@ -2,7 +2,7 @@
 
 Flow: camera, pixels -> rays; rays, spheres -> chords; rays, cuts -> [chords] -> portions -> media.
 
-Nothing begins or ends inside of a portion, and lists say which chords lie over it.
+Nothing begins or ends inside of a portion.
 """
 
 from __future__ import annotations
@@ -156,8 +156,7 @@ class Portions(NamedTuple):
         return Portions(*(column[which] for column in self))
 
 
-Cuts = tuple[np.ndarray, np.ndarray]
-"""Numbers of rays, and depths on them."""
+Cuts = tuple[np.ndarray, np.ndarray]  # numbers of rays, and depths on them
 
 
 def borders(chords: Chords, radius: Float[np.ndarray, " chords"]) -> Cuts:
@@ -194,23 +193,3 @@ def cut(rays: Rays, cuts: list[Cuts]) -> Portions:
     held = (ray[1:] == ray[:-1]) & (depth[1:] > depth[:-1])
     start, end = depth[:-1][held], depth[1:][held]
     return Portions(ray[:-1][held], start, end, np.arange(len(start)))
-
-
-def lists(rays: Rays, portions: Portions, chords: Chords) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which chords lie over which portions: `chord[first[i] : first[i] + length[i]]` of the arrays over portion i."""
-    width = 2 * (rays.far - rays.near)
-
-    def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
-
-    last = len(portions.ray) - 1
-    first = np.searchsorted(key(portions.ray, portions.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
-    beyond = np.searchsorted(key(portions.ray, portions.start), key(chords.ray, chords.exit)) + 1
-    first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
-    chord, portion = ranges(first, np.maximum(beyond - first, 0))
-    over = (portions.ray[portion] == chords.ray[chord]) & (chords.entry[chord] < portions.end[portion])
-    over &= chords.exit[chord] > portions.start[portion]
-    chord, portion = chord[over], portion[over]
-    count = np.bincount(portion, minlength=len(portions.ray))
-    small = portion.astype(np.uint16) if len(count) <= 1 << 16 else portion  # which sorts faster
-    return np.cumsum(count) - count, count, chord[np.argsort(small, kind="stable")]

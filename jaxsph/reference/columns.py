@@ -57,11 +57,18 @@ def project(
     columns, rows = ((np.arange(size)[:, None] + (1 + places) / 2).ravel() for size in (camera.width, camera.height))
     u, v = ray_coordinates(camera, columns, rows)
     sums = np.zeros((len(v), len(u), amounts.shape[1]))
-    views, (across, down) = to_view(particles.exact_position(), camera), np.meshgrid(u, v)
-    rays = lines(across, down, camera.is_perspective)
+    centers, kernel = to_view(particles.exact_position(), camera), kernels.by_name(particles.kernel)
+    across, down = np.meshgrid(u, v)
+    starts, directions = lines(across, down, camera.is_perspective)
+    slant = np.linalg.norm(directions, axis=-1)
     for i in np.flatnonzero(np.asarray(particles.valid)):
-        column = _column(particles.kernel, views[i], float(np.asarray(particles.support)[i]), *rays, (near, far))
-        sums += column[..., None] * amounts[i]
+        support = float(np.asarray(particles.support)[i])
+        foot = ((centers[i] - starts) * directions).sum(-1) / slant**2
+        square = ((starts + foot[..., None] * directions - centers[i]) ** 2).sum(-1) / support**2
+        met = np.nonzero(square < 1)
+        start, end = ((depth - foot[met]) * slant[met] / support for depth in (near, far))
+        integral = integral_across(np.array(KINKS), square[met], lambda away, t: kernel.of_square(away + t * t, np), start, end)
+        sums[met] += (kernel.norm * integral / support**2)[:, None] * amounts[i]
     parts = sums.reshape(camera.height, number, camera.width, number, -1)
     means: Any = np.einsum("isjtk,s,t->ijk", parts, shares / 2, shares / 2)
     area: Any = np.float64((2 * float(camera.half_height) / camera.height) ** 2)
@@ -70,21 +77,6 @@ def project(
     weights = means[..., 1]
     values: Any = np.where(weights > 0, means[..., 0] / np.where(weights > 0, weights, 1), np.nan)
     return Projection(values, weights, area, camera.is_perspective, name=held.name)
-
-
-def _column(
-    kernel: str, center: np.ndarray, support: float, starts: np.ndarray, directions: np.ndarray, depths: tuple[float, float]
-) -> np.ndarray:
-    """Integral of the kernel of one particle along all rays, (rows, columns)."""
-    slant = np.linalg.norm(directions, axis=-1)
-    foot = ((center - starts) * directions).sum(-1) / slant**2
-    square = ((starts + foot[..., None] * directions - center) ** 2).sum(-1) / support**2
-    met = np.nonzero(square < 1)
-    column, square, smooth = np.zeros(square.shape), square[met], kernels.by_name(kernel)
-    start, end = ((depth - foot[met]) * slant[met] / support for depth in depths)
-    total = integral_across(np.array(KINKS), square, lambda t: smooth.of_square(square + t * t, np), start, end)
-    column[met] = smooth.norm * total / support**2
-    return column
 
 
 def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +121,7 @@ def _lengths(
     foot, direction = foot @ axes, directions[rows, columns] / slant[:, None] @ axes
     place = (edges - foot_depth[:, None]) * slant[:, None] / radius  # of borders along rays, from the foot on
 
-    def value(t: np.ndarray) -> np.ndarray:
+    def value(_: np.ndarray, t: np.ndarray) -> np.ndarray:
         return at_offset(points.profile, foot[:, None] + t[..., None] * direction[:, None], attributes)
 
     integral = functools.partial(integral_across, kinks(points.profile), (foot**2).sum(-1)[:, None], value)
@@ -167,14 +159,14 @@ def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.nda
 
 
 def integral_across(
-    kinks: np.ndarray, square: np.ndarray, value: Callable[[np.ndarray], np.ndarray], start: np.ndarray, end: np.ndarray
+    kinks: np.ndarray, square: np.ndarray, value: Callable[..., np.ndarray], start: np.ndarray, end: np.ndarray
 ) -> np.ndarray:
     """Integral along rays from t = `start` to `end`, counted from the foot of a centre; by Gauss-Legendre quadrature.
 
     Args:
         kinks: distances from the centre, ascending from 0, between which what is integrated is smooth.
         square: of the distance of the foot.
-        value: at t.
+        value: `value(square, t)`.
         start, end: within the last kink, or cut off there.
     """
     rings = np.sqrt(np.maximum(kinks.reshape(-1, *[1] * square.ndim) ** 2 - square, 0))
@@ -182,5 +174,5 @@ def integral_across(
     for low, high in itertools.pairwise([*-rings[::-1], *rings]):
         first, last = np.clip(start, low, high), np.clip(end, low, high)
         for node, weight in zip(NODES, WEIGHTS, strict=True):
-            total += weight * (last - first) / 2 * value((first + last) / 2 + node * (last - first) / 2)
+            total += weight * (last - first) / 2 * value(square, (first + last) / 2 + node * (last - first) / 2)
     return total

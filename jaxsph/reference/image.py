@@ -22,11 +22,10 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.columns import thickness
-from jaxsph.reference.where import columns_of, ray_coordinates, seen_by, to_view, to_world
+from jaxsph.reference.where import asked_for, columns_of, ray_coordinates, to_view, to_world
 from jaxsph.reference.where import inside as within
 
-Part = Callable[[int], tuple[np.ndarray, np.ndarray]]
-"""What a part of a scene has in a sample of every ray: its optical thickness, and the same times colour."""
+Part = Callable[[int], tuple[np.ndarray, np.ndarray]]  # its optical thickness in a sample of every ray, and the same times colour
 
 
 def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cull: bool = True, every: int = 1) -> Image:
@@ -48,9 +47,7 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     """
     started = time.perf_counter()
     settings = settings or Settings()
-    if every < 1:
-        raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
-    camera = seen_by(camera, scene)
+    camera = asked_for(scene, camera, every)
     numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
     quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
@@ -70,11 +67,9 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     parts += [_of_points(*thickness(points, camera, u, v, edges), shown) for points in scene.point_sets]
     color, transmittance, depth = _composite(parts, edges, lengths.shape, scene.mix)
     per_pixel: Any = evaluations.sum(-1).astype(np.float64)
-    total = int(per_pixel.sum())
-    counts: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
-    stats = {**counts, "seconds": {"cast": time.perf_counter() - started}}
-    bound: Any = np.zeros_like(transmittance)
-    return Image(color, transmittance, depth, bound, per_pixel, True, 0, stats)
+    total, seconds = int(per_pixel.sum()), {"cast": time.perf_counter() - started}
+    stats = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0, "seconds": seconds}
+    return Image(color, transmittance, depth, np.zeros_like(transmittance), per_pixel, True, 0, stats)
 
 
 def sample_depths(camera: Camera, samples: int) -> np.ndarray:
@@ -108,7 +103,7 @@ def _fields(
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
     kernel = kernels.by_name(scene.particle_set.kernel)
-    position, support, volume, *quantities = columns_of(scene.particle_set)
+    position, _, support, volume, *quantities = columns_of(scene.particle_set)
     strength = volume / support**3
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
     shape = (len(v), len(u), samples)
@@ -223,5 +218,4 @@ def _interpolated(points: Any, given: Any, quantity: np.ndarray) -> np.ndarray:
     width = values[right] - values[left]
     jump = (quantity >= values[left]).astype(float)
     where = np.where(width > 0, np.clip((quantity - values[left]) / np.where(width > 0, width, 1), 0, 1), jump)[..., None]
-    result: np.ndarray = table[left] * (1 - where) + table[right] * where
-    return result
+    return np.asarray(table[left] * (1 - where) + table[right] * where)

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -20,7 +19,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.reference.chords import Portions, Rays, blocks, rays_of
 from jaxsph.reference.looks import Light, light_of, where_thickness
 from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
-from jaxsph.reference.where import seen_by
+from jaxsph.reference.where import asked_for
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20
@@ -76,22 +75,19 @@ def integral(
     started = time.perf_counter()
     if not tolerance >= LEAST_TOLERANCE:
         raise ValueError(f"`tolerance` must be at least {LEAST_TOLERANCE:g}, got {tolerance!r}; float64 sums hold no more digits")
-    camera = seen_by(camera, scene)
+    camera = asked_for(scene, camera, every)
     rows, columns = _pixels(camera, pixels, every)
     rays, parts = rays_of(camera, rows.ravel(), columns.ravel()), parts_of(scene, camera)
     found, counts = _all(rays, parts, tolerance, progress)
     color: Any = found[:, :3].reshape(*rows.shape, 3)
     transmittance, depth, error, evaluations = found[:, 3:].T.reshape(4, *rows.shape)
-    total = int(found[:, 6].sum())
-    stats: dict[str, Any] = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0}
+    total, seconds = int(found[:, 6].sum()), {"cast": time.perf_counter() - started}
+    stats = {"evaluations": total, "evaluations_full": total, "cells": 0, "pairs": 0, "seconds": seconds}
     stats |= {"rays": len(found), "chords": int(counts[0]), "portions": int(counts[1])}
-    stats |= {"seconds": {"cast": time.perf_counter() - started}}
     return Image(color, transmittance, depth, error, evaluations, False, 0, stats)
 
 
-def _all(
-    rays: Rays, parts: list[Part], tolerance: float, progress: Callable[[int, int], None] | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _all(rays: Rays, parts: list[Part], tolerance: float, progress: Callable[..., None] | None) -> tuple[np.ndarray, np.ndarray]:
     """Colour, transmittance, depth, error and evaluations of rays (rays, 7), and how many chords and portions they have."""
     found, counts, done = np.empty((len(rays.u), 7)), np.zeros(2, int), 0
     for which in blocks(rays, BLOCK):
@@ -105,13 +101,10 @@ def _all(
     return found, counts
 
 
-def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple[Int[np.ndarray, "..."], Int[np.ndarray, "..."]]:
+def _pixels(camera: Camera, pixels: tuple[Any, Any] | None, every: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns that are asked for."""
-    if every < 1:
-        raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
     if pixels is None:
-        sides = (np.arange(size)[every // 2 :: every] for size in (camera.height, camera.width))
-        rows, columns = np.meshgrid(*sides, indexing="ij")
+        rows, columns = np.indices((camera.height, camera.width))[:, every // 2 :: every, every // 2 :: every]
         return rows, columns
     if every != 1:
         raise ValueError(f"`every` = {every} goes with the whole image; give `pixels` or `every`")

@@ -27,20 +27,14 @@ ROUNDED = 64 * np.finfo(float).eps  # of the largest value, that a quantity may 
 BISECTIONS = 20  # of a gap between two nodes, before a secant
 
 
-def _coefficients(place: np.ndarray) -> np.ndarray:
-    """Chebyshev coefficients of polynomials through values at nodes."""
-    return np.linalg.inv(chebyshev.chebvander(place, len(place) - 1))
+def _polynomials(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From values at nodes to the Chebyshev coefficients of their polynomial, and to its integrals from -1 to each node."""
+    coefficients = np.linalg.inv(chebyshev.chebvander(place, len(place) - 1))
+    return coefficients, chebyshev.chebvander(place, len(place)) @ chebyshev.chebint(coefficients, lbnd=-1)
 
 
-def _integration(place: np.ndarray) -> np.ndarray:
-    """From values at nodes to the integrals of their polynomial from -1 to each node."""
-    whole = chebyshev.chebint(_coefficients(place), lbnd=-1)
-    return chebyshev.chebvander(place, len(place)) @ whole
-
-
-COEFFICIENTS = _coefficients(PLACE)
+(COEFFICIENTS, INTEGRATION), (_, EVERY_SECOND) = _polynomials(PLACE), _polynomials(PLACE[::2])
 WITHIN = chebyshev.chebvander(PLACE[:-1, None] + np.diff(PLACE)[:, None] * [0.2, 0.4, 0.6, 0.8], NODES - 1) @ COEFFICIENTS
-INTEGRATION, EVERY_SECOND = _integration(PLACE), _integration(PLACE[::2])
 
 
 class AtNodes(NamedTuple):
@@ -49,9 +43,9 @@ class AtNodes(NamedTuple):
     Attributes:
         extinction: a unit of path length.
         emission: colour times extinction.
-        doubt: error of light for what may lie unseen between nodes.
         crossing: depth where a quantity crosses a control value, NaN where none does.
         weight: how much extinction changes there.
+        doubt: error of light for what may lie unseen between nodes.
         evaluations: of kernels.
         looked: of each part with a transfer function, in order: numbers of the portions where it is, and its quantities there,
             and what extinction and emission it adds.
@@ -59,9 +53,9 @@ class AtNodes(NamedTuple):
 
     extinction: Float[np.ndarray, "nodes portions"]
     emission: Float[np.ndarray, "3 nodes portions"]
-    doubt: Float[np.ndarray, " portions"]
     crossing: Float[np.ndarray, " portions"]
     weight: Float[np.ndarray, " portions"]
+    doubt: Float[np.ndarray, " portions"]
     evaluations: Float[np.ndarray, " portions"]
     looked: list[tuple[np.ndarray, list[np.ndarray], np.ndarray, np.ndarray]]
 
@@ -118,11 +112,10 @@ class Look:
         there = ~np.isnan(quantities[0][0])
         which, given = which[there], [quantity[:, there] for quantity in quantities]
         half = (portions.end[which] - portions.start[which]) / 2
-        path = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
-        looks = zip(self._tables, given if len(given) == len(self._tables) else given * len(self._tables), strict=True)
-        channels = [channel for table, quantity in looks for channel in table.add(seen, which, quantity, portions, path)]
-        *color, extinction = channels
-        emission = np.stack(color) * extinction
+        gaps = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
+        looks = zip(self._tables, (given[0], given[-1]), strict=False)  # by one quantity alone where there is one table
+        channels = np.concatenate([table.add(seen, which, quantity, portions, gaps) for table, quantity in looks])
+        extinction, emission = channels[3], channels[:3] * channels[3]
         seen.extinction[:, which] += extinction
         seen.emission[:, :, which] += emission
         seen.looked.append((which, given, extinction, emission))
@@ -131,28 +124,27 @@ class Look:
 class _Table:
     """Some channels of a transfer function, by one quantity.
 
+    Entry k is of point k - 1, as segments are numbered, and entry 0 as of the first point. `_jump` is how much light jumps there,
+    `_turn` how much its slope changes, `_bend` both by the lesser width beside.
     At a jump the end of a portion is on the side that the portion is on, so that a portion that ends there is as smooth as any.
     """
 
     def __init__(self, points: Any, table: np.ndarray, light: np.ndarray, most: float):
-        values = np.asarray(points, np.float64)
-        width = np.append(np.diff(values), 0)
-        inverse = np.divide(1, width, out=np.zeros_like(width), where=width > 0)
-        change = np.append(np.diff(table), np.zeros((len(table), 1)), 1)
-        self._values, self._most = values, most
-        self._start, self._inverse = np.append(values[:1], values), np.append(0, inverse)
-        self._base, self._change = np.append(table[:, :1], table, 1), np.append(0 * table[:, :1], change, 1)
-        self._rank = np.append(0, np.cumsum(np.append(True, width[:-1] > 0)))  # distinct control values up to each
-        self._jump, self._turn, self._bend = _bends(light, width)
+        self._values, self._most = np.asarray(points, np.float64), most
+        start, base, light = (np.append(one[..., :1], one, -1) for one in (self._values, table, light))
+        width, none = np.append(np.diff(start), 0), np.zeros((len(light), 1))
+        self._start, self._inverse = start, np.divide(1, width, out=np.zeros_like(width), where=width > 0)
+        self._base, self._change = base, np.append(np.diff(base), np.zeros((len(base), 1)), 1)
+        self._rank = np.append(0, np.cumsum(np.append(True, width[1:-1] > 0)))  # distinct control values up to each
+        rise, before = np.diff(light), np.append(0, width[:-1])
+        slope = np.divide(rise, width[:-1], out=np.zeros_like(rise), where=width[:-1] > 0)
+        least = np.where((before > 0) & (width > 0), np.minimum(before, width), np.maximum(before, width))
+        self._jump = np.where(before > 0, 0, np.abs(np.append(none, rise, 1)).max(0))  # with the later of two points
+        self._turn = np.abs(np.append(slope, none, 1) - np.append(none, slope, 1)).max(0)
+        self._bend = self._jump + self._turn * least + np.finfo(float).tiny
 
-    def add(
-        self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, path: np.ndarray
-    ) -> list[np.ndarray]:
-        """Its channels for a `quantity` (nodes, which); what may lie unseen between nodes, and where light bends, go to `seen`.
-
-        Args:
-            path: of gaps between nodes.
-        """
+    def add(self, seen: AtNodes, which: np.ndarray, quantity: np.ndarray, portions: Portions, gaps: np.ndarray) -> np.ndarray:
+        """Its channels for a `quantity` (nodes, which); to `seen` go where light bends, and what `gaps` (their path) may hide."""
         inwards = quantity.copy()
         inwards[0] += NUDGE * (quantity[1] - quantity[0])
         inwards[-1] += NUDGE * (quantity[-2] - quantity[-1])
@@ -161,11 +153,10 @@ class _Table:
         upper = np.maximum(segment[1:], segment[:-1])
         bent = self._jump[upper] + KINK * self._turn[upper] * np.abs(np.diff(quantity, axis=0))
         skips = (np.abs(np.diff(self._rank[segment], axis=0)) > 1) | self._hidden(quantity, segment)
-        unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * path
+        unseen = np.where(skips, self._most, np.where(segment[1:] != segment[:-1], bent, 0)) * gaps
         seen.doubt[which] += np.minimum(unseen.sum(0), 1)
         self._cross(seen, which, quantity, segment, portions)
-        pairs = zip(self._base, self._change, strict=True)
-        return [base[segment] + part * change[segment] for base, change in pairs]
+        return np.asarray(self._base[:, segment] + part * self._change[:, segment])
 
     def _hidden(self, quantity: np.ndarray, segment: np.ndarray) -> np.ndarray:
         """Gaps between nodes within which the polynomial crosses control values that lie between no two nodes beside them."""
@@ -189,23 +180,6 @@ class _Table:
         half = (portions.end[of] - portions.start[of]) / 2
         seen.crossing[of] = portions.start[of] + (place + 1) * half
         seen.weight[of] = best[some]
-
-
-def _bends(light: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How much light (channels, points) jumps at control points, how much its slope changes, and both by the lesser width beside.
-
-    Entry k is of point k - 1, as segments are numbered; a jump's is with its later point.
-    """
-    none = np.zeros((len(light), 1))
-    rise = np.diff(light)
-    slope = np.divide(rise, width[:-1], out=np.zeros_like(rise), where=width[:-1] > 0)
-    before, after = np.append(0, width[:-1]), width
-    least = np.where((before > 0) & (after > 0), np.minimum(before, after), np.maximum(before, after))
-    jump = np.where(before > 0, 0, np.abs(np.concatenate([none, rise], 1)).max(0))
-    turn = np.abs(np.concatenate([slope, none], 1) - np.concatenate([none, slope], 1)).max(0)
-    jump[:1] = 0
-    both = jump + turn * least + np.finfo(float).tiny
-    return np.append(0, jump), np.append(0, turn), np.append(0, both)
 
 
 def _crossing(coefficients: np.ndarray, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

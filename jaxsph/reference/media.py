@@ -6,6 +6,7 @@ Flow: scene, rays -> [media] -> cuts of rays; portions -> [media] -> extinction 
 from __future__ import annotations
 
 import abc
+import itertools
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.chords import NO_CHORDS, Chords, Cuts, Portions, Rays, Spheres, batches, borders, cut, lists, ranges
+from jaxsph.reference.chords import NO_CHORDS, Chords, Cuts, Portions, Rays, Spheres, batches, borders, cut, ranges
 from jaxsph.reference.columns import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
 from jaxsph.reference.where import columns_of, crossings, inside, to_view, to_world
@@ -27,7 +28,7 @@ PAIRS = 1 << 12  # of a portion and a chord, whose nodes are looked at at once: 
 
 
 class Part(abc.ABC):
-    """One part of a scene as a camera sees it, in its clip alone; some rays `meet` it, and the rest is asked of those.
+    """One part of a scene in its clip, as a camera sees it; once rays `meet` it, the rest is about these.
 
     Attributes:
         chords: what rays have inside its spheres; none of a part that is not made of spheres.
@@ -41,7 +42,7 @@ class Part(abc.ABC):
         self._camera, self._clip = camera, clip
 
     def meet(self, rays: Rays) -> list[Cuts]:
-        """Where it begins or ends, and what else portions must not hold inside: each is in the clip or not, too."""
+        """Where it begins or ends, and what else portions must not hold inside, as faces of its clip."""
         self._rays, self._start = rays, to_world(rays.start, self._camera)
         self._direction = rays.direction @ np.asarray(self._camera.axes, np.float64)
         if self._clip is None:
@@ -51,13 +52,13 @@ class Part(abc.ABC):
         return [(ray, depth[ray, place])]
 
     def take(self, roots: Portions) -> None:
-        """Have these be the roots, of which others are parts, and find what it has in them."""
+        """Have these for roots, which all other portions are parts of, and find those that it has something in."""
         middle = (roots.start + roots.end) / 2
         self.shown = inside(self._clip, self._start[roots.ray] + middle[:, None] * self._direction[roots.ray])
 
     @abc.abstractmethod
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        """Add what it has at nodes of portions of the roots."""
+        """Add what it has at nodes of portions."""
 
     def border_by(self, portions: Portions) -> np.ndarray:
         """The border nearest to the middle of each portion, where only a derivative jumps, or NaN."""
@@ -69,24 +70,23 @@ def parts_of(scene: Scene, camera: Camera) -> list[Part]:
     parts: list[Part] = []
     if scene.particles is not None and scene.transfer is not None:
         parts.append(ParticlesPart(scene.particles, scene.transfer, camera, scene.particles_within))
-    parts += [VolumePart(volume, look, camera, scene.within) for volume, look in scene.volumes]
-    return parts + [PointsPart(points, camera, scene.within) for points in scene.point_sets]
+    parts += [_VolumePart(volume, look, camera, scene.within) for volume, look in scene.volumes]
+    return parts + [_PointsPart(points, camera, scene.within) for points in scene.point_sets]
 
 
-def roots_of(parts: list[Part], rays: Rays) -> Portions:
-    """The portions that rays are first cut into: those that any part has something in."""
+def roots_of(parts: list[Part], rays: Rays, *, empty: bool = False) -> Portions:
+    """The portions that rays are first cut into: those that any part has something in, or the `empty` ones, too."""
     roots = cut(rays, [cuts for part in parts for cuts in part.meet(rays)])
     for part in parts:
         part.take(roots)
-    return roots.some(np.logical_or.reduce([part.shown for part in parts]))
+    return roots if empty else roots.some(np.logical_or.reduce([part.shown for part in parts]))
 
 
 def at_nodes(parts: list[Part], portions: Portions) -> AtNodes:
     """What parts have at nodes of portions, in all."""
     count = len(portions.ray)
-    extinction, emission = np.zeros((NODES, count)), np.zeros((3, NODES, count))
-    doubt, weight, evaluations = np.zeros((3, count))
-    seen = AtNodes(extinction, emission, doubt, np.full(count, np.nan), weight, evaluations, [])
+    weight, doubt, evaluations = np.zeros((3, count))
+    seen = AtNodes(np.zeros((NODES, count)), np.zeros((3, NODES, count)), np.full(count, np.nan), weight, doubt, evaluations, [])
     for part in parts:
         part.add(seen, portions)
     return seen
@@ -100,28 +100,44 @@ class _SpheresPart(Part):
         self._spheres = Spheres(to_view(position, camera), radius, camera.is_perspective)
 
     def meet(self, rays: Rays) -> list[Cuts]:
-        """See `Part`."""
         self.chords = self._spheres.chords(rays)
         return super().meet(rays)
 
     def take(self, roots: Portions) -> None:
-        """See `Part`."""
+        """List the chords, too, that lie over each root i: `_chord[_first[i] : _first[i] + _length[i]]`."""
         super().take(roots)
-        self._first, self._length, self._chord = lists(self._rays, roots, self.chords)
+        rays, chords = self._rays, self.chords
+        width = 2 * (rays.far - rays.near)
+
+        def key(ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+            return ray * width + np.clip(depth, rays.near, rays.far) - rays.near
+
+        last = len(roots.ray) - 1
+        first = np.searchsorted(key(roots.ray, roots.end), key(chords.ray, chords.entry)) - 1  # keys are rounded: one more
+        beyond = np.searchsorted(key(roots.ray, roots.start), key(chords.ray, chords.exit)) + 1
+        first, beyond = np.clip(first, 0, last), np.clip(beyond, 0, last + 1)
+        chord, root = ranges(first, np.maximum(beyond - first, 0))
+        over = (roots.ray[root] == chords.ray[chord]) & (chords.entry[chord] < roots.end[root])
+        over &= chords.exit[chord] > roots.start[root]
+        chord, root = chord[over], root[over]
+        self._length = np.bincount(root, minlength=len(roots.ray))
+        self._first = np.cumsum(self._length) - self._length
+        small = root.astype(np.uint16) if last < 1 << 16 else root  # which sorts faster
+        self._chord = chord[np.argsort(small, kind="stable")]
         self.shown &= self._length > 0
 
-    def _over(self, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def over(self, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of a portion (a place in `root`) and a chord, portion by portion."""
         which, place = ranges(self._first[root], self._length[root])
         return which, self._chord[place]
 
 
 class ParticlesPart(_SpheresPart):
-    """Particles; those of no volume are not there."""
+    """Particles, each at its `entry` of the set, with copies where that is periodic; those of no volume are not there."""
 
     def __init__(self, particles: Particles, transfer: TransferFunction, camera: Camera, clip: Clip | None):
         columns = columns_of(particles)
-        position, support, volume, *quantities = (column[columns[2] > 0] for column in columns)
+        position, self.entry, support, volume, *quantities = (column[columns[3] > 0] for column in columns)
         super().__init__(position, support, camera, clip)
         strength = volume / support**3
         self._columns = strength / max(strength.max(initial=0), np.finfo(float).tiny), *quantities
@@ -144,12 +160,12 @@ class ParticlesPart(_SpheresPart):
             means[:, :, some] = self._means(portions.some(which[some]))
         self._look.add(seen, which, [_filled(quantity) for quantity in means], portions, self._rays.slant)
 
-    def _weights(self, portions: Portions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs of a portion and a chord over it, portion by portion, and V W of each at nodes (nodes, pairs).
+    def _weights(self, portions: Portions) -> tuple[np.ndarray, ...]:
+        """Pairs of a portion and a chord over it, V W of each at nodes (nodes, pairs), first pairs of portions, sums over theirs.
 
         With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
         """
-        which, chord = self._over(portions.root)
+        which, chord = self.over(portions.root)
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         scale, at = self._scale[chord], middle[which]
         place = PLACE.copy()
@@ -157,36 +173,32 @@ class ParticlesPart(_SpheresPart):
         along = place[:, None] * (half[which] * scale)
         into, left = (at - self.chords.entry[chord]) * scale, (self.chords.exit[chord] - at) * scale
         inside = np.clip((into + along) * (left - along), 0, 1)
-        return which, chord, self._strength[chord] * self._kernel.of_square(1 - inside, np)
+        weight = self._strength[chord] * self._kernel.of_square(1 - inside, np)
+        first = np.searchsorted(which, np.arange(len(portions.ray)))
+        return which, chord, weight, first, np.add.reduceat(weight, first, axis=1)
 
     def _means(self, portions: Portions) -> list[np.ndarray]:
         """All Q at nodes of portions (nodes, portions), relative to the first particle of each; NaN where nothing weighs."""
-        which, chord, weight = self._weights(portions)
-        first = np.searchsorted(which, np.arange(len(portions.ray)))
-        total, found = np.add.reduceat(weight, first, axis=1), []
+        which, chord, weight, first, total = self._weights(portions)
+        found = []
         for quantity in self._quantities:
             base = quantity[chord[first]]
             moved = np.add.reduceat(weight * (quantity[chord] - base[which]), first, axis=1)
             found.append(base + np.divide(moved, total, out=np.full_like(total, np.nan), where=total > 0))
         return found
 
-    def met_where_shown(self) -> np.ndarray:
-        """Numbers of the chords that lie over any of the roots where it is shown."""
-        return np.unique(self._over(np.flatnonzero(self.shown))[1])
-
     def shared(self, amounts: np.ndarray, portions: Portions) -> np.ndarray:
         """What is at nodes of portions (nodes, portions), dealt out to chords as V W there."""
         found, held = np.zeros(len(self.chords.ray)), np.flatnonzero(self._length[portions.root])
         for some in batches(self._length[portions.root[held]], PAIRS):
-            which, chord, weight = self._weights(portions.some(held[some]))
-            total = np.add.reduceat(weight, np.searchsorted(which, np.arange(len(some))), axis=1)
+            which, chord, weight, _, total = self._weights(portions.some(held[some]))
             each = np.divide(amounts[:, held[some]], total, out=np.zeros_like(total), where=total > 0)
             found += np.bincount(chord, (weight * each[:, which]).sum(0), len(found))
         return found
 
     def border_by(self, portions: Portions) -> np.ndarray:
         """See `Part`."""
-        which, chord = self._over(portions.root)
+        which, chord = self.over(portions.root)
         middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
         off = np.abs(border - middle[which])
@@ -200,14 +212,13 @@ class ParticlesPart(_SpheresPart):
 
 def _filled(quantity: np.ndarray) -> np.ndarray:
     """With its neighbour's where nothing weighs in float64, as at an end that is less than an eps away."""
-    for nodes in (range(1, NODES), range(NODES - 2, -1, -1)):
-        for node in nodes:
-            before = node - 1 if nodes.step > 0 else node + 1
-            quantity[node] = np.where(np.isnan(quantity[node]), quantity[before], quantity[node])
+    for nodes in (quantity, quantity[::-1]):
+        for before, node in itertools.pairwise(nodes):
+            np.copyto(node, before, where=np.isnan(node))
     return quantity
 
 
-class VolumePart(Part):
+class _VolumePart(Part):
     """A volume."""
 
     def __init__(self, volume: Volume, transfer: TransferFunction, camera: Camera, clip: Clip | None):
@@ -233,7 +244,6 @@ class VolumePart(Part):
         return [*faces, (ray, depth[ray, place])]
 
     def take(self, roots: Portions) -> None:
-        """See `Part`."""
         super().take(roots)
         at = self._at(roots.ray, (roots.start + roots.end) / 2)
         self.shown &= np.all((at >= 0) & (at <= self._last), axis=-1)
@@ -257,7 +267,7 @@ class VolumePart(Part):
         return start[ray] + depth[..., None] * direction[ray]
 
 
-class PointsPart(_SpheresPart):
+class _PointsPart(_SpheresPart):
     """A point set, by its true density: where its light is, whatever the `spread` by which renderers lay it along rays."""
 
     def __init__(self, points: Points, camera: Camera, clip: Clip | None):
@@ -280,11 +290,10 @@ class PointsPart(_SpheresPart):
         return [*faces, (np.tile(chords.ray, len(depths)), np.concatenate(depths))]
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        """See `Part`."""
         axes, held = np.asarray(self._camera.axes, np.float64), np.flatnonzero(self.shown[portions.root])
         for some in batches(self._length[portions.root[held]], PAIRS):
             own = portions.some(held[some])
-            which, chord = self._over(own.root)
+            which, chord = self.over(own.root)
             ray, point = self.chords.ray[chord], self.chords.sphere[chord]
             middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
             depth = middle[which] + PLACE[:, None] * half[which]

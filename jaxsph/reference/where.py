@@ -22,12 +22,10 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 
 
-def seen_by(camera: Camera, scene: Scene) -> Camera:
-    """The camera with depths, of a scene that the reference knows.
-
-    Raises:
-        ValueError: it does not know it.
-    """
+def asked_for(scene: Scene, camera: Camera, every: int = 1) -> Camera:
+    """The camera with near and far; `ValueError` for scenes that the reference does not know, and `every` of no pixels."""
+    if every < 1:
+        raise ValueError(f"`every` must be at least 1, got {every}; 1 takes all pixels")
     scene.check_without_surface("the reference")
     if scene.media:
         raise ValueError("`media` are unknown to the reference, which has particles, volumes and points; give `media=()`")
@@ -100,10 +98,10 @@ def crossings(
 
 
 def columns_of(particles: Particles) -> tuple[np.ndarray, ...]:
-    """Positions, supports, volumes and each quantity in float64; of a periodic set with every copy that reaches into the box."""
-    position, which = places_of(particles)
-    others = (particles.support, particles.volume, *particles.quantities)
-    return position, *(np.asarray(column, np.float64)[which] for column in others)
+    """`places_of`, and there supports, volumes and each quantity in float64."""
+    position, entry = places_of(particles)
+    others = particles.support, particles.volume, *particles.quantities
+    return position, entry, *(np.asarray(column, np.float64)[entry] for column in others)
 
 
 def places_of(particles: Particles) -> tuple[Float[np.ndarray, "places 3"], Int[np.ndarray, " places"]]:
