@@ -51,14 +51,7 @@ class RayResult:
 
 
 class Marched(NamedTuple):
-    """What is known between batches.
-
-    Attributes:
-        rays: what they have met.
-        light: of the slabs of the last batch, by slot.
-        left_out: what rays that ended would have taken, and how many slabs that is; None where none can end.
-        refined: what marching slabs again took; None where none are.
-    """
+    """What is known between batches: what rays have met, the light of the last batch by slot, and see `RayResult`."""
 
     rays: RayState
     light: Segment
@@ -77,12 +70,9 @@ def march(
     min_transmittance: Float[Array, ""] | None = None,
     tolerance: Float[Array, ""] | None = None,
 ) -> RayResult:
-    """March all packets of a band.
+    """March all packets of a band, by a schedule of bundles.
 
-    Args:
-        schedule: the slabs of samples to march, by bundle.
-        min_transmittance: packets all of whose rays let less through end, between batches; None for none.
-        tolerance: what slabs are refined for, where the plan has room for that; None where they are not.
+    Packets all of whose rays let less through than `min_transmittance` end between batches; for a tolerance slabs are refined.
     """
     batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
     together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None

@@ -56,13 +56,7 @@ def refine(
     share: Float[Array, " packets"],
     march: Callable[[Array, int], Segment],
 ) -> tuple[Segment, Float[Array, " packets"]]:
-    """March slabs of a batch again where their errors are too large.
-
-    Args:
-        light: of all slabs, by slot.
-        seen: of such light, the largest error of each slot's rays, as it is seen.
-        march: `march(items, parts)`: light of items with so many times as many samples.
-    """
+    """March slabs of a batch again, by `march(items, parts)`, where errors are too large that are `seen` of light, by slot."""
     dummy, doublings = batches.schedule.count.size, batches.plan.doublings
     packet, real = batch.marched % batches.num_packets, batch.marched < dummy
     allowed = jnp.where(real, share[packet], jnp.inf)

@@ -85,12 +85,7 @@ class Opened:
 
 
 def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
-    """The particles or the volume of a file (host side).
-
-    Args:
-        path: a file of particles or of a volume, see `jaxsph.io.read_table` and `read_volume`.
-        source: which of it; None chooses.
-        look: by which it will be shown: where that says all of it, opacity has no quantity of its own unless it is named.
+    """The particles or the volume of a file (host side); where a look says all of it, opacity has a quantity only by its name.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -129,15 +124,10 @@ def staged(
     beside: Scene | None = None,
     labels: Labels | None = None,
 ) -> Opened:
-    """The scene and the camera of what a file gives.
+    """The scene and the camera of what a file gives; what was not asked for is chosen.
 
-    Args:
-        loaded: the particles or the volume.
-        look: what was asked for; None chooses all of it.
-        view: likewise.
-        source: by which it was loaded; needed by what looks at masses and velocities of the particles that are shown.
-        beside: volumes and points with looks of their own that share the picture.
-        labels: for a key; None names the quantity by what the file states.
+    `source`, by which it was loaded, is for masses and velocities; volumes and points `beside` share the picture; without
+    `labels` a key is by what the file states.
 
     Raises:
         ValueError: options that do not suit what is there.

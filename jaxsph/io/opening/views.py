@@ -41,12 +41,7 @@ Said = list[tuple[str, str]]
 
 
 def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str | None]:
-    """A length in the unit of a file, > 0, and how a unit was understood.
-
-    Args:
-        value: a number, or text such as `"30 kpc"`.
-        name: of the argument, for messages.
-        unit: of the file's lengths, where it states one.
+    """A length, > 0, in the unit that a file states for its own, if it does, and how its own unit was understood.
 
     Raises:
         ValueError: no positive length; a unit that is not one of length, or where the file does not state its own.
@@ -84,12 +79,7 @@ class Framed(NamedTuple):
 
 
 def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Framed:
-    """The camera that is asked for, where it shows the scene, and what was chosen.
-
-    Args:
-        scene: with its looks.
-        view: what was asked for.
-        table: of the particles that are shown, for masses, velocities and the unit of length.
+    """How a scene with its looks is seen; the table of its particles is for masses, velocities, units and what is up.
 
     Raises:
         ValueError: a center where there is nothing, a length that is none, what the particles do not hold.
@@ -232,7 +222,7 @@ def _from_eye(scene: Scene, view: View, table: ParticleTable | None) -> Camera:
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
     up = view.up
     if up is None:
-        up = upright(np.subtract(target, view.eye), UP if table is None else table.up)
+        up = tuple(upright(np.subtract(target, view.eye), UP if table is None else table.up))  # type: ignore[arg-type]
     made = Camera.look_at(view.eye, target, up, fov, width, height, near=1e-3, far=1.0)
     return snug_in_picture(made, scene)
 

@@ -238,7 +238,7 @@ class Camera:
             ValueError: another axis, or coordinates that do not ascend.
         """
         view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range, up)
-        return cls.orthographic(*view[:4], width, height, near=view.near, far=view.far)
+        return cls.orthographic(width=width, height=height, **view)
 
     @classmethod
     @on_host

@@ -5,7 +5,7 @@ Flow: word, upward direction -> [framing] -> Direction; box around particles, ax
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,15 +29,11 @@ def sight(view: str, up: Any = UP) -> tuple[np.ndarray, np.ndarray]:
     """
     axis = np.asarray(up, np.float64)
     size = np.linalg.norm(axis) or 1.0
-    if view == "iso":  # turned as y is turned to what is up
-        y, forward = np.array(UP), np.array(OBLIQUE)
-        turn = np.cross(y, axis / size)
-        across = np.linalg.norm(turn)
-        if across > ALONG:
-            forward = (
-                forward + np.cross(turn, forward) + (1 - y @ axis / size) / across**2 * np.cross(turn, np.cross(turn, forward))
-            )
-        return (forward if y @ axis > 0 or across > ALONG else -forward), axis
+    if view == "iso":  # turned as y is turned to what is up (Rodrigues)
+        forward, turn, cosine = np.array(OBLIQUE), np.cross(UP, axis / size), axis[1] / size
+        if cosine < ALONG - 1:
+            return -forward, axis
+        return forward + np.cross(turn, forward) + np.cross(turn, np.cross(turn, forward)) / (1 + cosine), axis
     forward = np.asarray(VIEWS[view][0], np.float64)
     forward = -forward if forward @ axis > ALONG * size else forward
     return forward, upright(forward, axis)
@@ -52,17 +48,6 @@ def upright(forward: Any, up: Any) -> np.ndarray:
     return across if across.any() else np.array(UP)
 
 
-class ParallelView(NamedTuple):
-    """What `Camera.orthographic` takes; all in float64, length units."""
-
-    eye: np.ndarray
-    target: np.ndarray
-    up: np.ndarray
-    view_height: float
-    near: float
-    far: float
-
-
 def parallel_view(
     bounds: tuple[np.ndarray, np.ndarray],
     axis: str,
@@ -70,8 +55,8 @@ def parallel_view(
     margin: float,
     depth_range: tuple[Any, Any] | None,
     upward: Any = None,
-) -> ParallelView:
-    """The view along an axis that shows all of a box; `aspect` is height over width. See `Camera.along_axis`.
+) -> dict[str, Any]:
+    """What `Camera.orthographic` takes to show all of a box along an axis; `aspect`: height over width. See `Camera.along_axis`.
 
     Raises:
         ValueError: another axis, or coordinates that do not ascend.
@@ -95,4 +80,4 @@ def parallel_view(
         if not (np.isfinite(begin) and np.isfinite(end) and begin < end):
             raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {(begin, end)}")
         near, far = sorted(float((one - eye["xyz".index(axis)]) * forward.sum()) for one in (begin, end))
-    return ParallelView(eye, middle, up, view_height, near, far)
+    return {"eye": eye, "target": middle, "up": up, "view_height": view_height, "near": near, "far": far}

@@ -20,11 +20,7 @@ OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet 
 
 
 def with_depths(camera: Camera, shown: Any) -> Camera:
-    """A camera whose near and far, as far as they are None, are those of what is shown (host side).
-
-    Args:
-        camera: as `Camera.look_at` makes it.
-        shown: a scene, particles, a volume or points.
+    """A camera whose near and far, as far as they are None, are those of what is shown: a scene, or a part of one (host side).
 
     Raises:
         ValueError: without depths under a trace, with media, which do not say how large they are, or where the depth that is

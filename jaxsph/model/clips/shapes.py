@@ -40,15 +40,7 @@ class Plane(Clip):
     rest: Float[Array, "3"] = dataclasses.field(init=False)
 
     def __init__(self, point: Any, normal: Any):
-        """Check and pack.
-
-        Args:
-            point: (3,) on the plane, length units.
-            normal: (3,), of any length but 0.
-
-        Raises:
-            ValueError: other shapes, numbers that are not finite, a normal of zeros.
-        """
+        """Check and pack; a normal of any length but 0, else `ValueError`, as of other shapes and what is not finite."""
         near, rest = _vector("point", point)
         if is_traced(normal):
             along = normal / jnp.linalg.norm(normal)
@@ -136,14 +128,7 @@ class Box(_Boxed):
     rest: Float[Array, "2 3"] = dataclasses.field(init=False)
 
     def __init__(self, lower: Any, upper: Any):
-        """Check and pack.
-
-        Args:
-            lower, upper: (3,) corners, length units; lower < upper.
-
-        Raises:
-            ValueError: other shapes, numbers that are not finite, corners that do not ascend.
-        """
+        """Check and pack; corners ascend, else `ValueError`, as of other shapes and what is not finite."""
         lower, upper = plain("lower", lower), plain("upper", upper)
         (low, low_rest), (high, high_rest) = _vector("lower", lower), _vector("upper", upper)
         dtype = jnp.promote_types(low.dtype, high.dtype)
@@ -222,15 +207,7 @@ class Sphere(Clip):
     rest: Float[Array, "3"] = dataclasses.field(init=False)
 
     def __init__(self, center: Any, radius: Any):
-        """Check and pack.
-
-        Args:
-            center: (3,), length units.
-            radius: > 0, length units.
-
-        Raises:
-            ValueError: other shapes, numbers that are not finite, a radius that is not > 0.
-        """
+        """Check and pack; a radius > 0, else `ValueError`, as of other shapes and what is not finite."""
         radius = plain("radius", radius)
         near, rest = _vector("center", center)
         if not is_traced(radius):

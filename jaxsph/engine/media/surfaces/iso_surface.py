@@ -66,17 +66,7 @@ class IsoSurface(Medium):
 
     @classmethod
     def from_volume(cls, volume: Volume, level: Any, color: Any = (0.85, 0.8, 0.7), ambient: Any = 0.15) -> IsoSurface:
-        """Check and pack.
-
-        Args:
-            volume: whose surface it is.
-            level: a number, in the units of the volume.
-            color: (3,) in [0, 1].
-            ambient: a number in [0, 1].
-
-        Raises:
-            ValueError: a level that is not finite, a colour or a share outside of [0, 1], another shape.
-        """
+        """Check and pack; `ValueError`: a level that is not finite, a colour or a share outside of [0, 1], another shape."""
         if not isinstance(volume, Volume):
             raise ValueError(f"`volume` must be a `jaxsph.Volume`, got {type(volume).__name__}")
         given = {"level": (level, ()), "color": (color, (3,)), "ambient": (ambient, ())}
