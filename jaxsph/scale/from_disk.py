@@ -11,20 +11,17 @@ chosen alike; where supports reach around the eye or across near and far, they a
 from __future__ import annotations
 
 import dataclasses
-import functools
-import itertools
 import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.bands import Progress, Work
 from jaxsph.engine.planning.fit import MAX_CLASSES, measured, see, shape_of, sorted_and_measured
 from jaxsph.engine.planning.measures import Measures
-from jaxsph.engine.planning.plan import Choices, FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
+from jaxsph.engine.planning.plan import FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime import free_memory
@@ -36,17 +33,19 @@ from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import array_of
 from jaxsph.scale.on_disk import MOST_EXTREMES, Columns, OnDisk
-from jaxsph.scale.panes import CROWDED, Crowd, Need, Pane, Sides, cut_to_fit
+from jaxsph.scale.panes import Need, Pane, crowds
 from jaxsph.scale.parts import joined, of_columns, of_rows
 
 MEMORY = 1 << 30
-READ_BYTES, BYTES_A_PARTICLE = 96, 430
-"""Of a particle of a pane: of columns that are read, with those of the next pane; and in all, as a first guess."""
+READ_BYTES = 96
+"""Of a particle of a pane: of columns that are read, with those of the next pane."""
+CROWDED = 1.25
+"""Times as many particles as the sample has it there is room for in a pane."""
+SIDES = "left", "right", "top", "bottom"
 LEAST = f"{TILE} x {TILE} pixels", f"{TILE} rows of pixels"
 """The least pane, and the least from one side of the image to the other."""
-FRAME_SHARE = 0.2
-"""Of the memory, that a frame is guessed to take whatever its particles."""
 
 
 class TooLittleMemoryError(ValueError):
@@ -96,166 +95,131 @@ def render_from_disk(
     if settings.screen == "quadtree":
         raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
     renderer = _Renderer(on_disk, transfer, camera, settings, memory)
-    panes = renderer.panes()  # the fullest first: where the plan has room for it, it has for most
-    todo, images, most = deque(panes), dict[Pane, Image](), 0
-    with free_memory.given_back_at_once(), _Reader(on_disk, camera, memory // READ_BYTES) as reader:
+    todo, images, most = deque(renderer.panes()), dict[Pane, Image](), 0
+    always, ahead = on_disk.extremes(camera), dict[Pane, Future[Columns | None]]()
+    with free_memory.given_back_at_once(), ThreadPoolExecutor(1, "jaxsph-read") as thread:
+
+        def begun(pane: Pane) -> Future[Columns | None]:
+            return thread.submit(on_disk.seen_by, seen_by(camera, *pane), always, memory // READ_BYTES)
+
         while todo:
             pane = todo.popleft()
-            columns = reader.columns(pane, todo[0] if todo else None)
+            columns = (ahead.pop(pane, None) or begun(pane)).result()
+            if todo and not ahead:
+                ahead[todo[0]] = begun(todo[0])
             image = None if columns is None else renderer.pane(columns, pane)
-            if image is None:
-                todo.extendleft(reversed(renderer.halves(pane)))
+            if columns is None or image is None:
+                halves = pane.halves(renderer.whole_rows)[1]
+                if not halves:
+                    renderer.require_least()
+                    raise AssertionError(f"{pane} fits by counting, but not by its plan")
+                todo.extendleft(reversed(halves))
                 continue
-            assert columns is not None
             images[pane], most = image, max(most, len(columns[0]))
             del columns
             free_memory.give_back()
             if progress is not None:
                 progress(len(images), len(images) + len(todo))
-    image = _rows_of([_cut_image(pane, images, renderer.whole_rows) for pane in sorted(panes)], sorted(panes))
+    image = _of_halves(renderer.whole, images, renderer.whole_rows)
     return dataclasses.replace(image, stats=image.stats | {"panes": len(images), "most_particles": most})
 
 
-def _cut_image(pane: Pane, images: dict[Pane, Image], whole_rows: bool) -> Image:
+def _of_halves(pane: Pane, images: dict[Pane, Image], whole_rows: bool) -> Image:
     """The image of a pane, of its halves where it was cut."""
     if pane in images:
         return images[pane]
     axis, halves = pane.halves(whole_rows)
-    return joined([_cut_image(half, images, whole_rows) for half in halves], axis=axis)
+    return joined([_of_halves(half, images, whole_rows) for half in halves], axis=axis)
 
 
-def _rows_of(images: list[Image], panes: list[Pane]) -> Image:
-    """The image that panes make, in the order of their rows and columns."""
-    rows = itertools.groupby(zip(panes, images, strict=True), lambda one: one[0].top)
-    return joined([joined([image for _, image in row], axis=1) for _, row in rows])
-
-
-class _Reader:
-    """Reads the particles of a pane while another is rendered; None of panes with more than `most`."""
-
-    def __init__(self, on_disk: OnDisk, camera: Camera, most: int) -> None:
-        self._on_disk, self._camera, self._most = on_disk, camera, most
-        self._always = on_disk.extremes(camera)
-        self._ahead: dict[Pane, Future[Columns | None]] = {}
-        self._thread = ThreadPoolExecutor(1, "jaxsph-read")
-
-    def __enter__(self) -> _Reader:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._thread.shutdown()
-
-    def columns(self, pane: Pane, then: Pane | None) -> Columns | None:
-        """The particles of a pane; those of the next are begun to be read, unless others are read ahead already."""
-        columns = self._begun(pane).result()
-        if then is not None and not self._ahead:
-            self._ahead[then] = self._begun(then)
-        return columns
-
-    def _begun(self, pane: Pane) -> Future[Columns | None]:
-        begun = self._ahead.pop(pane, None)
-        return begun or self._thread.submit(self._on_disk.seen_by, seen_by(self._camera, *pane), self._always, self._most)
-
-
-@dataclasses.dataclass
 class _Renderer:
-    """Panes of one picture, with one plan that grows where it has to."""
+    """Panes of one picture, with one plan that grows where it has to; all is chosen by the sample, with the supports of all."""
 
-    on_disk: OnDisk
-    transfer: TransferFunction
-    camera: Camera
-    settings: Settings
-    memory: int
-    capacity: int = 1
-    plans: dict[tuple[int, int], Plan] = dataclasses.field(default_factory=dict)
-    """By rows of pixels and entries of particle arrays."""
-
-    @property
-    def whole_rows(self) -> bool:
-        """Whether panes reach from side to side: the pilot's lattice reaches from bundle to bundle."""
-        return self._asked.along.estimator == "pilot"
+    def __init__(self, on_disk: OnDisk, transfer: TransferFunction, camera: Camera, settings: Settings, memory: int) -> None:
+        self._on_disk, self._transfer, self._camera, self._settings, self._memory = on_disk, transfer, camera, settings, memory
+        self.whole = Pane(0, camera.height, 0, camera.width)
+        sample, index = on_disk.sample, on_disk.index
+        thinned = np.cbrt(max(sample.num_particles, 1) / max(len(on_disk), 1))
+        true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
+        self._asked = Request.of(Scene(particles=true, transfer=transfer), camera, settings)
+        self.whole_rows = self._asked.along.estimator == "pilot"  # whose lattice reaches from bundle to bundle
+        octaves = np.log2(index.support.max() / index.least.min()) if index.support.size else -1.0
+        classes = int(min(2 + np.ceil(octaves), MAX_CLASSES))  # as `planning` counts them in the whole
+        self._shape = dataclasses.replace(shape_of(self._asked), num_classes=classes, headroom=1.0)
+        self._sample = see(self._asked.scene, self._asked.camera, self._shape, Clock())
+        self._given = self._asked.along, choose(measured(self._sample, self._asked, self._shape), self._asked.along)
+        self._limit = settings.memory_limit or memory  # of a frame, whatever is read
+        self._capacity, self._plans = 1, dict[tuple[int, int], Plan]()  # by rows of pixels and entries of particle arrays
 
     def panes(self) -> list[Pane]:
-        """As few as memory allows, as far as the sample tells.
+        """Halves of halves of the picture, each of which fits as far as the sample tells.
+
+        The fullest are the first: where the plan has room for them, it has for most.
 
         Raises:
             TooLittleMemoryError: the least pane needs more.
         """
-        seen, there = self._sample.viewed, np.asarray(self.on_disk.sample.valid)
-        sides = Sides(*(np.asarray(side)[: len(there)][there] for side in (seen.left, seen.right, seen.top, seen.bottom)))
-        room = int((1 - FRAME_SHARE) * self.memory) // BYTES_A_PARTICLE
-        size = self.camera.height, self.camera.width
-        found, fit = cut_to_fit(size, sides, len(self.on_disk), room, self._fits, whole_rows=self.whole_rows)
+        todo, needs, fit = [self.whole], dict[Pane, Need](), True
+        while todo:
+            pane = todo.pop()
+            need, halves = self._told(pane), pane.halves(self.whole_rows)[1]
+            if halves and not self._fits(need):
+                todo += halves
+            else:
+                needs[pane], fit = need, fit and self._fits(need)
         if not fit:
-            self._require_least()
-        return list(found)
+            self.require_least()
+        return sorted(needs, key=lambda pane: -needs[pane].particles)
 
-    def halves(self, pane: Pane) -> list[Pane]:
-        """Of a pane that needs more than there is.
+    def _told(self, pane: Pane) -> Need:
+        """What suffices for a pane, as far as the sample tells."""
+        seen, all_there = _within(self._sample, pane), len(self._on_disk)
+        rows = of_rows(measured(seen, self._asked, self._shape), pane.top // TILE, -(-pane.bottom // TILE))
+        left, right, top, bottom = (np.asarray(getattr(seen.viewed, side)) for side in SIDES)
+        counts = ((left <= right) & (top <= bottom)).sum(), rows.tile_pairs.max(), rows.bundle_pairs.max()
+        scale = CROWDED * all_there / max(self._on_disk.sample.num_particles, 1)
+        held, tiles, bundles = (int(scale * (count + 2 * np.sqrt(count) + 1)) + MOST_EXTREMES for count in counts)
+        return Need(min(held, all_there + MOST_EXTREMES), tiles, bundles, pane.bottom - pane.top)
 
-        Raises:
-            TooLittleMemoryError: it cannot be cut.
-        """
-        halves = pane.halves(self.whole_rows)[1]
-        if not halves:
-            self._require_least()
-            raise AssertionError(f"{pane} fits by counting, but not by its plan")
-        return halves
-
-    def _require_least(self) -> None:
+    def require_least(self) -> None:
         """Raise where the least panes do not fit: all particles are read once, to count them."""
-        crowd = Crowd(self.camera, self.on_disk.index.bounds())
-        for position, support, *_ in self.on_disk.all_seen_by(seen_by(self.camera, 0, self.camera.height, 0, self.camera.width)):
-            crowd.count(position, support)
-        need = crowd.fullest(self.whole_rows)
-        need = need._replace(particles=need.particles + MOST_EXTREMES)
-        frame = self._smallest(need).bytes
-        given = {"memory": (self.memory, frame + self._read_bytes(need)), "settings.memory_limit": (self._limit, frame)}
-        for name, (allowed, least) in given.items():
+        some = (columns[:2] for _, _, columns in self._on_disk.read(seen_by(self._camera, *self.whole)))
+        counts = crowds(self._camera, self._on_disk.index.bounds(), some, self.whole_rows)
+        held, pairs = (max(of_panes.values(), default=0) for of_panes in counts)
+        need = Need(held + MOST_EXTREMES, pairs, 4 * pairs, TILE)  # a particle has up to four bundles in a tile
+        why = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles"
+        given = ("memory", self._memory), ("settings.memory_limit", self._limit)
+        for (name, allowed), least in zip(given, self._bytes(need), strict=True):
             if allowed < least:
-                why = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles"
                 raise TooLittleMemoryError(name, allowed, least, why)
 
-    @property
-    def _limit(self) -> int:
-        """Of a frame, whatever is read."""
-        return self.settings.memory_limit or self.memory
+    def _fits(self, need: Need) -> bool:
+        in_all, of_frame = self._bytes(need)
+        return in_all <= self._memory and of_frame <= self._limit
 
-    def _fits(self, need: Need) -> float:
-        """How many times what is needed there is, in bands of one row of tiles and least batches."""
-        least = self._smallest(need)
-        return min(self.memory / (least.bytes + self._read_bytes(need)), self._limit / least.bytes)
-
-    def _read_bytes(self, need: Need) -> int:
-        return READ_BYTES * capacity_class(need.particles)
-
-    def _smallest(self, need: Need) -> Plan:
-        """The plan that takes least of all."""
-        tile_rows, tile_columns = -(-need.height // TILE), -(-self.camera.width // TILE)
+    def _bytes(self, need: Need) -> tuple[int, int]:
+        """In all, and of the frame alone, in bands of one row of tiles and least batches."""
+        tile_rows, tile_columns = -(-need.height // TILE), -(-self._camera.width // TILE)
         tiles, bundles = (np.full(tile_rows, count) for count in (need.tile_pairs, need.bundle_pairs))
         measures = Measures(tiles, bundles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
-        shape = self._shape_of(self._shape, need.height, capacity_class(need.particles))
-        return smallest(measures, shape, self._asked.along, self._choices)
-
-    def _shape_of(self, shape: FrameShape, height: int, capacity: int) -> FrameShape:
-        return dataclasses.replace(shape, height=height, num_particles=capacity, num_classes=self._classes, headroom=1.0)
+        shape = dataclasses.replace(self._shape, height=need.height, num_particles=capacity_class(need.particles))
+        frame = smallest(measures, shape, *self._given).bytes
+        return frame + READ_BYTES * shape.num_particles, frame
 
     def pane(self, columns: Columns, pane: Pane) -> Image | None:
         """The image of some pixels; None where it needs more memory than there is."""
         needed = capacity_class(len(columns[0]))
-        for capacity in dict.fromkeys((max(self.capacity, needed), needed)):
-            if self._fits(Need(capacity, 1, 1, pane.bottom - pane.top)) < 1:
-                continue
-            image = self._image(columns, pane, capacity)
-            if image is not None:
-                self.capacity = max(self.capacity, capacity)
+        for capacity in dict.fromkeys((max(self._capacity, needed), needed)):
+            fits = self._fits(Need(capacity, 1, 1, pane.bottom - pane.top))
+            if fits and (image := self._image(columns, pane, capacity)) is not None:
+                self._capacity = max(self._capacity, capacity)
                 return image
         return None
 
     def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image | None:
-        particles = self.on_disk.particles(columns, capacity)
-        asked, clock = Request.of(Scene(particles=particles, transfer=self.transfer), self.camera, self.settings), Clock()
-        shape = self._shape_of(shape_of(asked), self.camera.height, capacity)
+        particles = self._on_disk.particles(columns, capacity)
+        asked, clock = Request.of(Scene(particles=particles, transfer=self._transfer), self._camera, self._settings), Clock()
+        shape = dataclasses.replace(self._shape, num_particles=capacity)
         seen = _within(see(asked.scene, asked.camera, shape, clock), pane)
         seen, measures = sorted_and_measured(seen, asked, shape)
         rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
@@ -263,62 +227,28 @@ class _Renderer:
         clock.mark("plan")
         if plan is None:
             return None
-        image = Work(seen, asked.camera, self.settings, plan, asked.scene.formulas, pane.top).image(clock)
+        image = Work(seen, asked.camera, self._settings, plan, asked.scene.formulas, pane.top).image(clock)
         return of_columns(asked.in_given_unit(image), pane.left, pane.right)
 
     def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:
         """The plan there is, if it serves; else with room for more like this if memory allows; None where it allows none."""
-        limit = min(self._limit, self.memory - READ_BYTES * shape.num_particles)
-        given, roomy = (self._asked.along, self._choices), dataclasses.replace(shape, headroom=CROWDED)
-        kept = self.plans.get((shape.height, shape.num_particles))
+        limit = min(self._limit, self._memory - READ_BYTES * shape.num_particles)
+        roomy, kept = dataclasses.replace(shape, headroom=CROWDED), self._plans.get((shape.height, shape.num_particles))
         if kept is not None:
             sizes = kept.bands, kept.cast.batch_slabs
-            if kept.serves(in_bands(needed, shape, *given, *sizes)):
+            if kept.serves(in_bands(needed, shape, *self._given, *sizes)):
                 return kept
-            grown = kept.grown(in_bands(needed, roomy, *given, *sizes))
+            grown = kept.grown(in_bands(needed, roomy, *self._given, *sizes))
             kept = dataclasses.replace(grown, bytes=bytes_of(grown, shape.number))
-        if kept is not None and kept.bytes <= limit:
-            made: Plan | None = kept
-        else:
-            made = fitting(needed, roomy, *given, limit) or fitting(needed, shape, *given, limit)
-        if made is not None:
-            self.plans[shape.height, shape.num_particles] = made
-        return made
-
-    @functools.cached_property
-    def _classes(self) -> int:
-        """Of supports, as the whole snapshot has them: `planning` counts octaves."""
-        support = self.on_disk.index.support
-        if not support.size:
-            return 1
-        octaves = np.log2(support.max() / self.on_disk.index.least.min())
-        return int(min(2 + np.ceil(max(octaves, 0)), MAX_CLASSES))
-
-    @functools.cached_property
-    def _asked(self) -> Request:
-        """Of the sample, with the supports of all particles."""
-        sample = self.on_disk.sample
-        thinned = np.cbrt(max(sample.num_particles, 1) / max(len(self.on_disk), 1))
-        true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
-        return Request.of(Scene(particles=true, transfer=self.transfer), self.camera, self.settings)
-
-    @functools.cached_property
-    def _shape(self) -> FrameShape:
-        return shape_of(self._asked)
-
-    @functools.cached_property
-    def _sample(self) -> Seen:
-        return see(self._asked.scene, self._asked.camera, self._shape, Clock())
-
-    @functools.cached_property
-    def _choices(self) -> Choices:
-        """By how large supports of the sample appear."""
-        return choose(measured(self._sample, self._asked, self._shape), self._asked.along)
+        if kept is None or kept.bytes > limit:
+            kept = fitting(needed, roomy, *self._given, limit) or fitting(needed, shape, *self._given, limit)
+        if kept is not None:
+            self._plans[shape.height, shape.num_particles] = kept
+        return kept
 
 
 def _within(seen: Seen, pane: Pane) -> Seen:
     """What is seen, with no particle touching any pixel out of a pane."""
-    viewed = seen.viewed
-    left, right = jnp.maximum(viewed.left, pane.left), jnp.minimum(viewed.right, pane.right - 1)
-    top, bottom = jnp.maximum(viewed.top, pane.top), jnp.minimum(viewed.bottom, pane.bottom - 1)
-    return seen._replace(viewed=dataclasses.replace(viewed, left=left, right=right, top=top, bottom=bottom))
+    ends = zip(SIDES, (np.maximum, np.minimum) * 2, (pane.left, pane.right - 1, pane.top, pane.bottom - 1), strict=True)
+    inside = {side: array_of(clipped(np.asarray(getattr(seen.viewed, side)), end)) for side, clipped, end in ends}
+    return seen._replace(viewed=dataclasses.replace(seen.viewed, **inside))

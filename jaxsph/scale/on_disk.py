@@ -29,6 +29,7 @@ SAMPLED = 1 << 16
 MOST_EXTREMES = 2
 """Particles that come along wherever they are: the widest and the strongest."""
 Columns = tuple[np.ndarray, ...]
+Places = frozenset[tuple[int, int]]  # files and rows of some particles
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -135,45 +136,35 @@ class OnDisk:
         quantity: Any = values[0] if len(values) == 1 else tuple(values)
         return Particles.from_arrays(position, support, quantity, volume, self.kernel, capacity=capacity)
 
-    def seen_by(
-        self, planes: Planes, always: frozenset[tuple[int, int]] = frozenset(), most: int | None = None
-    ) -> Columns | None:
+    def seen_by(self, planes: Planes, always: Places = frozenset(), most: int | None = None) -> Columns | None:
         """The particles whose supports reach into a region, and some others, in the order of the files.
 
         None where there are more than `most`: so many are never held.
         """
-        index, parts, found = self.index, [self.columns_of(self._nothing)], 0
-        held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
-        for file, row in always:
-            held |= (index.file == file) & (index.begin <= row) & (row < index.end)
-        for file, begin, columns in self._read(held):
+        parts: list[Columns] = []
+        for file, begin, columns in self.read(planes, always):
             kept = planes.meet(columns[0].astype(np.float64), columns[1].astype(np.float64))
             kept[[row - begin for which, row in always if which == file and begin <= row < begin + len(kept)]] = True
             parts.append(tuple(column[kept] for column in columns))
-            found += len(parts[-1][0])
-            if most is not None and found > most:
+            if most is not None and sum(len(part[0]) for part in parts) > most:
                 return None
+        if not parts:
+            first = int(self.index.file[0]) if len(self) else 0
+            parts.append(self.columns_of(self.snapshot.read(first, slice(0, 0), self.needed)))
         return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
-    def all_seen_by(self, planes: Planes) -> Iterator[Columns]:
-        """The particles of all runs that reach into a region, some at a time."""
-        held = planes.meet_boxes(self.index.lower, self.index.upper, self.index.support) if len(self) else np.zeros(0, bool)
-        return (columns for _, _, columns in self._read(held))
-
-    def _read(self, held: np.ndarray) -> Iterator[tuple[int, int, Columns]]:
-        """File, first row and columns of some runs."""
+    def read(self, planes: Planes, always: Places = frozenset()) -> Iterator[tuple[int, int, Columns]]:
+        """File, first row and columns of all runs that reach into a region, and of those of some others, some at a time."""
         index = self.index
-        runs = zip(index.file[held].tolist(), index.begin[held].tolist(), index.end[held].tolist(), strict=True)
-        for file, rows in together(runs):
+        held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
+        for file, row in always:
+            held |= (index.file == file) & (index.begin <= row) & (row < index.end)
+        runs = (of_runs[held].tolist() for of_runs in (index.file, index.begin, index.end))
+        for file, rows in together(zip(*runs, strict=True)):
             begin, end = rows[0][0], rows[-1][1]
             yield file, begin, self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
 
-    @functools.cached_property
-    def _nothing(self) -> ParticleTable:
-        file = int(self.index.file[0]) if len(self.index.file) else 0
-        return self.snapshot.read(file, slice(0, 0), self.needed)
-
-    def extremes(self, camera: Camera) -> frozenset[tuple[int, int]]:
+    def extremes(self, camera: Camera) -> Places:
         """File and row of the widest and of the strongest particle between near and far."""
         index, planes = self.index, between_depths(camera)
         runs = np.flatnonzero(planes.meet_boxes(index.lower, index.upper, index.support)) if len(index.file) else np.zeros(0, int)

@@ -38,6 +38,7 @@ PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
 OF_PARTS = (PICTURE, PART, PARTS, FIRST_ROW, ROWS)
 OF_FILES = ("certified", "faults")
 """Names of the metadata that files add, each of its own part."""
+LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
 
 @on_host
@@ -65,7 +66,8 @@ def render_tile(
     settings = settings or Settings()
     _require_parts(scene, camera, settings, index, count)
     camera = with_depths(camera, scene)
-    mark = picture_of(scene, camera, settings)
+    x64, of_any_memory = jax.config.read("jax_enable_x64"), dataclasses.replace(settings, memory_limit=None)
+    mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)
     clock, asked = Clock(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)
     seen, measures = sorted_and_measured(see(scene, asked.camera, shape, clock), asked, shape)
@@ -73,20 +75,12 @@ def render_tile(
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
     given = of_rows(measures, *rows), of_part, along, choose(measures, along)
-    plan = fitting(*given, along.memory_limit or shape.memory)
-    if plan is None:  # no room for more than this part needs
-        plan = fitted(given[0], dataclasses.replace(of_part, headroom=1.0), *given[2:])
+    tight = dataclasses.replace(of_part, headroom=1.0)  # where there is no room for more than this part needs
+    plan = fitting(*given, along.memory_limit or shape.memory) or fitted(given[0], tight, *given[2:])
     clock.mark("plan")
     image = asked.in_given_unit(Work(seen, asked.camera, settings, plan, scene.formulas, first).image(clock, progress))
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
-
-
-def picture_of(scene: Scene, camera: Camera, settings: Settings) -> str:
-    """A digest of all that a picture depends on; not of the memory that it may take."""
-    x64 = jax.config.read("jax_enable_x64")
-    parts = digest_of((scene, camera)), dataclasses.replace(settings, memory_limit=None)
-    return fingerprint("p", __version__, x64, *parts)
 
 
 def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
@@ -107,9 +101,8 @@ def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
 
 def of_rows(measures: Measures, first: int, last: int) -> Measures:
     """Of some rows of tiles alone."""
-    return dataclasses.replace(
-        measures, tile_pairs=measures.tile_pairs[first:last], bundle_pairs=measures.bundle_pairs[first:last]
-    )
+    tiles, bundles = measures.tile_pairs[first:last], measures.bundle_pairs[first:last]
+    return dataclasses.replace(measures, tile_pairs=tiles, bundle_pairs=bundles)
 
 
 def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int, count: int) -> None:
@@ -209,9 +202,6 @@ def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[s
         raise ValueError(f"{names[0]} begins at row {begins[0]}, not 0; render it again")
 
 
-LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
-
-
 def _layers_of(parts: list[Image]) -> tuple[str, ...]:
     """Of pixels, that all parts have."""
     return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
@@ -223,9 +213,8 @@ def of_columns(image: Image, left: int, right: int) -> Image:
     There because a device would compile a program for every width.
     """
     layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in _layers_of([image])}
-    layers["levels"] = (
-        None if image.levels is None else np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
-    )
+    if image.levels is not None:
+        layers["levels"] = np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
     return dataclasses.replace(image, **layers)
 
 
