@@ -183,15 +183,14 @@ class _Renderer:
 
     def require_least(self) -> None:
         """Raise where the least panes do not fit: all particles are read once, to count them."""
-        some = (columns[:2] for _, _, columns in self._on_disk.read(seen_by(self._camera, *self.whole)))
+        some = (columns for _, _, columns in self._on_disk.read(seen_by(self._camera, *self.whole)))
         counts = crowds(self._camera, self._on_disk.index.bounds(), some, self.whole_rows)
-        held, pairs = (max(of_panes.values(), default=0) for of_panes in counts)
+        held, pairs = (max(each.values(), default=0) for each in counts)
         need = Need(held + MOST_EXTREMES, pairs, 4 * pairs, TILE)  # a particle has up to four bundles in a tile
-        why = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles"
-        given = ("memory", self._memory), ("settings.memory_limit", self._limit)
-        for (name, allowed), least in zip(given, self._bytes(need), strict=True):
-            if allowed < least:
-                raise TooLittleMemoryError(name, allowed, least, why)
+        why, bytes_of_it = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles", self._bytes(need)
+        for name, given, least in zip(("memory", "settings.memory_limit"), (self._memory, self._limit), bytes_of_it, strict=True):
+            if given < least:
+                raise TooLittleMemoryError(name, given, least, why)
 
     def _fits(self, need: Need) -> bool:
         in_all, of_frame = self._bytes(need)

@@ -51,7 +51,7 @@ class Need(NamedTuple):
 
 
 def crowds(
-    camera: Camera, bounds: tuple[np.ndarray, np.ndarray], particles: Iterable[tuple[np.ndarray, np.ndarray]], whole_rows: bool
+    camera: Camera, bounds: tuple[np.ndarray, np.ndarray], particles: Iterable[tuple[np.ndarray, ...]], whole_rows: bool
 ) -> tuple[Counter[Pane], Counter[Pane]]:
     """How many of all particles are read for each least pane, a tile or a row of tiles; and pairs of its tiles and particles.
 
@@ -60,7 +60,7 @@ def crowds(
     Args:
         camera: whose picture it is.
         bounds: corners of a box around all particles.
-        particles: positions and supports, some at a time.
+        particles: positions, supports and whatever else, some at a time.
         whole_rows: whether the least panes are rows of tiles.
     """
     eye, forward = camera.exact_eye(), np.asarray(camera.axes, np.float64)[2]
@@ -80,7 +80,7 @@ def crowds(
         for half in halves if kept.any() else ():
             add(half, position[kept], reach[kept], row)
 
-    for position, support in particles:
+    for position, support, *_ in particles:
         reach = support.astype(np.float64) * (1 + SLACK) + 2 * SLACK * farthest  # of some particles alone `Planes` has less
         add(Pane(0, camera.height, 0, camera.width), position.astype(np.float64), reach)
     return held, pairs

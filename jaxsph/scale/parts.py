@@ -67,7 +67,7 @@ def render_tile(
     _require_parts(scene, camera, settings, index, count)
     camera = with_depths(camera, scene)
     x64, of_any_memory = jax.config.read("jax_enable_x64"), dataclasses.replace(settings, memory_limit=None)
-    mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)
+    mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)  # all that the picture depends on
     clock, asked = Clock(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)
     seen, measures = sorted_and_measured(see(scene, asked.camera, shape, clock), asked, shape)
