@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import workloads
 
 import jaxsph as js
-from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
 from jaxsph.engine.planning.fit import measured, see
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.trade.measurement import of_this_run

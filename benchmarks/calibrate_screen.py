@@ -25,7 +25,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from calibration_scenes import GROUPS, Kind
 
 import jaxsph as js
-from jaxsph.engine.screen.estimators import CAUTION
+from jaxsph.engine.screen.canvas import CAUTION
 from jaxsph.io.replace import written_whole
 from jaxsph.trade.measurement import of_this_run
 

@@ -12,7 +12,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.engine.asked import as_asked
 from jaxsph.engine.frame.bands import Progress, Work
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import traced_image_of
@@ -21,7 +20,7 @@ from jaxsph.engine.frame.over_mesh import drawn_over_mesh
 from jaxsph.engine.frame.refinement import refined
 from jaxsph.engine.planning.fit import PLANS, see, seen_by
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request, along_rays
+from jaxsph.engine.request import Request, along_rays, as_asked
 from jaxsph.engine.runtime.device_executors import OnDevices
 from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
 from jaxsph.engine.runtime.executors import Clock, Traced

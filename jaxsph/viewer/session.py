@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxsph.engine.asked import as_asked
-from jaxsph.engine.request import along_rays
+from jaxsph.engine.request import along_rays, as_asked
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.scene import Scene

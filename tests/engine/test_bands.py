@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access import lists as access
+from jaxsph.engine.access.grid import shard
 from jaxsph.engine.access.lists import BUNDLE, bundle_origins
-from jaxsph.engine.access.shards import shard
 from jaxsph.engine.frame.bands import dealing
 
 SAME_BITS = """

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.frame.claims import faults_of_settings
+from jaxsph.engine.frame.images import faults_of_settings
 from jaxsph.numerics import faults
 
 ALL = [bit for bit in faults.MESSAGES if not bit & faults.TOLD]

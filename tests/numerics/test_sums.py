@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from jaxsph.numerics.sums import STEP, running_sum
+from jaxsph.engine.access.compaction import STEP, running_sum
 
 
 @jax.jit

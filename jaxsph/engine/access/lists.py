@@ -22,13 +22,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.footprint import side_distances, touches
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
 from jaxsph.numerics.fusion import fusion_barrier
-from jaxsph.numerics.sums import running_sum
 from jaxsph.numerics.trees import tree
 
 MAX_EXACT = 1 << 22  # tiles of a band that float32 divides by columns without a mistake; whole numbers take longer

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxsph.engine.access.compaction import running_sum
 from jaxsph.model.transfer.function import EVEN, SELECT_ALL, TransferFunction, look_up
-from jaxsph.numerics.sums import running_sum
 from jaxsph.numerics.trees import tree
 
 MACROCELL = 4

@@ -43,6 +43,15 @@ from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 BUCKETS = 1024  # of the transfer function's domain: a slope is averaged over one at least
+CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
+MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
+MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
+SUBSAMPLED_SHARE = 0.2  # of the variance across, what is left between rays of `SUBSAMPLE`, where it is most: at free surfaces
+DEVIATIONS_AROUND = 10.0  # of Q, by which quantities between nodes are taken to lie beyond those at the nodes
+MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
+AXES = 2, 1, 0  # of a lattice: columns, rows, layers
+Combine = Callable[[Array, Array], Array]
+Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; nodes
 
 
 @tree()
@@ -93,17 +102,6 @@ def mean_square_slope(squares: SquaredSlopes, low: Array, high: Array) -> list[A
     extent = jnp.maximum(high - low, jnp.where(squares.rate > 0, 1 / squares.rate, 1))
     *inside, jumps = upper - lower
     return [jnp.where(jumps > 0, jnp.inf, (sum_of + lost * most) / extent) for sum_of, most in zip(inside, upper, strict=False)]
-
-
-CUBIC = 3 / 128  # of a fourth difference: largest error of a cubic between its middle nodes
-MIN_CLEARANCE = 12.0  # times its estimated error that the sum of weights is above zero wherever a slab is interpolated
-MIN_DEVIATION = 8  # eps: what interpolated samples differ by, at least
-SUBSAMPLED_SHARE = 0.2  # of the variance across, what is left between rays of `SUBSAMPLE`, where it is most: at free surfaces
-DEVIATIONS_AROUND = 10.0  # of Q, by which quantities between nodes are taken to lie beyond those at the nodes
-MIN_ACROSS = 1 / 64  # share of the variance that is across, at least
-AXES = 2, 1, 0  # of a lattice: columns, rows, layers
-Combine = Callable[[Array, Array], Array]
-Carried = tuple[Array, Array, list["NodeValues"]]  # optical thickness in front; light, see `second_differences`; nodes
 
 
 @tree()

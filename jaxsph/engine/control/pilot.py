@@ -17,8 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.interpolation_error import InterpolationError
-from jaxsph.engine.control.knapsack import select_under_budget
-from jaxsph.engine.control.spacing import choose_spacing
+from jaxsph.engine.control.spacing import choose_spacing, select_under_budget
 from jaxsph.engine.field.lattice import FINEST, Lattice, Spacing
 from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, SUBSAMPLE, SUBSAMPLED, SlabSchedule, full_rate
 from jaxsph.model.camera.camera import Camera

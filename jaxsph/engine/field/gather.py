@@ -9,21 +9,27 @@ The perspective grid makes the squared distance separable. A sample sits at $(a_
 (perspective) or 1 (orthographic), so the squared distance in supports is $A_{kc} + D_{kr}$ with $A_{kc} = ((a_k u_c - X) / H)^2$
 and $D_{kr} = ((s_k - Z) / H)^2 + ((a_k v_r - Y) / H)^2$: one addition a sample, or for poly6 one subtraction from the margin
 $1 - D_{kr}$. Differences to the particle are taken before they are squared, so nothing cancels.
+
+Rays that are no tensor product (`gather_scattered`) have the same order of operations, so that a ray is the same bit for bit in
+whichever packet it is cast: what rays of a row or a column would share is computed where it is added, but rounded as if it were
+stored, as a compiler may contract a square and what it is added to into one operation.
 """
 
 from __future__ import annotations
 
 import functools
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import fetch, quantities_of
+from jaxsph.engine.field.fetch import Block, fetch, quantities_of
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
+from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 16  # particles unrolled in the inner loop
@@ -63,3 +69,34 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
         return w, [quantity[:, k, None, None, None] for quantity in quantities]
 
     return with_block(sums, [weighed(k) for k in range(BLOCK)])
+
+
+def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
+    """Sums (tasks, samples, 1, rays) at every sample of slabs, from all particles of their windows."""
+    sums = sums_of([jnp.zeros(task.shape, task.depth.dtype)] * (1 + len(quantities_of(ordered))))
+    for turns in task.turns(BLOCK, PARTS[task.crowded]):
+        add = functools.partial(_add_scattered, ordered, rank, turns.task, kernel)
+        sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
+    return jax.tree.map(lambda value: value[:, :, None], sums)
+
+
+def _add_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
+    """With a block of particles more."""
+    entry, s = task.entry, task.depth[..., None]
+    lateral_scale = s if task.perspective else jnp.ones_like(s)
+    su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
+    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
+    smooth, largest = kernels.by_name(kernel), jnp.finfo(s.dtype).max
+
+    def fetched(index: Array) -> Block:
+        return fetch(ordered, rank, windows, index, references)[1]
+
+    block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+
+    def weighed(k: int) -> tuple[Array, tuple[Array, ...]]:
+        one = jax.tree.map(lambda column: column[:, k, None, None], block)
+        across = lesser(((su - one.x) * one.scale) ** 2, largest)  # what is between the two keeps them apart
+        along = ((s - one.z) * one.scale) ** 2 + ((sv - one.y) * one.scale) ** 2
+        return smooth.weigh(smooth.prepare(along, one.size), across, one.size, jnp), one.quantities
+
+    return with_block(sums, (weighed(k) for k in range(BLOCK)))

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import Grid, unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.shards import unshard
 from jaxsph.numerics.trees import tree
 
 REACH = 2  # nodes to either side that a fourth difference takes

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.shards import unshard
 from jaxsph.engine.control.adapt import ControlPlan, rounding_of
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.bands import Work

@@ -16,12 +16,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.lists import ListPlan
+from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
+from jaxsph.engine.access.lists import BundleLists, ListPlan
 from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.adjoint import KEPT, CastMethod
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.field.lattice import Lattice
-from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
 from jaxsph.engine.frame.layers import Band, Drawn, OfShards
 from jaxsph.engine.frame.stages import (
     BandGrid,
@@ -34,14 +35,19 @@ from jaxsph.engine.frame.stages import (
     decide_by_pilot,
     decide_full_rate,
     ends,
+    grid_of_lists,
     least_transmittance,
     limits_of,
+    make_grid,
+    order,
+    stage,
     sum_shard,
 )
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
-from jaxsph.engine.runtime.executors import Executor
+from jaxsph.engine.runtime.executors import Clock, Executor, Forecast, HostStage
+from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
@@ -52,7 +58,64 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of, product
 
+Found = Int[Array, " particles"] | None
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
+
+
+@stage("lists", "samples", "beside", quickly=True)
+def find_windows(
+    ordered: Ordered,
+    made: BundleLists,
+    camera: Camera,
+    first_row: Int[Array, ""],
+    *,
+    lists: ListPlan,
+    samples: int,
+    beside: bool,
+    tuning: Tuning,
+) -> BandGrid:
+    """All but the lists of the grid of the band that begins at a row of pixels; what a program returns it would copy."""
+    return grid_of_lists(ordered, made, camera, first_row, lists, samples, beside)._replace(lists=None)  # type: ignore[arg-type]
+
+
+def _order(run: Clock, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
+    if found is None:
+        found = depth_order(viewed, cores_at_hand())
+        run.mark(stage)
+    ordered: Ordered = run.one(stage, order, (viewed, camera, found), **static)
+    return ordered
+
+
+def _order_foreseen(run: Forecast, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
+    shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32) if found is None else found
+    ordered: Ordered = run.one(stage, order, (viewed, camera, shape), **static)
+    return ordered
+
+
+def _grid(
+    run: Clock, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
+) -> BandGrid:
+    sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
+    view = (sides.spheres, sides.bundles, camera, first_row)
+    touched = run.program(stage, find_touched, (*view, pair_shapes(lists)))
+    made = build_lists_on_host(sides, lambda pairs: touched(*view, pairs), lists, cores_at_hand())
+    run.mark(stage)
+    grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
+    return grid._replace(lists=made)
+
+
+def _grid_foreseen(
+    run: Forecast, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
+) -> BandGrid:
+    sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
+    run.one(stage, find_touched, (sides.spheres, sides.bundles, camera, first_row, pair_shapes(lists)))
+    made = list_shapes(lists)
+    grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
+    return grid._replace(lists=made)
+
+
+ORDER = HostStage(order, _order, _order_foreseen)
+MAKE_GRID = HostStage(make_grid, _grid, _grid_foreseen)
 
 
 @dataclasses.dataclass(frozen=True)

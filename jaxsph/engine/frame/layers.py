@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.shards import unshard
 from jaxsph.engine.frame.stages import Cast, Verdict
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import compiled_quickly

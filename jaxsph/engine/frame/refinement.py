@@ -22,7 +22,7 @@ from jaxsph.engine.media.shown import RayLimits
 from jaxsph.engine.runtime.executors import Executor
 from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.packets import Queue, packets_of
-from jaxsph.engine.screen.quadtree import QuadtreePlan
+from jaxsph.engine.screen.pyramid import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.numerics.checks import array_of
 

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import Grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
-from jaxsph.engine.access.shards import unshard
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import evaluations

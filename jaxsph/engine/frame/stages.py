@@ -16,20 +16,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.extents import slab_extents
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
-from jaxsph.engine.access.shards import shard, shard_of_grid
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
 from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.cast.march import RayResult
-from jaxsph.engine.control.adapt import ControlPlan, adapt
+from jaxsph.engine.control.adapt import ControlPlan, adapt, probe
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
-from jaxsph.engine.control.probe import probe
 from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.engine.field.lattice import Lattice, region_of, sum_shards
 from jaxsph.engine.field.nodes import sum_at_nodes

@@ -22,12 +22,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.cover import cover_of, over_groups
-from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.interpolation import interpolate_slabs
 from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.nodes import gather_subsampled
-from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import Sums, by_rays, least_weight
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxsph.engine.access.extents import SlabExtents
+from jaxsph.engine.access.grid import SlabExtents
 from jaxsph.engine.access.macrocells import Occupancy
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.volume import Volume

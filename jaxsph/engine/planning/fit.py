@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.engine.access.host_sorting import depth_order
+from jaxsph.engine.access.host_lists import depth_order
 from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import FrameShape, Plan, choose, fitted, fitting, next_class
 from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene

@@ -19,11 +19,10 @@ from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.field.lattice import FINEST, Spacing
-from jaxsph.engine.planning.measures import Measures
-from jaxsph.engine.planning.memory_estimate import frame_bytes, quadtree_bytes
+from jaxsph.engine.planning.measures import Measures, frame_bytes, quadtree_bytes
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
-from jaxsph.engine.screen.quadtree import QuadtreePlan
+from jaxsph.engine.screen.pyramid import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class

@@ -12,7 +12,7 @@ from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.access.extents import slab_extents
+from jaxsph.engine.access.grid import slab_extents
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.field.schedule import full_rate
 from jaxsph.engine.screen.packets import every_bundle

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.access.host_sorting import entries_at, sorted_order
+from jaxsph.engine.access.host_lists import entries_at, sorted_order
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.engine.runtime.tuning import CPU

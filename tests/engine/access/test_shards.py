@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.access.shards import shard, shard_of_grid, unshard
+from jaxsph.engine.access.grid import shard, shard_of_grid, unshard
 from jaxsph.engine.control.adapt import ControlPlan
 
 MANY = 8

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, nodes_between
-from jaxsph.engine.frame.host_stages import MAKE_GRID, ORDER
+from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Clock
 from jaxsph.engine.runtime.tuning import CPU

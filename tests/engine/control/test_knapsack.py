@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.control.knapsack import select_under_budget
+from jaxsph.engine.control.spacing import select_under_budget
 
 CHOICES, BUNDLES = 12, 5
 take = jax.jit(select_under_budget)

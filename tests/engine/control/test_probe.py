@@ -10,7 +10,7 @@ import pytest
 from derivatives import QUICKLY
 
 import jaxsph as js
-from jaxsph.engine.control.probe import MIN_PROMISING_SHARE, probe
+from jaxsph.engine.control.adapt import MIN_PROMISING_SHARE, probe
 from jaxsph.engine.control.ranges import tables_of_parts
 
 

@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import FORMS, SAMPLES, drawn
 
-from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.piercing import Piercing
-from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 
 KERNELS = "poly6", "cubic_spline", "wendland_c2"

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.access.extents import SlabExtents
+from jaxsph.engine.access.grid import SlabExtents
 from jaxsph.engine.access.macrocells import MACROCELL, MacrocellRanges, Occupancy
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.volume_grid import VolumeGrid

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.screen.estimators import allowed, leaf_errors
+from jaxsph.engine.screen.canvas import allowed, leaf_errors
 from jaxsph.engine.screen.pyramid import places
 
 SHAPE, SIDE = (65, 49), 8

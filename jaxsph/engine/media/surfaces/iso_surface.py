@@ -10,6 +10,7 @@ a few steps of false position (the Illinois form: Dahlquist & Bjoerck 1974, sect
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -20,19 +21,47 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.surfaces.headlight import OPAQUE, headlight, square_of
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_shape
-from jaxsph.numerics.extremes import clamped
+from jaxsph.numerics.extremes import clamped, greater
 from jaxsph.numerics.trees import tree
 
+OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
 POLISHED = 2  # steps of Newton's after those: the last has the derivatives, and they are as good as the root before it
 Coordinates = list[Float[Array, "tasks samples rays"]]
+
+
+def headlight(
+    normal: Sequence[Float[Array, "..."]],
+    ray: Sequence[Float[Array, "..."]],
+    ambient: Float[Array, ""],
+    light: Float[Array, "3"] | None = None,
+) -> Float[Array, "..."]:
+    """Ambient light, and the light that a surface faces with the side that is seen (Lambert); where it faces nowhere, all of it.
+
+    Args:
+        normal, ray: x, y and z of a vector across the surface and of one along the ray, of any lengths.
+        ambient: share of the light that a surface has which is seen edge on.
+        light: x, y and z of a vector of unit length towards a light far away; None for a light at the eye.
+    """
+    along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
+    square = square_of(normal) * square_of(ray)
+    if light is None:
+        facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
+        return ambient + (1 - ambient) * facing
+    square, towards = square_of(normal), normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+    towards = greater(0, jnp.where(along > 0, -towards, towards))
+    return ambient + (1 - ambient) * jnp.where(square > 0, towards * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
+
+
+def square_of(vector: Sequence[Float[Array, "..."]]) -> Float[Array, "..."]:
+    """Of its length."""
+    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 @tree()

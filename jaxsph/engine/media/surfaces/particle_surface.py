@@ -29,13 +29,12 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of
 from jaxsph.engine.field.crossing import Bracket, Cut, at_crossings, first_crossings
-from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.piercing import Found, Piercing
-from jaxsph.engine.field.scattered import gather_scattered
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, columns_of
-from jaxsph.engine.media.surfaces.headlight import OPAQUE
+from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
 from jaxsph.engine.media.surfaces.root import Root, SurfaceLook, pull_root, root_near
 from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip

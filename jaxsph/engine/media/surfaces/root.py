@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.crossing import Bracket
 from jaxsph.engine.field.piercing import Found, Piercing
-from jaxsph.engine.media.surfaces.headlight import headlight
+from jaxsph.engine.media.surfaces.iso_surface import headlight
 from jaxsph.model.medium import COLORS
 from jaxsph.model.transfer.function import Segments, find, read
 from jaxsph.numerics.extremes import clamped

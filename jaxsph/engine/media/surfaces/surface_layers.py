@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.field.crossing import all_crossings
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.surfaces.headlight import OPAQUE
+from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Place, SurfaceCotangents
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import OfPlaces, Stops
