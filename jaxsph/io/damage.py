@@ -61,10 +61,8 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:
         reason = " ".join(str(error).split()) or "no further reason given"
-        raise ValueError(
-            f"{path}: cannot be read as {source} ({type(error).__name__}: {reason}); the file is probably cut short, "
-            f"damaged or of another format: copy it again, or write it again from its source"
-        ) from error
+        wrong = f"{path}: cannot be read as {source} ({type(error).__name__}: {reason}); the file is probably cut short,"
+        raise ValueError(f"{wrong} damaged or of another format: copy it again, or write it again from its source") from error
 
 
 def regular_file(path: str | os.PathLike[str]) -> Path:

@@ -143,10 +143,8 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
     Raises `ValueError`: there is something left.
     """
     if left > 0:
-        raise DataError(
-            f"has {left} more {unit} than {what} and what its header announces: one of them is damaged, so that what is "
-            f"read may be shifted; copy it again, or write it again from its source"
-        )
+        wrong = f"has {left} more {unit} than {what} and what its header announces: one of them is damaged,"
+        raise DataError(f"{wrong} so that what is read may be shifted; copy it again, or write it again from its source")
 
 
 def choose_type(present: Sequence[int], part_type: int | None) -> int:

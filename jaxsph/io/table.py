@@ -195,10 +195,8 @@ def scalar_of_width_one(column: np.ndarray) -> np.ndarray:
 def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:
     column = scalar_of_width_one(native(np.asarray(column)))
     if column.ndim not in (1, 2) or len(column) != count:
-        raise DataError(
-            f"column `{name}` has shape {column.shape}, but there are {count} particles; "
-            f"a column must be (N,) or (N, k): leave it out, or write the file again"
-        )
+        wrong = f"column `{name}` has shape {column.shape}, but there are {count} particles;"
+        raise DataError(f"{wrong} a column must be (N,) or (N, k): leave it out, or write the file again")
     if column.ndim == 2 and not 1 <= column.shape[1] <= MAX_COMPONENTS:
         raise DataError(
             f"column `{name}` has shape {column.shape}, but must have 1 to {MAX_COMPONENTS} numbers a particle; leave it out"

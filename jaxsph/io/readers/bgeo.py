@@ -62,10 +62,8 @@ def _opened(path: Path) -> IO[bytes]:
 def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]], int, bool]:
     """Number of points, record layout (position first), the offset of the first record, and whether nothing else follows."""
     if content[:5] != b"BgeoV":
-        raise DataError(
-            "is not a classic bgeo file (it does not begin with `BgeoV`); newer Houdini files must be saved as "
-            "`.bgeo` version 5 (classic)"
-        )
+        wrong = "is not a classic bgeo file (it does not begin with `BgeoV`);"
+        raise DataError(f"{wrong} newer Houdini files must be saved as `.bgeo` version 5 (classic)")
     version, count, *others, num_attributes, _, _, num_details = struct.unpack_from(">9i", content, 5)
     if version != 5:
         raise DataError(f"has bgeo version {version}; only version 5 is known: save it as classic bgeo")
@@ -118,7 +116,5 @@ def _refuse_overwritten(position: np.ndarray, columns: dict[str, np.ndarray]) ->
         subnormal = (coordinate != 0) & (np.abs(coordinate) < SMALLEST_NORMAL)
         if twin is not None or subnormal.mean() > 0.5:
             same = f"the attribute `{twin}`" if twin is not None else "integers"
-            raise DataError(
-                f"its {axis} coordinates were overwritten by {same}, and cannot be recovered (a simulator does so when "
-                f"an attribute, such as `id`, is requested twice): request it once and export again"
-            )
+            wrong = f"its {axis} coordinates were overwritten by {same}, and cannot be recovered (a simulator does so when"
+            raise DataError(f"{wrong} an attribute, such as `id`, is requested twice): request it once and export again")

@@ -159,10 +159,8 @@ def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[
         return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
     kernel = _swift_kernel(file)
     if kernel not in SWIFT_KERNELS:
-        raise DataError(
-            f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`); the support radius is known "
-            f"for {', '.join(SWIFT_KERNELS)}"
-        )
+        wrong = f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`);"
+        raise DataError(f"{wrong} the support radius is known for {', '.join(SWIFT_KERNELS)}")
     stated = (number_of(file[part].attrs, "Dimension") for part in ("HydroScheme", "Header") if part in file)
     dimensions = next((int(number) for number in stated if number in (1, 2, 3)), 3)
     gamma = SWIFT_KERNELS[kernel][1][dimensions - 1]
@@ -205,10 +203,8 @@ def _refuse_other_count(header: Any, chosen: int, count: int) -> None:
     """A file that was rewritten in part, or not to its end, says so here alone."""
     told = numbers_of(header, "NumPart_ThisFile")
     if chosen < len(told) and told[chosen] != count:
-        raise DataError(
-            f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g}; copy it again, "
-            f"or correct that number if rows were added or left out on purpose"
-        )
+        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g};"
+        raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
 
 
 def _is_periodic(file: Any) -> bool:

@@ -36,10 +36,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             return hdf5_dump.from_hdf5(file, part_type)
         stored = next((name for want in POSITION_NAMES for name in file if plain(name) == want), None)
         if stored is None:
-            raise DataError(
-                f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget, SWIFT), "
-                f"`particles` and `header` (Phantom), or a dataset `Coordinates`"
-            )
+            wrong = f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget,"
+            raise DataError(f"{wrong} SWIFT), `particles` and `header` (Phantom), or a dataset `Coordinates`")
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         position = read_positions(file[stored])

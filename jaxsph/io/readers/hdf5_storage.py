@@ -128,10 +128,8 @@ def refuse_unwritten(dataset: Any) -> None:
         written = dataset.id.get_num_chunks()
         chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
         if written < chunks:
-            raise DataError(
-                f"{what}, but only {written} of its {chunks} chunks were ever written: "
-                f"the others would be read as {dataset.fillvalue}; write the file again, or copy it again"
-            )
+            wrong = f"{what}, but only {written} of its {chunks} chunks were ever written:"
+            raise DataError(f"{wrong} the others would be read as {dataset.fillvalue}; write the file again, or copy it again")
     if needed > stored * _most_per_byte(dataset):
         again = "write the file again, or copy it again"
         raise DataError(f"{what}, which needs {needed} bytes, but only {stored} were ever written; {again}")
@@ -162,10 +160,8 @@ def _refuse_short_storage(dataset: Any, needed: int) -> None:
         path, part = _raw_file(dataset, name), min(size, left)
         there = path.stat().st_size
         if there < offset + part:
-            raise DataError(
-                f"`{dataset.name}` lies in `{name}`, which must have {offset + part} bytes and has {there}: the others would be "
-                f"read as zeros; copy that file again"
-            )
+            wrong = f"`{dataset.name}` lies in `{name}`, which must have {offset + part} bytes and has {there}:"
+            raise DataError(f"{wrong} the others would be read as zeros; copy that file again")
         left -= part
     if left > 0:
         raise DataError(f"`{dataset.name}` needs {needed} bytes, {left} of which lie nowhere; write the file again")
@@ -221,10 +217,8 @@ def _refuse_gaps(dataset: Any) -> None:
         told = f"has shape {dataset.shape}, but is a view of {numbers} numbers only"
         raise DataError(f"`{dataset.name}` {told}; write the file again")
     if not _all_covered([_block(dataset, space) for space in spaces if space.get_select_npoints()], dataset.shape):
-        raise DataError(
-            f"`{dataset.name}` is a view that shows some data sets twice, and has parts that show none: these would be read as "
-            f"{dataset.fillvalue}; write the file again"
-        )
+        wrong = f"`{dataset.name}` is a view that shows some data sets twice, and has parts that show none:"
+        raise DataError(f"{wrong} these would be read as {dataset.fillvalue}; write the file again")
 
 
 def _has_all(there: tuple[int, ...], mapping: Any) -> bool:

@@ -111,10 +111,8 @@ def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Array:
     most = entry.compress_size * (1 if entry.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO)
     if entry.file_size > most:
-        raise DataError(
-            f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can; "
-            f"it is damaged: copy it again"
-        )
+        wrong = f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can;"
+        raise DataError(f"{wrong} it is damaged: copy it again")
     with archive.open(entry) as stream:
         shape, is_fortran, dtype = array_header(stream)
         held = entry.file_size - stream.tell()

@@ -175,10 +175,8 @@ def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:
     kept = [value.is_integer() and int(value) == number for number, value in zip(whole, values.tolist(), strict=True)]
     lost = next((words[row] for row, number in enumerate(whole) if number is not None and not kept[row]), None)
     if lost is not None:
-        raise DataError(
-            f"has the whole number {lost[:40]} in the column `{name}`, which float64 cannot hold and 64 bits only in a column of "
-            f"whole numbers: write ids as such, and quantities with a decimal point"
-        )
+        wrong = f"has the whole number {lost[:40]} in the column `{name}`, which float64 cannot hold and 64 bits only"
+        raise DataError(f"{wrong} in a column of whole numbers: write ids as such, and quantities with a decimal point")
     return values
 
 

@@ -143,10 +143,8 @@ class Decoder:
             raise DataError(f"announces more data than its {self.file_bytes} bytes can hold, so it is damaged; write it again")
         values = self._values(element, dtype, need, name) if count else np.zeros(0, dtype)
         if width < 1 or len(values) != count * width:
-            raise DataError(
-                f"has {len(values)} numbers of `{name}`, but {count} points of {width} components each; "
-                f"it is cut short or damaged: copy it again"
-            )
+            wrong = f"has {len(values)} numbers of `{name}`, but {count} points of {width} components each;"
+            raise DataError(f"{wrong} it is cut short or damaged: copy it again")
         return values.reshape(count, width)
 
     def _values(self, element: ElementTree.Element, dtype: np.dtype, need: int, name: str) -> np.ndarray:

@@ -237,10 +237,8 @@ def _unit(name: str, column: np.ndarray) -> np.ndarray:
     wrong = (values < 0) | (values > (BYTE if are_bytes else 1))
     if wrong.any():
         row = int(np.argwhere(wrong)[0, 0])
-        raise DataError(
-            f"column `{name}` must be in [0, 1], or whole numbers from 0 to {BYTE}, "
-            f"got {values[wrong].flat[0]:g} in row {row + 1}"
-        )
+        what = f"column `{name}` must be in [0, 1], or whole numbers from 0 to {BYTE},"
+        raise DataError(f"{what} got {values[wrong].flat[0]:g} in row {row + 1}")
     return values / BYTE if are_bytes else values
 
 

@@ -186,10 +186,8 @@ def _refuse_too_many_pairs(tree: scipy.spatial.KDTree, points: np.ndarray, radii
     some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
     reached = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
     if reached * len(points) > MAX_PAIRS:
-        raise DataError(
-            f"supports reach about {reached:.0f} particles each, {reached * len(points):.0f} pairs in all, and a kernel sum "
-            f"over them would take hours; give smaller supports, or check their unit"
-        )
+        wrong = f"supports reach about {reached:.0f} particles each, {reached * len(points):.0f} pairs in all,"
+        raise DataError(f"{wrong} and a kernel sum over them would take hours; give smaller supports, or check their unit")
 
 
 def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:

@@ -85,10 +85,8 @@ def along_axes(
     shares = abs(steps) / lengths
     axis = shares.argmax(0)
     if sorted(axis) != [0, 1, 2] or (np.sort(shares, 0)[:2] > SKEW).any():
-        raise DataError(
-            f"has oblique axes (directions {(steps / lengths).T.round(6).tolist()}), and a volume's axes lie along x, y and z; "
-            "resample it onto such a grid first"
-        )
+        wrong = f"has oblique axes (directions {(steps / lengths).T.round(6).tolist()}),"
+        raise DataError(f"{wrong} and a volume's axes lie along x, y and z; resample it onto such a grid first")
     order, lower = np.argsort(axis), origin.copy()
     shape = next(iter(arrays.values())).shape
     flips = tuple(int(k) for k in range(3) if steps[axis[k], k] < 0)

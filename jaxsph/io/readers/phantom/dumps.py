@@ -63,10 +63,8 @@ class Dump:
         h = self.h
         unknown = np.isnan(h)  # only `h <= 0` marks the dead; what is no number was damaged, or written so by a run that failed
         if unknown.any():
-            raise DataError(
-                f"smoothing lengths `h` must be numbers, but {int(unknown.sum())} of {len(h)} are NaN, the first at index "
-                f"{int(np.argmax(unknown))}; remove these particles, or dump it again"
-            )
+            wrong = f"smoothing lengths `h` must be numbers, but {int(unknown.sum())} of {len(h)} are NaN,"
+            raise DataError(f"{wrong} the first at index {int(np.argmax(unknown))}; remove these particles, or dump it again")
         said, alive = [*self.left_out], h > 0
         if not alive.all():
             said.append(f"dropped {int((~alive).sum())} dead or accreted particles (h <= 0)")

@@ -69,10 +69,8 @@ class Records:
             stop = self.at + 4 + abs(head)
             tail = self._length_at(stop, what)
             if tail != (-abs(head) if parts else abs(head)):
-                raise DataError(
-                    f"is damaged: the record of {what} at byte {self.at} begins with length {head} and ends with {tail}; "
-                    f"copy it again"
-                )
+                wrong = f"is damaged: the record of {what} at byte {self.at} begins with length {head} and ends with {tail};"
+                raise DataError(f"{wrong} copy it again")
             parts.append(self.content[self.at + 4 : stop])
             self.at, more = stop + 4, head < 0
         found = parts[0] if len(parts) == 1 else np.concatenate(parts)
