@@ -30,6 +30,8 @@ from jaxsph.io.table import plain
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
+MAX_CHUNK = 2**27
+"""Bytes of a chunk that may be larger than its data set, which grows."""
 MAX_PIECES = 2**24
 """Of a view: about as many as parts of a snapshot, squared at worst."""
 COPY = "write its numbers into one file"
@@ -125,6 +127,9 @@ def refuse_unwritten(dataset: Any) -> None:
         return _refuse_short_storage(dataset, needed)
     what, stored = f"`{dataset.name}` has shape {dataset.shape}", dataset.id.get_storage_size()
     if dataset.chunks is not None:
+        unpacked = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        if unpacked > max(needed, MAX_CHUNK):
+            raise DataError(f"{what}, but chunks of {unpacked} bytes, each unpacked as a whole; write it in smaller ones")
         written = dataset.id.get_num_chunks()
         chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
         if written < chunks:

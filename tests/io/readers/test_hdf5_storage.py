@@ -1,5 +1,7 @@
 """Data of a data set that lies in other files is there, all of it, or the data set is refused: nothing is read as zeros."""
 
+import zlib
+
 import numpy as np
 import pytest
 
@@ -145,3 +147,18 @@ def test_raw_bytes_are_not_read_from_anywhere(tmp_path, monkeypatch):
             io.read_table(write_raw(tmp_path / "inner", name))
     with pytest.raises(ValueError, match=r"and there is no .*gone\.bin; start the program in the folder"):
         io.read_table(write_raw(tmp_path / "inner", "gone.bin"))
+
+
+@pytest.mark.parametrize(("rows", "refused"), [(2**26, True), (2**20, False)])
+def test_no_chunk_is_unpacked_that_is_far_larger_than_its_data_set(rows, refused, samples, tmp_path, measured):
+    samples.write_points(tmp_path / "a.hdf5", samples.particles())
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        made = file.create_dataset("heat", (7,), "f8", maxshape=(None,), chunks=(rows,), compression="gzip")
+        made.id.write_direct_chunk((0,), zlib.compress(bytes(8 * 2**20)))
+    with measured() as memory:
+        if refused:
+            with pytest.raises(ValueError, match=r"a\.hdf5: `/heat` .* chunks of 536870912 bytes"):
+                io.read_table(tmp_path / "a.hdf5")
+        else:
+            assert io.read_table(tmp_path / "a.hdf5").columns["heat"].tolist() == [0.0] * 7
+    assert memory.peak < 2**23
