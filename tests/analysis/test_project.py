@@ -383,3 +383,14 @@ def test_amounts_over_an_area_that_float32_cannot_hold_are_refused(tmp_path):
     image.save(tmp_path / "a.exr")
     found = js.io.read_projection(tmp_path / "a.exr")
     assert float(found.pixel_area) == float(image.pixel_area) > 1e45 and float(found.total()) == pytest.approx(1e43, rel=1e-4)
+
+
+def test_particles_beside_the_picture_are_no_fault():
+    """The only ones that no depth cuts, and all there are."""
+    position = np.array([[0, 0, 0.9], [0.2, 0.1, -0.9], [5, 0, 0.1]])
+    particles = js.Particles.from_arrays(position, 0.5, [1.0, 2.0, 3.0], kernel="cubic_spline")
+    for middle, there in ((0.0, True), (30.0, False)):
+        for pixel in ("mean", "ray"):
+            camera = js.Camera.orthographic((middle, 0, 3), (middle, 0, 0), view_height=1.5, near=2.2, far=3.8, **SIZE)
+            found = np.asarray(js.project(particles, camera, of=np.ones(3), pixel=pixel).values)
+            assert np.isfinite(found).all() and (found.max() > 0) == there

@@ -1,5 +1,7 @@
 """The command `project`: what it projects, that it is what the library has, and how it refuses."""
 
+import dataclasses
+
 import commanded
 import numpy as np
 import pytest
@@ -218,3 +220,13 @@ def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code
         assert header["CUNIT1"] == "cm" and abs(header["CRVAL1"] / 1e21 - 1) < 0.2
         np.testing.assert_allclose(found[0].data, code_unit * raw.astype(np.float64)[::-1], rtol=1e-6)
         assert (units.Unit(header["BUNIT"]) == units.Unit(unit)) if unit else "BUNIT" not in header
+
+
+def test_columns_of_all_there_is_are_those_of_a_camera_without_depths(file, capsys):
+    """One of `read_scene` has the depths of its picture."""
+    found, _ = values(capsys, file, "--center", "0.5,0.5,0.5", "--width", "0.4")
+    scene, camera = io.read_scene(file, view="z", center=(0.5, 0.5, 0.5), width=0.4, size=(18, 12))
+    whole = js.project(scene.particles, dataclasses.replace(camera, near=None, far=None), of=columns()["mass"])
+    np.testing.assert_allclose(whole.values, found, rtol=1e-4)
+    cut = js.project(scene.particles, camera, of=columns()["mass"])
+    assert float(cut.total()) < 0.9 * float(whole.total())

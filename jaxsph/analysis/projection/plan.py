@@ -156,8 +156,9 @@ def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> P
         particles = particles.wrapped()
     placed = placed_by(particles, camera)
     counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in bare.rules]  # type: ignore[arg-type]
+    there = [bool(WANTED[n](placed).any()) for n, _ in bare.rules]  # be it beside the picture
     while True:
-        lists = [_lists(one, camera, bands) for one in counts]
+        lists = [_lists(one, camera, bands) if some else None for one, some in zip(counts, there, strict=True)]
         made = dataclasses.replace(bare, bands=bands, rays=lists[-1], shares=lists[0] if pixel == "mean" else None)
         needed = _bytes(made)
         if needed <= limit and all(one is None or one.list_capacity <= MAX_CAPACITY for one in lists):
@@ -208,12 +209,10 @@ def _larger(one: ListPlan | None, other: ListPlan | None) -> ListPlan | None:
     return dataclasses.replace(one, tile_capacity=tiles, list_capacity=pairs)
 
 
-def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan | None:
+def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan:
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
     pairs = [fullest_band(counts, of_band) for counts in (counted.tile_pairs, counted.bundle_pairs)]
-    if pairs[0] == 0:
-        return None
     return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
 
 

@@ -65,7 +65,7 @@ def project(
 
     Args:
         particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.
-        camera: where from, how large the image is, and the depths that rays begin and end at.
+        camera: where from, how large the image is, and the depths that rays begin and end at; where they are None, all there is.
         of: numbers of all particles in their order, or `"volume"` or `"quantity"`. Without weight the amounts $a_j$, default the
             volumes (true ones, which give the path length inside); with weight the values $q_j$, default the quantity.
         weight: the weights $w_j$, as for `of`: masses or volumes. Not negative.
