@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -15,7 +16,7 @@ from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.lattice import FINEST, GAP, REACH, Region, Spacing, region_of
 from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
-from jaxsph.engine.field.schedule import SUBSAMPLE, full_rate
+from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE, full_rate
 from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.particles import kernels
 
@@ -63,6 +64,24 @@ def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spa
         assert (found != 0).sum() == (found[kept] != 0).sum(), "margins are zero"
         np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
     assert weight.max() > 0
+
+
+@pytest.mark.parametrize("samples", [3, 16, 40])
+@pytest.mark.parametrize("slab_samples", [4, 16])
+def test_the_widest_stencil_of_the_last_slab_lies_in_the_lattice(frames, stages, slab_samples, samples):
+    """Where all are read at once, for accelerators, a shorter lattice would have them moved."""
+    few, rng = dataclasses.replace(frames, samples=samples), np.random.default_rng(0)
+    plan, region = few.plan(slab_samples), Region(jnp.int32(0), jnp.int32(0), 4, 4, FINEST)
+
+    camera = few.camera(rng)
+    grid, _ = stages.eval_shape(few.scene(rng).particles, camera, plan=plan)
+
+    def lattice(grid, camera):
+        return sum_at_nodes(grid, camera, "poly6", slab_samples, region, (jnp.float32(0.4),), 16)
+
+    layers = jax.eval_shape(lattice, grid, camera).weight.shape[0]
+    within, last = slab_samples // FINEST.samples, -(-samples // slab_samples) - 1
+    assert REACH + last * within - 1 + (within << MAX_SPACING_LEVEL) + 3 <= layers
 
 
 @pytest.mark.slow
