@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
-from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, looked, pulled, total, towards, weights
+from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, looked, pulled, total, towards, valued, weights
 from examples import examples
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -68,6 +68,34 @@ def check(inputs, named, cotangent, asked, plan):
     slope, size = along(gradient, move)
     assert slope == pytest.approx(difference, rel=RTOL, abs=CLOSE * (1 + size))
     assert pushed == pytest.approx(slope, abs=AGREE * (1 + size))
+
+
+def ending_on_samples(rng, camera, gap):
+    """Particles whose supports end within a share `gap` of them from a sample: where a power of that is what a sample weighs."""
+    u = np.asarray(camera.column(rng.integers(0, camera.width, CAPACITY) + 0.5))
+    v = np.asarray(camera.row(rng.integers(0, camera.height, CAPACITY) + 0.5))
+    depth = np.asarray(camera.depth(rng.integers(0, SETTINGS.samples + 1, CAPACITY).astype(np.float32), SETTINGS.samples))
+    way, support = rng.normal(size=(CAPACITY, 3)), rng.uniform(0.1, 0.6, CAPACITY)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    view = np.stack([u, v, depth], 1) + (support * (1 - gap))[:, None] * way
+    position = view @ np.asarray(camera.axes) + np.asarray(camera.eye)
+    columns = position, support, rng.uniform(0, 1, CAPACITY), rng.uniform(0.1, 1, CAPACITY)
+    return js.Particles.from_arrays(*(column.astype(np.float32) for column in columns), "wendland_c6")
+
+
+@examples(8)
+@given(seed=st.integers(0, 2**32 - 1), exponents=st.lists(st.floats(-7, -2), min_size=CAPACITY, max_size=CAPACITY))
+def test_gradients_are_finite_where_a_sample_weighs_next_to_nothing(seed, exponents):
+    """Of the kernel that falls off steepest, in float32: the eighth power of 1e-4 is a number, its square is none."""
+    rng = np.random.default_rng(seed)
+    camera = js.Camera.orthographic((0, 0, 3), (0, 0, 0), view_height=2.0, width=8, height=6, near=2, far=4)
+    colors, extinction = rng.uniform(0, 1, (5, 3)).astype(np.float32), rng.uniform(0, 8, 5).astype(np.float32)
+    look = js.TransferFunction.from_points(np.linspace(0, 1, 5, dtype=np.float32), colors, extinction)
+    scene = js.Scene(particles=ending_on_samples(rng, camera, 10.0 ** np.array(exponents)), transfer=look)
+    value, gradient = valued((scene, camera), jnp.asarray(rng.normal(size=(6, 8, 4)), jnp.float32), SETTINGS, PLAN)
+    assert np.isfinite(value)
+    for leaf in jax.tree.leaves(gradient):
+        assert leaf.dtype == jax.dtypes.float0 or np.isfinite(np.asarray(leaf)).all()
 
 
 @pytest.mark.slow

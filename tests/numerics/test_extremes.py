@@ -1,4 +1,4 @@
-"""Minimum and maximum are those of numpy, and their derivatives ask which number is larger, never which the result equals."""
+"""Minimum, maximum and ratio are those of numpy; derivatives ask which number is larger, and square no divisor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.extremes import LEAST, clamped, greater, lesser, ratio
 
 NUMBERS = st.floats(width=32, allow_nan=False)
 
@@ -44,3 +44,23 @@ def test_no_derivative_asks_whether_two_numbers_are_equal(which):
     assert " eq " not in str(asked)
     towards_a, towards_b = jax.jit(jax.grad(which, (0, 1)))(0.5, 2.0)
     assert (float(towards_a), float(towards_b)) == ((0, 1) if which is greater else (1, 0))
+
+
+@given(st.floats(2**-10, 1, width=32), st.sampled_from([-1, 1]), st.floats(-96, 30))
+def test_derivatives_of_ratios_are_right_where_squares_of_divisors_underflow(share, sign, exponent):
+    """In both modes, to some eps: a sum of weights near the end of a support may be 1e-30, and what it divides as small."""
+    whole = np.float32(2**exponent)
+    part = np.float32(sign * share) * whole
+    found, pull = jax.vjp(ratio, part, whole)
+    exact = np.float64(part) / np.float64(whole)
+    wanted = 1 / np.float64(whole), -exact / np.float64(whole)
+    assert found == part / whole
+    np.testing.assert_allclose(pull(jnp.float32(1)), wanted, rtol=1e-6)
+    np.testing.assert_allclose(jax.jvp(ratio, (part, whole), (whole, whole))[1], 1 - exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("whole", [0.0, -1.0, np.nan, 1e-38, LEAST * np.finfo(np.float32).tiny])
+def test_what_is_divided_by_next_to_nothing_has_no_derivatives(whole):
+    part, whole = jnp.float32(1e-37), jnp.float32(whole)
+    np.testing.assert_array_equal(jax.grad(ratio, (0, 1))(part, whole), (0, 0))
+    assert np.isfinite(ratio(part, whole))

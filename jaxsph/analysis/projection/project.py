@@ -37,6 +37,7 @@ from jaxsph.model.particles.periodic import between_faces, past_faces, runs_thro
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
+from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.given import in_unit
@@ -141,8 +142,7 @@ def _image(sums: Float[Array, "height width channels"], held: Held, camera: Came
     values, weight = sums[..., 0], None
     if held.is_mean:
         weight = sums[..., 1]
-        there = weight > 0
-        values = jnp.where(there, values / jnp.where(there, weight, 1), jnp.nan)
+        values = jnp.where(weight > 0, ratio(values, weight), jnp.nan)
         weight = times(weight, held.exponents[1] + 2 * digits)
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
     image = Projection(times(values, first), weight, area, camera.is_perspective)

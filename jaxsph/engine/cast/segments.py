@@ -32,7 +32,7 @@ from jaxsph.engine.cast.samples import emitted, transmitted
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
-from jaxsph.numerics.extremes import clamped
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
 
 EXTINCTION = slice(3, 4)
@@ -126,9 +126,7 @@ def extrapolated(
 
 def colors_of(emission: Optics, extinction: Float[Array, "tasks intervals rays"]) -> Optics:
     """Mean colours, by extinction; none where there is nothing."""
-    filled = extinction > 0
-    divisor = jnp.where(filled, extinction, 1)
-    return [jnp.where(filled, clamped(value / divisor, 0, 1), 0) for value in emission]
+    return [clamped(ratio(value, extinction), 0, 1) for value in emission]
 
 
 def _extinction(medium: Medium, intervals: Any, task: SlabTask) -> Array:

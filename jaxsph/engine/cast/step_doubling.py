@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
-from jaxsph.numerics.extremes import greater, lesser
+from jaxsph.numerics.extremes import greater, lesser, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 
 SHORTEST = 1 / 256  # of a sample: the least step, which is accepted whatever it differs by
@@ -209,6 +209,5 @@ def _light(
 ) -> tuple[Float[Array, "3 rays"], Float[Array, " rays"]]:
     """Colour and optical thickness between two points: extinction linear, colour their mean by extinction."""
     *emission, thickness = 0.5 * path * (near + far)
-    filled = thickness > 0
-    share = jnp.where(filled, -jnp.expm1(-thickness) / jnp.where(filled, thickness, 1), 1)  # of emission, what gets out
+    share = jnp.where(thickness > 0, ratio(-jnp.expm1(-thickness), thickness), 1)  # of emission, what gets out
     return jnp.stack(emission) * share, thickness

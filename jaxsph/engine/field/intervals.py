@@ -26,7 +26,7 @@ from jaxsph.engine.field.cover import Cover
 from jaxsph.engine.field.tasks import Part
 from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import slope_in_middle
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
 
 LIGHT, EXTINCTION = range(4), 3  # channels: red, green, blue, extinction
 BESIDE = 1e-3  # of an interval that rounding may move a border out of it
@@ -47,11 +47,9 @@ class Intervals(NamedTuple):
         if part is None:
             return self
         begin, end = greater(ahead, part.begin), lesser(ahead + self.share, part.end)
-        inverse = jnp.where(self.share > 0, 1 / jnp.where(self.share > 0, self.share, 1), 0)
+        inverse = ratio(1.0, self.share)
         near, far = (self.near + clamped((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
-        hull = part.end - part.begin
-        filled = jnp.where(hull > 0, part.share / jnp.where(hull > 0, hull, 1), 0)
-        return Intervals(near, far, greater(0, end - begin) * filled)
+        return Intervals(near, far, greater(0, end - begin) * ratio(part.share, part.end - part.begin))
 
 
 def intervals_of(
@@ -75,7 +73,7 @@ def intervals_of(
     slack = BESIDE * length
     begins = (front >= begin - slack) & (front <= end + slack)
     ends = (back >= begin - slack) & (back <= end + slack)
-    inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 0)
+    inverse = ratio(1.0, length)
     ahead = jnp.where(begins, clamped((front - begin) * inverse, 0, 1), jnp.where(first, 0, 0.5))
     past = jnp.where(ends, clamped((end - back) * inverse, 0, 1), jnp.where(second, 0, 0.5))
     ahead, past = jnp.where(first, 0, ahead), jnp.where(second, 0, past)

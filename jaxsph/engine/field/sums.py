@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 from jaxsph.numerics.fusion import barriers_kept
 from jaxsph.numerics.trees import tree
 
-MIN_WEIGHT = 2.0**20  # times the least normal number
 REDUCED = 2  # quantities whose sums, of weights among them, are reduced rather than carried
 
 
@@ -99,8 +98,3 @@ def by_rays(sums: Sums) -> list[Float[Array, "tasks samples rays"]]:
     """The sum of weights and those of quantities, rays in a row: short rows do not vectorise."""
     rows = tuple(value.reshape(*value.shape[:2], -1) for value in sums.packed)
     return list(dataclasses.replace(sums, packed=rows).all)
-
-
-def least_weight(dtype: Any) -> float:
-    """The sum of weights below which a sample has no cotangents, as one over it could overflow."""
-    return float(MIN_WEIGHT * jnp.finfo(dtype).tiny)

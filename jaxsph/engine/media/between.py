@@ -19,12 +19,12 @@ from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.cover import Cover, Ends, Lines, ends_of, over_groups
 from jaxsph.engine.field.fetch import particle_at
 from jaxsph.engine.field.intervals import BESIDE, EXTINCTION, Intervals, intervals_of, looked_up, means_by
-from jaxsph.engine.field.sums import Sums, by_rays, least_weight
+from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH
 from jaxsph.engine.lookups.means import MeanTables, mean_light
 from jaxsph.model.transfer.function import Segments, TransferFunction
-from jaxsph.numerics.extremes import greater, lesser
+from jaxsph.numerics.extremes import greater, lesser, ratio
 
 GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives
 
@@ -90,12 +90,9 @@ def missed_thickness(gathered: SumsBetween, task: SlabTask, tables: MeanTables) 
 def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) -> list[Intervals]:
     weight, *several = sums
     covers = [cover, cover._replace(of_front=cover.others[0], of_back=cover.others[1])] if cover.others else [cover]
-    inside, solid = weight > 0, weight > least_weight(weight.dtype)
     found = []
     for weighted, own, of_entry in zip(several, covers, task.entry.references, strict=True):
-        still = jax.lax.stop_gradient(weighted) / jnp.where(inside, jax.lax.stop_gradient(weight), 1)
-        ratio = jnp.where(inside, jnp.where(solid, weighted / jnp.where(solid, weight, 1), still), 0)
-        near, far, share = intervals_of(ratio, inside, own, depth, task.part)
+        near, far, share = intervals_of(ratio(weighted, weight), weight > 0, own, depth, task.part)
         reference = of_entry[:, None, None]
         found.append(Intervals(reference + near, reference + far, share))
     return found

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.medium import Medium, OfPlaces, Stops
+from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "..."]]
@@ -160,8 +161,7 @@ def mixed_colors(colors: list[Optics], extinctions: Optics, path: Float[Array, "
     weights, total = extinctions, mixed_extinction(extinctions)
     if path is not None:
         weights, total = [_opacity(extinction, path) for extinction in extinctions], _opacity(total, path)
-    divisor = jnp.where(total > 0, total, 1)  # divided by, not multiplied with one over it: one alone is to have a share of 1
-    shares = [jnp.where(total > 0, weight / divisor, 0) for weight in weights]
+    shares = [ratio(weight, total) for weight in weights]
     weighed = [[share * color for color in of_one] for share, of_one in zip(shares, colors, strict=True)]
     return [mixed_extinction(list(of_channel)) for of_channel in zip(*weighed, strict=True)]
 

@@ -41,10 +41,10 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Shaped
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.numerics.extremes import ratio
 
 WIDTH = 8  # columns of a table, or a multiple: a power of two, such that few rows lie across two lines of the cache
 ROUNDING = 64  # eps of the box that spheres are widened by, as leaves are found by view coordinates
-LEAST = 2.0**20  # times the least normal number: sums below it have no cotangents, as one over them could overflow
 EXTINCTION = slice(3, 4)
 OF_PARTICLES = ("x", "y", "z", "scale", "size", "quantity")  # columns, see `access.view.Columns`
 Columns = list[Float[Array, "tasks samples rays"]]
@@ -266,15 +266,12 @@ class OctreeParticles(OctreeMedium):
         return first[OF_PARTICLES.index("quantity")]
 
     def extinction(self, gathered: LeafSums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
-        """Extinction, and places in the transfer function; where weights are less than `LEAST`, the field has no derivatives."""
+        """Extinction, and places in the transfer function."""
         segments: Segments = self.viewed.look
-        solid = gathered.sums[0] > LEAST * jnp.finfo(gathered.sums[0].dtype).tiny
-        weight, weighted = lax.stop_gradient(gathered.sums)
-        thin = jnp.where(weight > 0, weighted / jnp.where(weight > 0, weight, 1), 0)
-        ratio = jnp.where(solid, gathered.sums[1] / jnp.where(solid, gathered.sums[0], 1), thin)
-        place = find(segments, gathered.reference + ratio)
+        weight, weighted = gathered.sums
+        place = find(segments, gathered.reference + ratio(weighted, weight))
         (extinction,) = read(segments, place, EXTINCTION)
-        return jnp.where(gathered.sums[0] > 0, extinction, 0), place
+        return jnp.where(weight > 0, extinction, 0), place
 
     def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function."""
@@ -344,10 +341,9 @@ class OctreePoints(OctreeMedium):
         return gathered.sums[0], gathered
 
     def colors(self, samples: LeafSums, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Weighed by extinction; where that is less than `LEAST`, black."""
+        """Weighed by extinction."""
         extinction, *weighed = samples.sums
-        solid = extinction > LEAST * jnp.finfo(extinction.dtype).tiny
-        return [jnp.where(solid, value / jnp.where(solid, extinction, 1), 0) for value in weighed[channels]]
+        return [ratio(value, extinction) for value in weighed[channels]]
 
 
 def octree_over(spheres: Particles) -> Octree:

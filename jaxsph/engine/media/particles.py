@@ -27,13 +27,14 @@ from jaxsph.engine.field.interpolation import interpolate_slabs
 from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.nodes import gather_subsampled
-from jaxsph.engine.field.sums import Sums, by_rays, least_weight
+from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
 from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_thickness, pull_cover, pull_means
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
+from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -118,7 +119,7 @@ class ParticleMedium(Medium):
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
         quantities = [
-            reference[:, None, None] + jnp.where(inside, value / jnp.where(inside, weight, 1), 0)
+            reference[:, None, None] + ratio(value, weight)
             for reference, value in zip(task.entry.references, weighted, strict=True)
         ]
         place = at_extinction = find(self.segments[-1], quantities[-1])
@@ -238,19 +239,18 @@ def pull_look_up(
 ) -> SampleCotangents:
     """From cotangents of optics to those of the sums that they were looked up by."""
     weight, *several = by_rays(sums)
-    inside, solid = weight > 0, weight > least_weight(weight.dtype)
-    inverse = 1 / jnp.where(inside, weight, 1)
-    of_optics = [jnp.where(inside, value, 0) for value in cotangents]
+    of_optics = [jnp.where(weight > 0, value, 0) for value in cotangents]
     of_weight, of_weighted, looks = jnp.zeros_like(weight), [], []
     looked_up = (range(4),) if len(parts) == 1 else (range(3), range(3, 4))  # of red, green, blue, extinction by each quantity
     for weighted, reference, segments, channels in zip(several, task.entry.references, parts, looked_up, strict=True):
-        ratio = jnp.where(inside, weighted * inverse, 0)
-        quantity = reference[:, None, None] + ratio
+        found, pull_ratio = jax.vjp(ratio, weighted, weight)
+        quantity = reference[:, None, None] + found
         slopes = jax.jvp(functools.partial(look_up, segments), (quantity,), (jnp.ones_like(quantity),))[1]
         own = [value if k in channels else jnp.zeros_like(value) for k, value in enumerate(of_optics)]
         of_quantity = functools.reduce(jnp.add, (own[k] * slopes[k] for k in channels))
-        of_weighted.append(jnp.where(solid, of_quantity * inverse, 0))
-        of_weight = of_weight - ratio * of_weighted[-1]
+        of_own, more = pull_ratio(of_quantity)
+        of_weighted.append(of_own)
+        of_weight = of_weight + more
         looks.append(LookUpCotangents(own, of_quantity, quantity))
     return SampleCotangents([of_weight, *of_weighted], tuple(looks))
 

@@ -31,7 +31,7 @@ from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Chord, Profile, Shaped
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -138,12 +138,12 @@ class PointsMedium(Medium):
     ) -> tuple[Float[Array, "tasks intervals rays"], tuple[Array, ...]]:
         """Mean extinction of intervals."""
         path = task.path()
-        return jnp.where(path > 0, gathered[0] / jnp.where(path > 0, path, 1), 0), gathered
+        return ratio(gathered[0], path), gathered
 
     def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """Weighed by thickness."""
         thickness, *weighed = samples
-        inverse = jnp.where(thickness > 0, 1 / jnp.where(thickness > 0, thickness, 1), 0)
+        inverse = ratio(1.0, thickness)
         return [value * inverse for value in weighed[channels]]
 
     def intervals(self, gathered: tuple[Array, ...], task: SlabTask) -> tuple[Array, ...]:
@@ -153,8 +153,7 @@ class PointsMedium(Medium):
     def means(self, intervals: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """See `Medium.means`: exact, as what is laid into an interval is."""
         thickness, *weighed = intervals
-        path = task.path()
-        inverse = jnp.where(path > 0, 1 / jnp.where(path > 0, path, 1), 0)
+        inverse = ratio(1.0, task.path())
         return [value * inverse for value in [*weighed, thickness][channels]]
 
     def every_other(self, gathered: tuple[Array, ...]) -> tuple[Array, ...]:

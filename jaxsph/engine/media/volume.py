@@ -26,7 +26,7 @@ from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, greater
+from jaxsph.numerics.extremes import clamped, greater, ratio
 from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
@@ -136,7 +136,7 @@ class VolumeMedium(Medium):
         """Ends of the intervals between samples, and what share of each is in the box."""
         begin, end = task.depth[:, :-1, None], task.depth[:, 1:, None]
         first, slab = task.depth[:, :1, None], (task.depth[:, -1:] - task.depth[:, :1])[:, :, None]
-        inverse = jnp.where(end > begin, 1 / jnp.where(end > begin, end - begin, 1), 0)
+        inverse = ratio(1.0, end - begin)
         ahead = clamped((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
         within = clamped((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
         near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])

@@ -18,7 +18,7 @@ from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite, require_real, require_shape, rounded_into
-from jaxsph.numerics.extremes import clamped, lesser
+from jaxsph.numerics.extremes import clamped, lesser, ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
@@ -227,10 +227,10 @@ class TransferFunction:
         change = jnp.append(table[:, 1:] - table[:, :-1], jnp.zeros((4, 1), table.dtype), 1)
         width = jnp.append(self.values[1:] - self.values[:-1], 0)
         largest = jnp.finfo(width.dtype).max
-        inverse = jnp.where(width > 0, lesser(1 / jnp.where(width > 0, width, 1), largest), 0)
+        inverse = lesser(ratio(1.0, width), largest)
         buckets = BUCKETS_PER_POINT * self.values.shape[0]
         extent = self.values[-1] - self.values[0]
-        rate = jnp.where(extent > 0, lesser(buckets / jnp.where(extent > 0, extent, 1), largest), 0)
+        rate = lesser(ratio(float(buckets), extent), largest)
         inside = _bucket(self.values, self.values[0], rate, buckets)
         below = jnp.searchsorted(inside, jnp.arange(buckets + 1, dtype=jnp.int32)).astype(jnp.int32)
         fullest = (below[1:] - below[:-1]).max()
@@ -247,7 +247,7 @@ def _one_sided(
     above = jnp.searchsorted(lax.stop_gradient(points), lax.stop_gradient(at), side=side)
     before, after = jnp.clip(above - 1, 0, last), jnp.clip(above, 0, last)
     width = points[after] - points[before]
-    part = jnp.where(width > 0, (at - points[before]) / jnp.where(width > 0, width, 1), 0)[:, None]
+    part = ratio(at - points[before], width)[:, None]
     return table[before] * (1 - part) + table[after] * part
 
 

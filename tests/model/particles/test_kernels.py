@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate
 
 from jaxsph.model.particles import kernels
+from jaxsph.numerics.extremes import ratio
 
 names = pytest.mark.parametrize("name", kernels.KERNELS)
 
@@ -75,6 +76,21 @@ def test_a_strength_can_be_folded_into_the_lengths(name, part, rest, size):
 @pytest.mark.parametrize("r", [0.0, 0.5, 1.0, 1.5])
 def test_gradient_is_finite_at_the_particle_at_the_edge_and_outside(name, r):
     assert np.isfinite(evaluate(name, r, 1)[1])
+
+
+@names
+def test_means_by_weights_have_finite_derivatives_wherever_a_support_ends(name):
+    """In float32, from the outermost distance of which a weight is left inwards: what is divided by is any small number."""
+    smooth = kernels.by_name(name)
+
+    def mean(place):
+        weights = [smooth.of_square((place - center) ** 2, jnp) for center in np.float32([0, 0.3])]
+        return ratio(0.7 * weights[0] - 0.2 * weights[1], weights[0] + weights[1])
+
+    place = jnp.asarray(1 - np.geomspace(1e-7, 1e-2, 400), jnp.float32) * jnp.float32([[-1], [1]])
+    found, moved = jax.jvp(mean, (place,), (jnp.ones_like(place),))
+    pulled = jax.vjp(mean, place)[1](jnp.ones_like(place))[0]
+    assert np.isfinite(moved).all() and np.isfinite(pulled).all() and np.isfinite(found).all()
 
 
 def test_unknown_kernel_lists_the_known_ones():

@@ -27,7 +27,7 @@ from jaxsph.model.medium import Medium
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_shape
-from jaxsph.numerics.extremes import clamped, greater
+from jaxsph.numerics.extremes import clamped, greater, ratio
 from jaxsph.numerics.trees import tree
 
 OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
@@ -169,7 +169,7 @@ class IsoSurface(Medium):
         """Opaque samples, and how brightly they shine."""
         met, shade = gathered
         length = jnp.sqrt(square_of(lax.stop_gradient(_ray(_ends(task)))))
-        return jnp.where(met & (length > 0), OPAQUE / jnp.where(length > 0, length, 1), 0), shade
+        return jnp.where(met, ratio(OPAQUE, length), 0), shade
 
     def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """The colour, shaded."""

@@ -43,6 +43,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.fusion import side_by_side
 from jaxsph.numerics.trees import tree
 
@@ -180,7 +181,7 @@ class ParticleSurface(Medium):
         path = task.path()
         each = jnp.arange(path.shape[1], dtype=jnp.int32)[:, None]
         opaque = (gathered.interval[:, None] == each) & (path > 0)
-        return jnp.where(opaque, OPAQUE / jnp.where(path > 0, path, 1), 0), gathered
+        return jnp.where(opaque, ratio(OPAQUE, path), 0), gathered
 
     def colors(self, samples: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """Of the surface, lit."""

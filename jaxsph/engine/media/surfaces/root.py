@@ -24,7 +24,7 @@ from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.media.surfaces.iso_surface import headlight
 from jaxsph.model.medium import COLORS
 from jaxsph.model.transfer.function import Segments, find, read
-from jaxsph.numerics.extremes import clamped
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.trees import tree
 
 Vectors = list[Float[Array, "tasks rays"]]
@@ -79,8 +79,7 @@ class SurfaceLook:
         """Red, green and blue before they are lit."""
         if self.segments is None:
             return list(self.color)
-        inverse = jnp.where(found.weight > 0, 1 / jnp.where(found.weight > 0, found.weight, 1), 0)
-        return read(self.segments, find(self.segments, reference + found.weighted[0] * inverse), COLORS)
+        return read(self.segments, find(self.segments, reference + found.weighted[0] * ratio(1.0, found.weight)), COLORS)
 
 
 def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:

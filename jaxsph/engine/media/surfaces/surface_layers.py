@@ -28,7 +28,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import lesser
+from jaxsph.numerics.extremes import lesser, ratio
 from jaxsph.numerics.trees import tree
 
 
@@ -93,8 +93,7 @@ class SurfaceLayers(ParticleSurface):
             left = left * (1 - opacity)
         path, taken = task.path(), (1 - left)[:, :, None]
         thickness = jnp.where(left > 0, lesser(-jnp.log(jnp.where(left > 0, left, 1)), OPAQUE), OPAQUE)
-        color = jnp.where(taken > 0, light / jnp.where(taken > 0, taken, 1), 0)
-        return jnp.where(path > 0, thickness / jnp.where(path > 0, path, 1), 0), color
+        return ratio(thickness, path), ratio(light, taken)
 
     def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Array]:  # type: ignore[override]
         """Of the layers of each interval, lit."""
