@@ -18,14 +18,14 @@ from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import Placed, tree
 
 SPREADS = "chords", "feet", "centres"
 MAIN = "position", "radius", "color", "extinction"
 
 
 @tree(static=("spread", "length_unit"))
-class Points:
+class Points(Placed):
     """A set of points; make it with `from_arrays`.
 
     At an offset d from its centre a point has the extinction `extinction * profile(|d| / radius)` a unit length, and none where
@@ -51,6 +51,7 @@ class Points:
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
+    PLACE, REST = "position", "position_rest"
     position: Float[Array, "points 3"]
     radius: Float[Array, " points"]
     color: Float[Array, "points 3"]

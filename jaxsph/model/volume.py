@@ -15,13 +15,13 @@ from jaxtyping import Array, Float, Num
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
-from jaxsph.numerics.trees import on_host, tree
+from jaxsph.numerics.trees import Placed, on_host, tree
 
 KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
 
 
 @tree(static=("length_unit",))
-class Volume:
+class Volume(Placed):
     r"""A quantity given at the points $x = \text{lower} + (i, j, k) \cdot \text{spacing}$ of a grid; make it with `from_array`.
 
     Between grid points it is trilinear; outside of the box that they span there is nothing. Values may be changed by
@@ -35,6 +35,7 @@ class Volume:
         length_unit: what the unit of lengths is called, where the place was given with one (static).
     """
 
+    PLACE, REST = "lower", "lower_rest"
     values: Num[Array, "nx ny nz"]
     lower: Float[Array, "3"]
     spacing: Float[Array, "3"]

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from jaxsph.numerics.checks import array_of, at_once, is_traced, module_for, require_real
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, require_real
 from jaxsph.numerics.faults import MESSAGES, TOLD, raise_for
 from jaxsph.numerics.given import plain
 
@@ -51,11 +51,12 @@ def tree(
     def register(kind: Kind) -> Kind:
         made: Any = dataclasses.dataclass(frozen=True, **options)(kind)
         MADE.add(made)
-        names = [field.name for field in dataclasses.fields(made)]
+        dropped = [field.name for field in dataclasses.fields(made) if field.name == "placed"]
+        names = [field.name for field in dataclasses.fields(made) if field.name not in dropped]
         leaves = [name for name in names if (name not in static if traced is None else name in traced)]
         fixed_names = [name for name in names if name not in leaves]
         if not unchecked:
-            jax.tree_util.register_dataclass(made, leaves, fixed_names)
+            jax.tree_util.register_dataclass(made, leaves, fixed_names, dropped)
             return made
 
         def flatten(one: Any) -> tuple[list[Any], tuple[Any, ...]]:
@@ -71,6 +72,37 @@ def tree(
         return made
 
     return register
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Placed:
+    """A base of what holds a place in float32, and beside it what rounding has left, which belongs to that very place.
+
+    `dataclasses.replace` hands on what was left of the former place. So each knows the pair that it was made with: where the
+    place is another, nothing is left of it but what is the same number as before.
+
+    Attributes:
+        placed: place and rest as they were made, no part of the tree: trees are made anew with theirs.
+    """
+
+    PLACE: ClassVar[str]
+    REST: ClassVar[str]
+    placed: tuple[Any, Any] | None = dataclasses.field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        place, rest = getattr(self, self.PLACE), getattr(self, self.REST)
+        former = (place, rest) if self.placed is None else self.placed
+        if rest is former[1] and place is not former[0] and place is not None and np.ndim(rest):
+            rest = _left(place if hasattr(place, "dtype") else np.asarray(place), *former)
+        fill(self, placed=(place, rest), **{self.REST: rest})
+
+
+def _left(place: Any, before: Any, rest: Any) -> Any:
+    """What rounding has left where a place is still what it was before, else nothing."""
+    if place.shape != before.shape:
+        return array_of(np.zeros(place.shape, rest.dtype))
+    xp, (place, before, rest) = at_hand((place, before, rest))
+    return array_of(xp.where(place == before, rest, xp.zeros_like(rest)))
 
 
 def unchecked_of(kind: type[Any], /, **fields: Any) -> Any:

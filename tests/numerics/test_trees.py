@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Float, Int, Num
 
+import jaxsph as js
 from jaxsph.numerics.trees import OPEN, fitting, on_host, tree
 
 
@@ -191,3 +192,53 @@ def test_other_rules_of_promotion_are_left_to_users():
         assert on_host(lambda held: float((held.place + held.size[:3] * jnp.int32(1)).sum()))(WHOLE) == 24
         with pytest.raises(ValueError, match="rank_promotion"):
             WHOLE.place + WHOLE.size[:3]
+
+
+FAR = np.array([[2e5, -1e6, 3e6], [1e6 + 0.3, 2e5 + 0.7, 1e5 + 0.1], [7e5 + 0.2, 1e6, 4e5 + 0.9]])
+PLACED = {
+    "particles": (js.Particles.from_arrays(FAR, 0.01, 1.0, capacity=3), "position"),
+    "points": (js.Points.from_arrays(FAR, 0.01, extinction=1.0, capacity=3), "position"),
+    "volume": (js.Volume.from_array(np.zeros((2, 2, 2)), lower=FAR[1]), "lower"),
+    "camera": (js.Camera.look_at(FAR[1], FAR[1] + [0, 0, 1]), "eye"),
+}
+placed = pytest.mark.parametrize(("one", "name"), PLACED.values(), ids=PLACED)
+
+
+def exact(one, name):
+    """The place in float64."""
+    return np.asarray(getattr(one, name), np.float64) + np.asarray(getattr(one, f"{name}_rest"), np.float64)
+
+
+@placed
+def test_what_is_put_in_is_of_no_other_place(one, name):
+    """Wherever it is put in, and the tree stays the same; what is left of a place is left of the same numbers alone."""
+    former = getattr(one, name)
+    assert np.abs(getattr(one, f"{name}_rest")).max() > 1e-3
+    some = np.arange(former.size).reshape(former.shape) % 2 == 0
+
+    def moved(one, by):
+        return dataclasses.replace(one, **{name: getattr(one, name) + by})
+
+    step = jnp.where(some, 0, jnp.float32(2048.5))
+    wanted = np.where(some, exact(one, name), np.asarray(former + step, np.float64))
+    one_of_many = jax.tree.map(lambda leaf: leaf[0], jax.vmap(moved, (None, 0))(one, step[None]))
+    for found in (moved(one, step), jax.jit(moved)(one, step), jax.jit(lambda by: moved(one, by))(step), one_of_many):
+        np.testing.assert_array_equal(exact(found, name), wanted)
+        assert jax.tree.structure(found) == jax.tree.structure(one)
+    other = dataclasses.replace(one, **{name: np.zeros_like(former)})
+    assert not exact(dataclasses.replace(other, length_unit="m") if name != "eye" else other, name).any()
+
+
+@placed
+def test_what_stays_where_it_is_keeps_its_digits(one, name):
+    """Of other fields that are put in, of pairs that are, and of all leaves that a transformation makes anew."""
+    wanted, low = exact(one, name), f"{name}_rest"
+    static = {"width": 7} if name == "eye" else {"length_unit": "m"}
+    np.testing.assert_array_equal(exact(dataclasses.replace(dataclasses.replace(one, **static)), name), wanted)
+    doubled = jax.tree.map(lambda leaf: 2 * leaf if leaf.dtype != bool else leaf, one)
+    np.testing.assert_array_equal(exact(dataclasses.replace(doubled, **static), name), 2 * wanted)
+    pair = dataclasses.replace(one, **{name: 2 * getattr(one, name), low: 2 * getattr(one, low)})
+    np.testing.assert_array_equal(exact(dataclasses.replace(pair, **static), name), 2 * wanted)
+    slope = jax.grad(lambda moves: (getattr(moves, name) + getattr(moves, low)).sum(), allow_int=True)(one)
+    assert (np.asarray(getattr(slope, name)) == 1).all() and (np.asarray(getattr(slope, low)) == 1).all()
+    assert jax.tree.map(lambda _: None, one).placed == (None, None)

@@ -25,7 +25,7 @@ from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import OPEN, on_host, tree
+from jaxsph.numerics.trees import OPEN, Placed, on_host, tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
 
@@ -58,7 +58,7 @@ class BoundingBox(NamedTuple):
 
 
 @tree(static=("width", "height", "projection", "stride"))
-class Camera:
+class Camera(Placed):
     """A perspective or orthographic camera; make it with `look_at`, `orthographic`, `framing` or `along_axis`.
 
     Lengths are numbers in the unit of positions, which a camera does not know: what carries a unit is refused.
@@ -76,6 +76,7 @@ class Camera:
         stride: rays go through every so many pixels of either direction, and through the last: see `strided`.
     """
 
+    PLACE, REST = "eye", "eye_rest"
     eye: Float[Array, "3"]
     axes: Float[Array, "3 3"]
     half_height: Float[Array, ""]

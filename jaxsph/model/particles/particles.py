@@ -23,7 +23,7 @@ from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive, require_shape
 from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import on_host, tree
+from jaxsph.numerics.trees import Placed, on_host, tree
 
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
 VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
@@ -45,7 +45,7 @@ def room_for(what: str, count: int, capacity: int | None) -> int:
 
 
 @tree(static=("kernel", "length_unit"))
-class Particles:
+class Particles(Placed):
     """SPH particles that carry a quantity; make them with `from_arrays`.
 
     The arrays are padded to a capacity, with the first particle at volume 0; `valid` marks the particles that exist. Values
@@ -65,6 +65,7 @@ class Particles:
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
+    PLACE, REST = "position", "position_rest"
     position: Float[Array, "particles 3"]
     support: Float[Array, " particles"]
     quantity: Float[Array, " particles"]
@@ -148,7 +149,7 @@ class Particles:
         if known:
             _require_volumes(arrays["volume"], columns["volume"])
         rest = rest_of(arrays["position"], columns["position"], columns["support"]) if known else None
-        entries = {name: array_of(value) for name, value in columns.items()}
+        entries: dict[str, Any] = {name: array_of(value) for name, value in columns.items()}
         valid, period = array_of((np if known else jnp).arange(room) < count), _period(box, arrays["support"], dtype)
         return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=name_of(unit))
 
