@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
-from derivatives import AGREE, CLOSE, along, anyhow, differ, filled, looked, pulled, towards, valued, weights
+from derivatives import AGREE, CLOSE, STEP, along, anyhow, differ, filled, looked, pulled, stepped, towards, valued, weights
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -44,6 +44,26 @@ PHENOMENA = {
     "the field of view widens": lambda inputs, rng: {"half_height": np.ones(())},
     "samples move apart": anyhow("near", "far"),
 }
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_on_control_points_both_modes_have_the_slope_that_begins_there(frames, x64, constant):
+    """Where quantities lie on kinks of the transfer function there are two slopes: every rule takes the same one."""
+    rng = np.random.default_rng(11)
+    (scene, camera), cotangent, plan = filled(frames, rng), weights(rng, frames), frames.plan()
+    points = np.asarray(scene.transfer.values)
+    quantity = np.full(frames.capacity, points[2]) if constant else rng.choice(points, frames.capacity)
+    inputs = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=jnp.asarray(quantity))), camera
+    names = "position", "support", "quantity", "volume", "values", "colors", "extinction", "eye"
+    move = towards(inputs, anyhow(*names)(inputs, rng))
+    _, pushed, gradient = looked(inputs, move, cotangent, frames.settings, plan)
+    slope, size = along(gradient, move)
+    assert pushed == pytest.approx(slope, abs=AGREE * size)
+    if constant:
+        up = towards(inputs, {"quantity": np.ones(frames.capacity)})
+        ahead, here = (looked(stepped(inputs, up, by), up, cotangent, frames.settings, plan)[0] for by in (STEP, 0.0))
+        slope, size = along(gradient, up)
+        assert slope == pytest.approx(float(ahead - here) / STEP, abs=10 * STEP * (1 + size))
 
 
 @pytest.mark.parametrize("phenomenon", PHENOMENA)

@@ -6,7 +6,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import CLOSE, QUICKLY, STEP, along, anyhow, filled, pulled, stepped, still, total, towards, valued, weights
+from derivatives import (
+    AGREE,
+    CLOSE,
+    QUICKLY,
+    STEP,
+    along,
+    anyhow,
+    filled,
+    looked,
+    pulled,
+    stepped,
+    still,
+    total,
+    towards,
+    valued,
+    weights,
+)
 
 import jaxsph as js
 from jaxsph.engine.control.adapt import ControlPlan
@@ -14,6 +30,21 @@ from jaxsph.engine.control.pilot import PilotPlan
 
 ADAPTIVE = {"super_pixels": False}
 STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this file's even scene
+
+
+def test_media_that_are_mixed_by_opacity_have_one_slope_in_both_modes(frames, x64):
+    """What they emit may be more than what they take of the light that comes from behind, as all of them show theirs."""
+    few, rng = dataclasses.replace(frames, width=8, height=6, samples=12, capacity=6), np.random.default_rng(4)
+    scene, camera = few.scene(rng, decades=0.3, dtype=np.float64), few.camera(rng, dtype=np.float64)
+    white, thick = np.full((2, 3), 0.9), np.array([5.0, 9.0])
+    dense = js.TransferFunction.from_points(np.array([0.0, 1.0]), white, thick)
+    volume = js.Volume.from_array(rng.uniform(0.1, 0.9, (3, 3, 3)), lower=np.full(3, -1.0), spacing=np.ones(3))
+    both = js.Scene(particles=scene.particles, transfer=dense, volume=volume, volume_transfer=dense, mix="opacity")
+    inputs, cotangent, settings = (both, camera), weights(rng, few), few.settings
+    move = towards(inputs, anyhow("position", "support", "quantity", "eye")(inputs, rng))
+    _, pushed, gradient = looked(inputs, move, cotangent, settings, js.plan(*inputs, settings))
+    slope, size = along(gradient, move)
+    assert pushed == pytest.approx(slope, abs=AGREE * size)
 
 
 @pytest.mark.slow

@@ -263,7 +263,8 @@ def _pull(
     medium = Mixture.of(media, method.mix)
     start = Accumulated(medium.no_cotangents(), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
     with barriers(plan.tuning.fusion_barriers):
-        found = _Backward(batches, medium, method.integrator, wanted.field).pull(image, cotangent, start)
+        most = 1 if method.mix == "extinction" else len(media)
+        found = _Backward(batches, medium, method.integrator, wanted.field, most).pull(image, cotangent, start)
     of_media = found.medium if len(media) > 1 else (found.medium,)
     columns, transfer = jax.tree.map(jnp.zeros_like, inputs.columns), None
     within = jax.tree.map(jnp.zeros_like, inputs.within)
@@ -287,12 +288,13 @@ def _pull(
 
 @dataclasses.dataclass(frozen=True)
 class _Backward:
-    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are, too."""
+    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are; `most`: see `replay`."""
 
     batches: Batches
     medium: Medium
     integrator: Integrator
     geometry: bool
+    most: int
 
     def pull(self, image: Layers, cotangent: Layers, start: Accumulated) -> Accumulated:
         """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
@@ -313,7 +315,7 @@ class _Backward:
                 return jax.tree.map(put, held, self.march(items))
 
             light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
-            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together)
+            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, self.most)
 
             def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
                 items, begin = batches.chunk(batch, chunk)

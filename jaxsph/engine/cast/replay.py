@@ -5,8 +5,9 @@ Flow: cotangents of an image -> adjoint -> [replay] -> integrator, media.
 Let $\bar C$ and $\bar T$ be the cotangents of a ray's colour and transmittance. Hochstetter et al. 2016, equation 3,
 $C = \sum_k T_k e_k$ with $e_k$ what slab k emits as seen from right in front of it and $T_k$ what is let through before, gives
 $e_k$ the cotangent $T_k \bar C$. More optical thickness in slab k dims all that comes from behind it, so its cotangent is
-$-(\bar C \cdot C_{>k} + \bar T T)$, with $C_{>k}$ what the slabs behind add to the ray. That is at most what is let through,
-which bounds its rounding. Cotangents of where a ray ends are of the slab that ends it.
+$-(\bar C \cdot C_{>k} + \bar T T)$, with $C_{>k}$ what the slabs behind add to the ray. That is at most what is let through
+(times how many media show all of their light, where they are mixed so), which bounds its rounding. Cotangents of where a ray ends
+are of the slab that ends it.
 """
 
 from __future__ import annotations
@@ -66,7 +67,12 @@ def fresh_replay(
 
 
 def pull_composite(
-    state: ReplayState, light: tuple[Array, ...], batch: Batch, starts: Int[Array, " layers_and_one"], together: Together
+    state: ReplayState,
+    light: tuple[Array, ...],
+    batch: Batch,
+    starts: Int[Array, " layers_and_one"],
+    together: Together,
+    most: int = 1,
 ) -> tuple[ReplayState, Float[Array, "4_or_8 slots rays"]]:
     """Cotangents of the slabs of a batch: of red, green, blue and optical thickness, and of their stops if rays have any.
 
@@ -74,6 +80,7 @@ def pull_composite(
 
     Args:
         light: red, green, blue and transmittance of the slabs, by slot, and their stops; and of nothing at the end.
+        most: times what a slab takes of the light, that it emits at most.
     """
     nothing = light[3].shape[0] - 1
 
@@ -82,7 +89,7 @@ def pull_composite(
         slot = jnp.where(inside, batch.slot[place], nothing)
         # at hand before any is put back, see `composite`
         rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
-        made, found = _pull_slabs(rays, [field[slot] for field in light])
+        made, found = _pull_slabs(rays, [field[slot] for field in light], most)
         put_back = functools.partial(lax.dynamic_update_slice_in_dim, start_index=packet, axis=-2)
         state = dataclasses.replace(state, **{name: put_back(getattr(state, name), rows) for name, rows in made.items()})
         return state, cotangents.at[:, slot].set(found)
@@ -91,12 +98,12 @@ def pull_composite(
     return over_layers(put, (state, start), starts, batch, together)
 
 
-def _pull_slabs(rays: ReplayState, light: list[Array]) -> tuple[dict[str, Array], Array]:
+def _pull_slabs(rays: ReplayState, light: list[Array], most: int) -> tuple[dict[str, Array], Array]:
     """What is made again of rays behind one more slab each, and the cotangents of those slabs."""
     (*emission, left), stops = light[:4], light[4:]
     behind = rays.transmittance_so_far * left
     color = rays.color_so_far + rays.transmittance_so_far * jnp.stack(emission)
-    remaining = clamped(rays.color - color, 0, behind)
+    remaining = clamped(rays.color - color, 0, most * behind)
     hidden = (rays.cotangent[:3] * remaining).sum(0) + rays.cotangent[3] * rays.transmittance
     found = [rays.cotangent[:3] * rays.transmittance_so_far, -hidden[None]]
     made = {"color_so_far": color, "transmittance_so_far": behind}
