@@ -51,7 +51,7 @@ def tree(
     def register(kind: Kind) -> Kind:
         made: Any = dataclasses.dataclass(frozen=True, **options)(kind)
         MADE.add(made)
-        dropped = [field.name for field in dataclasses.fields(made) if field.name == "placed"]
+        dropped = ["placed"] if issubclass(made, Placed) else []
         names = [field.name for field in dataclasses.fields(made) if field.name not in dropped]
         leaves = [name for name in names if (name not in static if traced is None else name in traced)]
         fixed_names = [name for name in names if name not in leaves]
@@ -76,13 +76,10 @@ def tree(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Placed:
-    """A base of what holds a place in float32, and beside it what rounding has left, which belongs to that very place.
+    """A base of what holds a place, and beside it what rounding has left of that.
 
-    `dataclasses.replace` hands on what was left of the former place. So each knows the pair that it was made with: where the
-    place is another, nothing is left of it but what is the same number as before.
-
-    Attributes:
-        placed: place and rest as they were made, no part of the tree: trees are made anew with theirs.
+    `dataclasses.replace` hands on what was left of the former place. So the pair as it was made is known, `placed` (no part of
+    the tree), and of another place nothing is left but where it has the same numbers.
     """
 
     PLACE: ClassVar[str]
@@ -93,16 +90,10 @@ class Placed:
         place, rest = getattr(self, self.PLACE), getattr(self, self.REST)
         former = (place, rest) if self.placed is None else self.placed
         if rest is former[1] and place is not former[0] and place is not None and np.ndim(rest):
-            rest = _left(place if hasattr(place, "dtype") else np.asarray(place), *former)
+            xp, (now, before, left) = at_hand((place if hasattr(place, "dtype") else np.asarray(place), *former))
+            same = now == before if now.shape == before.shape else xp.zeros(now.shape, bool)
+            rest = array_of(xp.where(same, left if now.shape == before.shape else 0, 0).astype(left.dtype))
         fill(self, placed=(place, rest), **{self.REST: rest})
-
-
-def _left(place: Any, before: Any, rest: Any) -> Any:
-    """What rounding has left where a place is still what it was before, else nothing."""
-    if place.shape != before.shape:
-        return array_of(np.zeros(place.shape, rest.dtype))
-    xp, (place, before, rest) = at_hand((place, before, rest))
-    return array_of(xp.where(place == before, rest, xp.zeros_like(rest)))
 
 
 def unchecked_of(kind: type[Any], /, **fields: Any) -> Any:

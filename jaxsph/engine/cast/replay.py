@@ -67,12 +67,7 @@ def fresh_replay(
 
 
 def pull_composite(
-    state: ReplayState,
-    light: tuple[Array, ...],
-    batch: Batch,
-    starts: Int[Array, " layers_and_one"],
-    together: Together,
-    most: int = 1,
+    state: ReplayState, light: tuple[Array, ...], batch: Batch, starts: Int[Array, " _"], together: Together, most: int = 1
 ) -> tuple[ReplayState, Float[Array, "4_or_8 slots rays"]]:
     """Cotangents of the slabs of a batch: of red, green, blue and optical thickness, and of their stops if rays have any.
 
