@@ -25,7 +25,7 @@ from jaxsph.engine.field.schedule import reference_quantities
 from jaxsph.engine.frame.stages import make_grid
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
-from jaxsph.engine.runtime import memory_maps, programs
+from jaxsph.engine.runtime import memory, programs
 
 pytest_plugins = ["by_reference", "compiled", "core", "share"]
 
@@ -164,9 +164,9 @@ def few_programs_of_slow_tests(request: pytest.FixtureRequest) -> Iterator[None]
 
 
 def _let_go_of_programs() -> None:
-    if (memory_maps.in_use() or 0) > MAX_MAPS:
+    if (memory.in_use() or 0) > MAX_MAPS:
         jax.clear_caches()
-    if (memory_maps.in_use() or 0) > MAX_MAPS:  # else a file might begin with so many that its own would be let go
+    if (memory.in_use() or 0) > MAX_MAPS:  # else a file might begin with so many that its own would be let go
         programs.PROGRAMS.clear()
 
 

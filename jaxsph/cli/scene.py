@@ -31,7 +31,7 @@ from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.surface import Surface
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 ISO_COLOR = 0.85, 0.8, 0.7
 OF_SCENES = ("particles", "frame")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 NAMES = {
     "white": "#ffffff",

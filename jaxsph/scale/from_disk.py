@@ -24,8 +24,8 @@ from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime import free_memory
 from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.memory import give_back, given_back_at_once
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.frusta import seen_by
 from jaxsph.model.image import Image
@@ -97,7 +97,7 @@ def render_from_disk(
     renderer = _Renderer(on_disk, transfer, camera, settings, memory)
     todo, images, most = deque(renderer.panes()), dict[Pane, Image](), 0
     always, ahead = on_disk.extremes(camera), dict[Pane, Future[Columns | None]]()
-    with free_memory.given_back_at_once(), ThreadPoolExecutor(1, "jaxsph-read") as thread:
+    with given_back_at_once(), ThreadPoolExecutor(1, "jaxsph-read") as thread:
 
         def begun(pane: Pane) -> Future[Columns | None]:
             return thread.submit(on_disk.seen_by, seen_by(camera, *pane), always, memory // READ_BYTES)
@@ -117,7 +117,7 @@ def render_from_disk(
                 continue
             images[pane], most = image, max(most, len(columns[0]))
             del columns
-            free_memory.give_back()
+            give_back()
             if progress is not None:
                 progress(len(images), len(images) + len(todo))
     image = _of_halves(renderer.whole, images, renderer.whole_rows)

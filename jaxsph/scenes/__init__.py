@@ -27,7 +27,7 @@ from jaxsph.model.transfer.looks import (
     preset,
 )
 from jaxsph.model.transfer.maps import colormap
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 from jaxsph.scenes import cosmos, fields
 from jaxsph.scenes.checker_board import checker_board
 from jaxsph.scenes.flubber import flubber

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxsph.numerics.nearest import did_you_mean, nearest
+from jaxsph.numerics.names import did_you_mean, nearest
 
 NAMES = ("Density", "InternalEnergy", "viridis")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 NONE = "none"
 GIB = 2**30

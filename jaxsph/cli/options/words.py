@@ -15,7 +15,7 @@ from cyclopts import Argument
 
 from jaxsph.cli.options.table import COMMANDS
 from jaxsph.cli.voice import UsageError
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 COMMAND = "jaxsph.command"
 """Metadata of a picture: the words of its command, as JSON."""

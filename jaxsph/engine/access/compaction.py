@@ -6,9 +6,8 @@ Layer n of the compacted slabs holds every bundle's n-th filled item, front to b
 height, the bundles of a layer are the first so many of all: the layers, one after the other, are a list of items in which those
 that are near in depth are near each other, and any part of it can be put in front of what follows.
 
-Of `lax.associative_scan` XLA makes dozens of kernels, which takes it half a second for each scan; its own cumulative sum is up
-to ten times as slow as these on CPUs. So sums are taken in groups of `STEP`, those of the groups' totals in the same way, and
-each level is one kernel that adds a triangle of entries.
+Of `lax.associative_scan` XLA makes dozens of kernels, in half a second; its own cumulative sum is up to ten times as slow as
+these on CPUs, in groups of `STEP` and of these groups' totals: each level is one kernel that adds a triangle of entries.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@ r"""Error control of a band of the image: from the grid and a tolerance to the w
 
 Flow: slab windows -> probe -> [adapt: analysis -> candidates -> merge] -> schedule -> cast -> image.
 
-Bounds need every particle of a cell, and most cells of a mixed fluid then turn out to vary too much. A few particles from the
-middle of a slab's window vary less than all of them: where even their quantities would change the image by more than the
-tolerance, nothing is lost by leaving the cell at full rate without looking further (`probe`). Whatever that says, what is
-analysed is bounded with care.
+Most cells of a mixed fluid vary too much, and bounds need every particle of one. A few from the middle of a slab's window vary
+less than all: where even these would change the image too much, nothing is lost by leaving a cell at full rate (`probe`).
 
 Errors of cells add up (`errors`), so a bundle has a budget to spend: choose a candidate for each cell such that the errors'
 sum stays within the tolerance and the evaluations saved are most. The multiplier rule does that up to one cell: for a price

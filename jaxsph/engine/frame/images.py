@@ -31,10 +31,7 @@ from jaxsph.numerics.version import __version__
 
 
 def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
-    """Whether `error_bound` is proven where there are no faults: of point samples, a ray a pixel, by strict bounds.
-
-    Of surfaces nothing is: samples may miss what is thin of them.
-    """
+    """Whether `error_bound` is proven, without faults: by strict bounds, of point samples of no surface, a ray a pixel."""
     if plan.integrator != REFERENCE or plan.quadtree is not None or isinstance(plan.control, PilotPlan) or formulas.surfaces:
         return False
     if plan.control is None:

@@ -31,8 +31,7 @@ from jaxsph.engine.access.octree import Leaf, Octree, build_octree
 from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.lookups.quantities import in_units_of
-from jaxsph.engine.media.point_rays import NUM_COLUMNS, Row
-from jaxsph.engine.media.points import PointsMedium
+from jaxsph.engine.media.points import NUM_COLUMNS, PointsMedium, Row
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces

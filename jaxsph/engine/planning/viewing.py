@@ -2,9 +2,8 @@
 
 Flow: scene, camera -> [viewing] -> plan, stages.
 
-Looks that an optimiser stepped out of range with are taken back into it, and derivatives pass as if they had not been: so a
-further step may lead inside again. What is off by more than rounding sets a fault; the image is that of the nearest colours and
-extinctions there are.
+Looks that an optimiser stepped out of range with are taken back into it, and derivatives pass as if they had not been: a further
+step may lead inside again. What is off by more than rounding sets a fault.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from jaxsph.engine.runtime import free_memory, memory_maps
+from jaxsph.engine.runtime import memory
 from jaxsph.engine.runtime.tuning import cores_at_hand
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
@@ -106,19 +106,19 @@ class Programs:
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
-            while self._kept and memory_maps.crowded():
+            while self._kept and memory.crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)
                 gc.collect()
-            if not memory_maps.crowded():
+            if not memory.crowded():
                 return
             for let_go in _LET_GO:
                 let_go()
             gc.collect()
-            if memory_maps.crowded() and not self._warned:
+            if memory.crowded() and not self._warned:
                 self._warned = True
                 warnings.warn(
-                    f"this process holds over {memory_maps.CROWDED:.0%} of the {memory_maps.limit()} memory maps that it may "
+                    f"this process holds over {memory.CROWDED:.0%} of the {memory.limit()} memory maps that it may "
                     "have, in programs that are not jaxsph's own, and ends without a word when it needs more: call "
                     "`jax.clear_caches()`, and jit functions once instead of anew",
                     stacklevel=3,
@@ -139,7 +139,7 @@ class Programs:
             tidy = self._let_go and self._compiling == 0
             self._let_go &= not tidy
         if tidy:  # it takes a tenth of a second, which the first frames of a process need not wait for
-            free_memory.give_back()
+            memory.give_back()
 
 
 PROGRAMS = Programs()

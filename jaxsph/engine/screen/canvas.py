@@ -1,8 +1,6 @@
 """What is known of an image so far: rays that were cast, and pixels that no ray is needed for.
 
 Flow: cast -> [canvas: painted] -> marking -> packets -> cast; -> [canvas: finished] -> layers.
-
-How wrong each leaf is, is estimated a posteriori in units of colour, over its pixels: leaves with the largest errors are split.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import given
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 RADIUS_NAMES = ("radius", "radii", "rad", "r", "size")
 COLOR_TRIPLES = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g", "color_b"))

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.table import ParticleTable, plain, refuse_rows
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 ROLES: dict[str, tuple[str, ...]] = {
     "density": ("density", "densities", "rho", "rhop", "gas_density", "den"),

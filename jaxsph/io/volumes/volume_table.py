@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 
 from jaxsph.io.damage import DataError
-from jaxsph.numerics.nearest import did_you_mean
+from jaxsph.numerics.names import did_you_mean
 
 COMPONENTS = "xyz"
 SKEW = 1e-6  # of a step along an axis that may lie across it: directions are written with some seven digits

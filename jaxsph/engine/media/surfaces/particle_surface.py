@@ -12,6 +12,11 @@ are two things: several thin parts in one interval, none of which one particle m
 thinner than an interval, of a ray that begins in the fluid. More samples find them.
 
 A clip's face is such a place, too, in the intervals that it cuts: what is thin there is an estimate as well.
+
+However a root was found, only its place counts, by the implicit function theorem: with F the field, p all that it depends on and
+t the depth of a crossing, $F(t, p) = c$ makes t a function whose derivatives are those of one step of Newton's with its slope
+held fixed, $dt = (dc - F_p \, dp) / F_t$; what is found there, G, moves by $G_p \, dp + G_t \, dt$. Backward, $\bar G$ gives the
+place the cotangent $\bar t + \bar G \cdot G_t$, the field minus that over $F_t$, in one more pass over particles.
 """
 
 from __future__ import annotations
@@ -34,18 +39,113 @@ from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, columns_of
-from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
-from jaxsph.engine.media.surfaces.root import Root, SurfaceLook, pull_root, root_near
+from jaxsph.engine.media.surfaces.iso_surface import OPAQUE, headlight
 from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops, added
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
-from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import side_by_side
 from jaxsph.numerics.trees import tree
+
+Vectors = list[Float[Array, "tasks rays"]]
+
+
+class Root(NamedTuple):
+    """Where rays cross the level, relative to the middle of their slab, and what is found there."""
+
+    place: Float[Array, "tasks rays"]
+    found: Found
+
+
+class OfRoot(NamedTuple):
+    """Cotangents of particles, `field.transposed.COLUMNS`, of the level, and of a common factor of all u and v."""
+
+    table: Float[Array, "particles 8"]
+    level: Float[Array, ""]
+    factor: Float[Array, ""]
+
+
+@tree()
+class SurfaceLook:
+    """How a surface looks.
+
+    Attributes:
+        color: red, green and blue where no transfer function colours it.
+        ambient: share of the light that it has where it is seen edge on.
+        segments: of the transfer function that colours it; None without one.
+        light: x, y and z in view space of a vector of unit length towards the light; None for one at the eye.
+    """
+
+    color: Float[Array, "3"]
+    ambient: Float[Array, ""]
+    segments: Segments | None
+    light: Float[Array, "3"] | None = None
+
+    def shade(self, found: Found, ray: Vectors, reference: Float[Array, "tasks 1"]) -> tuple[Vectors, Vectors]:
+        """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope.
+
+        Args:
+            ray: x, y and z of vectors along the rays.
+            reference: what the quantities that were found are relative to.
+        """
+        steepest = lax.stop_gradient(jnp.stack([abs(of) for of in found.gradient]).max(0))
+        gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
+        square = gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2
+        normal = [-of * lax.rsqrt(jnp.where(square > 0, square, 1)) for of in gradient]
+        light = headlight(normal, ray, self.ambient, self.light)
+        return [color * light for color in self._colors(found, reference)], normal
+
+    def _colors(self, found: Found, reference: Float[Array, "tasks 1"]) -> list[Float[Array, "..."]]:
+        """Red, green and blue before they are lit."""
+        if self.segments is None:
+            return list(self.color)
+        return read(self.segments, find(self.segments, reference + found.weighted[0] * ratio(1.0, found.weight)), COLORS)
+
+
+def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
+    """Of the field, a unit of depth."""
+    return found.gradient[0] * ray[0] + found.gradient[1] * ray[1] + found.gradient[2] * ray[2]
+
+
+def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root: Bool[Array, ""]) -> Root:
+    """The root in a bracket, by a step of Newton's from its secant, which has the derivatives; and what is found there.
+
+    Args:
+        is_root: whether the secant is the root: then it stays, and the step has the derivatives alone.
+
+    Differentiation:
+        By the particles, the rays and the level, as of an implicit function; the bracket has none.
+    """
+    bracket = lax.stop_gradient(bracket)
+    given = bracket.secant()
+
+    def find(nth: Array, root: Root) -> Root:
+        slope = lax.stop_gradient(slope_along(root.found, rays.ray()))  # 0 before anything is found
+        place = given + jnp.where(slope != 0, (level - root.found.weight) / jnp.where(slope != 0, slope, 1), 0)
+        taken = jnp.where(is_root | (nth == 0), given, clamped(place, bracket.low, bracket.high))
+        place = place + lax.stop_gradient(taken - place)
+        return Root(place, rays.found(place))
+
+    zero = jnp.zeros_like(given)
+    nothing = Found(zero, (zero,) * 3, (zero,) * len(rays.task.entry.references))
+    return lax.fori_loop(0, 2, find, Root(given, nothing))  # at the secant, and at the root
+
+
+def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
+    """Cotangents of all that a root depends on, from those of the root; 0 where the field has no slope along the ray."""
+    _, moved = jax.jvp(rays.found, (place,), (jnp.ones_like(place),))
+    of_found = cotangents.found
+    of_place = cotangents.place
+    for of, along in zip(jax.tree.leaves(of_found), jax.tree.leaves(moved), strict=True):
+        of_place = of_place + of * along
+    slope = moved.weight
+    of_level = jnp.where(slope != 0, of_place / jnp.where(slope != 0, slope, 1), 0)
+    table, factor = rays.pull(table, place, of_found._replace(weight=of_found.weight - of_level))
+    return OfRoot(table, of_level.sum(), factor)
 
 
 class Hit(NamedTuple):
