@@ -137,7 +137,10 @@ def each_frame(kind, adversary):
     plan, derived = None, True
     for nth in range(EACH):
         frame = scene, camera, settings = drawn(kind, nth, adversary)
-        check(kind, js.render(scene, camera, settings), (), frame)
+        try:
+            check(kind, js.render(scene, camera, settings), (), frame)
+        except ValueError as error:  # of supports over four decades, whose volumes are alike
+            assert "the strengths volume / support^3 of the particles are too far apart" in str(error)
         scene, camera, settings = frame = drawn(kind, EACH + nth, adversary)
         if reachable(scene, settings) is not scene:  # octrees are built on the host: refused under `jit`, by name
             continue
