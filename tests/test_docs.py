@@ -21,7 +21,7 @@ PAGES = {"README.md": README} | {
 SHELL = "".join(block for page in PAGES.values() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
 INLINE = [line for page in PAGES.values() for line in re.findall(r"`(jaxsph \w+[^`\n]*)`", page)]
 COMMANDS = [line for line in [*re.findall(r"^(jaxsph \w+[^#\n]*)", SHELL, re.MULTILINE), *INLINE] if "COMMAND" not in line]
-ELSEWHERE = "docs/extending.md", "docs/for_jax_users.md", "docs/viewing.md"  # pages whose blocks others run
+ELSEWHERE = "docs/extending.md", "docs/for_jax_users.md", "docs/gradients.md", "docs/viewing.md"  # pages whose blocks others run
 BLOCKS = {
     f"{name}:{number}": block
     for name, page in PAGES.items() if name not in ELSEWHERE
@@ -62,6 +62,15 @@ def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
 
 
 @pytest.mark.notebook
+def test_the_page_of_gradients_runs_as_pasted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", PAGES["docs/gradients.md"], re.DOTALL)
+    known = {}
+    exec(compile(smaller("\n".join(blocks)), "gradients.md", "exec"), known)
+    assert len(blocks) == 2 and not (known["position"] == known["scene"].particles.position + 0.01).all()
+
+
+@pytest.mark.notebook
 def test_the_page_for_users_of_jax_runs_as_pasted():
     """All of its blocks, one after the other."""
     blocks = re.findall(r"```python\n(.*?)```", PAGES["docs/for_jax_users.md"], re.DOTALL)
@@ -71,7 +80,7 @@ def test_the_page_for_users_of_jax_runs_as_pasted():
 
 
 def test_there_are_blocks_to_run():
-    assert len(BLOCKS) == 15 and all(len(block.split("\n")) <= 20 for block in BLOCKS.values())
+    assert len(BLOCKS) == 14 and all(len(block.split("\n")) <= 20 for block in BLOCKS.values())
     example, gradient = (re.findall(r"^.*\S", block, re.MULTILINE) for name, block in BLOCKS.items() if name.startswith("README"))
     assert len(example) <= 10 and len(gradient) <= 8
 

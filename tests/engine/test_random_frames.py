@@ -1,8 +1,8 @@
 """Frames of any size, control, integrator, kernel and medium, other ones each day: none raises but by name, no number is NaN
 where there is no fault, and what is certified is as near to the float64 reference as it says.
 
-Numbers differ from frame to frame, what is compiled for from one kind of frames to the next: there are `KINDS` of `EACH` eager
-frames and as many under `jit`, where they have derivatives, too; more kinds at night. A failure shows its kind,
+Numbers differ from frame to frame, what is compiled for from one kind of frames to the next: there are `KINDS` of `EAGER`
+eager frames and `TRACED` under `jit`, where they have derivatives, too; more kinds at night. A failure shows its kind,
 which `kind_of(SEED)` makes again.
 """
 
@@ -26,8 +26,8 @@ from jaxsph.model.particles.kernels import KERNELS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
-KINDS, EACH = 2, 15  # of frames, and frames of each that are drawn eagerly, and again under `jit`
-AT_NIGHT = 17  # as many kinds
+KINDS, AT_NIGHT = 2, 25  # of frames, and times as many at night
+EAGER, TRACED = 10, 20  # frames of a kind
 TODAY = datetime.datetime.now(datetime.UTC).date().toordinal()
 SLOW = "all together"  # takes minutes to compile
 SINGLE, DOUBLE = 2e-3, 1e-7  # between images in float32, and in float64, and the reference, where no error is told
@@ -133,23 +133,22 @@ def check(kind, image, gradient, frame):
 
 
 def each_frame(kind, adversary):
-    """Eagerly, each with a plan of its own, and under `jit` with one that grows."""
-    plan, derived = None, True
-    for nth in range(EACH):
-        frame = scene, camera, settings = drawn(kind, nth, adversary)
+    """Eagerly, each with a plan of its own; and under `jit` with one of all, but for those that need octrees of the host's."""
+    frames, plan, derived = [drawn(kind, nth, adversary) for nth in range(EAGER + TRACED)], None, True
+    for frame in frames[:EAGER]:
         try:
-            check(kind, js.render(scene, camera, settings), (), frame)
+            check(kind, js.render(*frame), (), frame)
         except ValueError as error:  # of supports over four decades, whose volumes are alike
             assert "the strengths volume / support^3 of the particles are too far apart" in str(error)
-        scene, camera, settings = frame = drawn(kind, EACH + nth, adversary)
-        if reachable(scene, settings) is not scene:  # octrees are built on the host: refused under `jit`, by name
-            continue
-        plan = js.plan(scene, camera, settings, like=plan, headroom=4)
+    frames = [frame for frame in frames[EAGER:] if reachable(frame[0], frame[2]) is frame[0]]
+    for frame in frames:
+        plan = js.plan(*frame, like=plan, headroom=4)
+    for frame in frames:
         try:
-            found = traced((scene, camera), settings, plan=plan, derived=derived)
+            found = traced(frame[:2], frame[2], plan=plan, derived=derived)
         except NotImplementedError as error:
             assert derived and "`" in str(error)
-            found = traced((scene, camera), settings, plan=plan, derived=(derived := False))
+            found = traced(frame[:2], frame[2], plan=plan, derived=(derived := False))
         check(kind, *found, frame)
 
 

@@ -170,7 +170,8 @@ def test_a_camera_of_another_size_and_a_target_behind_the_eye_are_refused():
 def test_figures_need_no_display_and_leave_pyplot_alone():
     code = (
         "import sys, numpy as np, jaxsph as js\n"
-        "image = js.Image(np.zeros((20, 30, 3)), np.ones((20, 30)), np.ones((20, 30)), np.ones((20, 30)), 0, True, 0, {})\n"
+        "layer = np.ones((20, 30))\n"
+        "image = js.Image(np.zeros((20, 30, 3)), layer, layer, layer, layer, True, 0, {})\n"
         "image.figure(labels='x'); js.TransferFunction.from_colormap('heat', (0, 1)).figure()\n"
         "assert 'matplotlib.figure' in sys.modules and 'matplotlib.pyplot' not in sys.modules"
     )

@@ -66,7 +66,7 @@ def refuse_strangers(parts: Sequence[ParticleTable], count: int) -> None:
             if own != other:
                 raise DataError(f"{part.path}: has {name} = {own}, and {first.path} {other}: {STRANGERS}")
         twin = seen.setdefault(part.position[:1].tobytes(), part) if len(part) else part
-        if twin is not part and np.array_equal(twin.position, part.position):
+        if twin is not part and np.array_equal(twin.position, part.position) and np.ptp(part.position, 0).any():
             raise DataError(f"{part.path}: has the particles of {twin.path} once more: {STRANGERS}")
     if not is_all(count, first):
         raise DataError(f"{first.path}: announces {first.announced} particles, and its files have {count}: {STRANGERS}")
