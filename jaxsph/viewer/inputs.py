@@ -16,6 +16,8 @@ from jaxsph.viewer.control_points import ControlPoints, Point, Steps
 from jaxsph.viewer.pose import Pose
 
 MAX_SHARE, MAX_FACTOR, MAX_DEGREES = 100.0, 100.0, 3600.0
+MIN_SIDE, MAX_SIDE, MAX_PIXELS = 16, 16384, 3840 * 2160
+"""Of a picture that is as large as a page has room for."""
 AXES = ("x", "-x", "y", "-y", "z", "-z", "iso")
 ROW = 5  # numbers of a control point: place, extinction, red, green, blue
 
@@ -38,6 +40,14 @@ def word(message: dict[str, Any], name: str, known: tuple[str, ...]) -> str:
     if value not in known:
         raise InputError(f"`{name}` of {message.get('do')!r} must be one of {', '.join(known)}, got {_short(value)}")
     return str(value)
+
+
+def size_of(message: dict[str, Any]) -> tuple[int, int]:
+    """Width and height of a picture that a page has room for, pixels; smaller where these are more than `MAX_PIXELS`."""
+    sides = [number(message, name, 1, MAX_SIDE) for name in ("width", "height")]
+    share = min(1.0, math.sqrt(MAX_PIXELS / math.prod(sides)))
+    width, height = (max(MIN_SIDE, int(share * side)) for side in sides)
+    return width, height
 
 
 def points_of(message: dict[str, Any]) -> list[Point]:

@@ -35,7 +35,7 @@ class Picture:
         image, scene, camera: what it is, and what it was made of.
         settings: likewise.
         pose: of the camera.
-        facts: numbers for the page: `error`, `rays_left`, `milliseconds`.
+        facts: numbers for the page: `size` of the full picture, `error`, `rays_left`, `milliseconds`.
     """
 
     version: int
@@ -93,6 +93,7 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     left = camera.width * camera.height - height * width
     bound = np.nan_to_num(np.asarray(image.error_bound, np.float64), nan=0.0, neginf=0.0, posinf=1.0)
     facts: dict[str, Any] = {"rays_left": left, "milliseconds": round(1000 * seconds), "error": None}
+    facts["size"] = [camera.width, camera.height]
     if settings.tolerance is None:
         error = "error not estimated" if scene.surface is None else OF_SURFACE
         words = f"{width} x {height}, {settings.samples} samples a ray; {error}"

@@ -83,6 +83,12 @@ class Pose:
             return Camera.look_at(eye, target, up, 2 * math.degrees(math.atan(self.tangent)), width, height)
         return Camera.orthographic(eye, target, up, self.height, width, height)
 
+    def around(self, width: int, height: int) -> list[Camera]:
+        """Cameras around this one, for whose views there is to be room."""
+        poses = [self.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [self.orbited(0, tilt) for tilt in (0.4, -0.4)]
+        poses += [self.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
+        return [pose.camera(width, height) for pose in poses]
+
     def orbited(self, right: float, down: float) -> Pose:
         """Turned as if the target was dragged: by shares of the picture's height."""
         around = self.pole if self.pole @ self.axes[1] >= 0 else -self.pole

@@ -24,7 +24,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.code import Source
 from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
-from jaxsph.viewer.inputs import InputError, number
+from jaxsph.viewer.inputs import InputError, number, size_of
 from jaxsph.viewer.picture import Picture, described
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
@@ -33,6 +33,8 @@ from jaxsph.viewer.timeline import Timeline
 
 REST_SECONDS = 0.2
 """How long nothing moves before more than drafts are made."""
+FIRST_SECONDS = 5.0
+"""How long a view that is as large as its page waits for the size of one: programs of another would be compiled for nobody."""
 Listener = Callable[[Any], None]
 
 
@@ -43,6 +45,7 @@ class Snapshot(NamedTuple):
     scene: Scene
     camera: Camera
     pose: Pose
+    stages: tuple[Stage, ...]
 
 
 class Session:
@@ -52,7 +55,7 @@ class Session:
 
     Attributes:
         settings: of the last picture of a state.
-        stages: how pictures are made, the draft first.
+        stages: how pictures of the newest size are made, the draft first.
         told: a reason why there is no picture of the settings, for people; empty where there is.
     """
 
@@ -63,6 +66,8 @@ class Session:
         settings: Settings | None = None,
         source: Source | None = None,
         timeline: Timeline | None = None,
+        *,
+        fits: bool = False,
     ) -> None:
         """Begin with what `jaxsph.render(scene, camera, settings)` takes; nothing is rendered yet.
 
@@ -71,6 +76,7 @@ class Session:
             settings: of the last picture of a state; None is `stages.default_of(scene)`.
             source: where the scene comes from, for the code that makes it again.
             timeline: the sequence that it is a frame of, if it is.
+            fits: whether pictures are as large as a page has room for, instead of as the camera says.
 
         Raises:
             ValueError: a scene with nothing in it, or a camera that is none; a tolerance of a surface of particles.
@@ -81,9 +87,9 @@ class Session:
         if scene.surface is not None:
             along_rays(scene, self.settings)
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
-        self._timeline = timeline
+        self._timeline, self._fits = timeline, fits
         self._state = State(scene, camera)
-        self._version, self._drawn, self._failed, self._changed = 1, 0, 0, 0.0
+        self._version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
         self._histogram: Any = None
@@ -99,6 +105,7 @@ class Session:
 
     def start(self) -> Session:
         """Begin to render."""
+        self._begins = time.monotonic() + FIRST_SECONDS if self._fits else 0.0
         for work in (self._draft, self._finish, *([] if self._timeline is None else [self._read])):
             thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
             self._threads.append(thread)
@@ -139,7 +146,7 @@ class Session:
         """The newest state."""
         with self._lock:
             state = self._state
-            return Snapshot(self._version, state.scene, state.camera, state.pose)
+            return Snapshot(self._version, state.scene, state.camera, state.pose, self.stages)
 
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
@@ -213,7 +220,8 @@ class Session:
         """Do what a message asks for.
 
         Args:
-            message: `{"do": NAME, ...}`, see `State.do`; also `pick`, and `frame` with a `number` from 0 on, of a sequence.
+            message: `{"do": NAME, ...}`, see `State.do`; also `pick`, `frame` with a `number` from 0 on, of a sequence, and
+                `size` with the `width` and `height` that a page has room for, pixels: it is done where the view fits its page.
 
         Returns:
             An answer for who asked, where there is one.
@@ -232,17 +240,32 @@ class Session:
                 self._timeline.ask(int(number(message, "number", 0, len(self._timeline.frames) - 1)))
                 return None
             with self._lock:
-                self._state.do(message, self._seen)
-                if message["do"] in QUIET:
-                    return None
-                self._version += 1
-                self._changed = time.monotonic()
-                self._lock.notify_all()
+                if message["do"] == "size":
+                    self._fit(*size_of(message))
+                else:
+                    self._state.do(message, self._seen)
+                    if message["do"] not in QUIET:
+                        self._renew()
         except InputError:
             raise
         except (ValueError, ArithmeticError) as error:
             raise InputError(str(error)) from error
         return None
+
+    def _fit(self, width: int, height: int) -> None:
+        """Make pictures of so many pixels from now on, where nobody said of how many."""
+        if self._fits:
+            self._begins = 0.0
+            if self._state.resize(width, height):
+                self.stages = stages_of(self.settings, self._state.camera)
+                self._renew()
+            self._lock.notify_all()
+
+    def _renew(self) -> None:
+        """Have pictures of what is now another state."""
+        self._version += 1
+        self._changed = time.monotonic()
+        self._lock.notify_all()
 
     def _seen(self, message: dict[str, Any]) -> np.ndarray:
         """The place at half light under a place of the picture."""
@@ -276,7 +299,7 @@ class Session:
     def _draft(self) -> None:
         """A draft of every state that is still the newest when the one before is done."""
         while (state := self._next(self._drawn)) is not None:
-            self._show(self.stages[0], state, lambda: False)
+            self._show(state.stages[0], state, lambda: False)
             with self._lock:
                 self._drawn = state.version
                 self._lock.notify_all()
@@ -286,7 +309,7 @@ class Session:
         done = 0
         while (state := self._next(done, rest=True)) is not None:
             moved = self._is_old(state)
-            for stage in self.stages[1:]:
+            for stage in state.stages[1:]:
                 if moved() or not self._show(stage, state, moved):
                     break
             if not moved():
@@ -304,16 +327,14 @@ class Session:
             with self._lock:
                 self._timeline.number = number  # type: ignore[union-attr]
                 self._state.frame(scene)
-                self._version += 1
-                self._changed = time.monotonic()
-                self._lock.notify_all()
+                self._renew()
         self._send(self.state())
 
     def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
         """The newest state as soon as there is one after `done`, and it rests and is drafted if it has to; None at the end."""
         with self._lock:
             while not self._closed:
-                still = REST_SECONDS - (time.monotonic() - self._changed) if rest else 0.0
+                still = max(self._begins, self._changed + REST_SECONDS if rest else 0.0) - time.monotonic()
                 ready = self._version > done and (self._drawn == self._version or not rest)
                 if ready and still <= 0:
                     return self.snapshot()
@@ -328,8 +349,8 @@ class Session:
         started = time.perf_counter()
         try:
             if not stage.made:
-                with self._lock:
-                    around = self._state.around
+                size = state.camera.width, state.camera.height
+                around = [] if state.scene.media else state.pose.around(*size)  # media do not say how large they are
                 stage.prepare(state.scene, [state.camera, *around])
             image = stage.image(state.scene, state.camera, stop)
         except Abandoned:
@@ -338,7 +359,7 @@ class Session:
             self._tell(stage, state, error)
             return False
         words, facts = described(stage, image, state.scene, state.camera, time.perf_counter() - started)
-        final = stage is self.stages[-1]
+        final = stage is state.stages[-1]
         made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
         picture = Picture(state.version, stage.name, words, final, *made, facts)
         with self._lock:

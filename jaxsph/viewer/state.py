@@ -50,7 +50,7 @@ class State:
             ValueError: a camera that is none.
         """
         look = first_look(scene)
-        self._given, self._first = camera, Pose.of(camera, scene)
+        self._given, self._first, self._resized = camera, Pose.of(camera, scene), False
         self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
         self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
         self._base, self._keys = scene, []  # type: Scene, list[tuple[Camera, np.ndarray]]
@@ -65,14 +65,6 @@ class State:
         if self._base.media:  # which do not say how large they are
             camera = dataclasses.replace(camera, near=self._given.near, far=self._given.far)
         return camera
-
-    @property
-    def around(self) -> list[Camera]:
-        """Views around this one, for which there is to be room."""
-        size, pose = (self._given.width, self._given.height), self.pose
-        poses = [pose.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [pose.orbited(0, tilt) for tilt in (0.4, -0.4)]
-        poses += [pose.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
-        return [] if self._base.media else [one.camera(*size) for one in poses]
 
     @property
     def transfer(self) -> TransferFunction | None:
@@ -114,9 +106,12 @@ class State:
         }
 
     def code(self, source: Source, settings: Settings) -> dict[str, str]:
-        """The Python that makes it again."""
+        """The Python that makes it again, in as many pixels."""
         moved, edited = self.moved or source.whole, self.edited or source.whole
         pose, look = self.pose if moved else None, self.transfer if edited else None
+        if self._resized and not moved:
+            size = f"width={self._given.width}, height={self._given.height}"
+            source = dataclasses.replace(source, python=f"{source.python}\ncamera = dataclasses.replace(camera, {size})")
         return {"python": python_of(source, self.camera, pose, look, settings, self.scene.within)}
 
     def do(self, message: dict[str, Any], seen: Seen) -> None:
@@ -170,6 +165,14 @@ class State:
         """Show another frame of a sequence, with the look, the camera and the cut that there are."""
         self._base = scene
         self.scene = self._looked()
+
+    def resize(self, width: int, height: int) -> bool:
+        """Have so many pixels, of key frames, too, all of one size; whether that is new. What is seen keeps its height."""
+        if (self._given.width, self._given.height) == (width, height):
+            return False
+        self._given, self._resized = dataclasses.replace(self._given, width=width, height=height), True
+        self._keys = [(dataclasses.replace(camera, width=width, height=height), middle) for camera, middle in self._keys]
+        return True
 
     def _move(self, pose: Pose) -> None:
         pose.camera(1, 1)  # refuses what is none

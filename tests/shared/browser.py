@@ -24,13 +24,13 @@ def found():
 class Page:
     """A tab."""
 
-    def __init__(self, browser, address):
+    def __init__(self, browser, address, scale):
         request = urllib.request.Request(f"http://127.0.0.1:{browser.port}/json/new?about:blank", method="PUT")
         with urllib.request.urlopen(request, timeout=SECONDS) as answer:
             told = json.load(answer)
         self.opened = contextlib.ExitStack()
         self.socket = self.opened.enter_context(connect(told["webSocketDebuggerUrl"], max_size=None, open_timeout=SECONDS))
-        self.number, self.said = 0, []
+        self.number, self.said, self.scale = 0, [], scale
         self.call("Page.enable")
         self.call("Runtime.enable")
         self.call("Log.enable")
@@ -50,7 +50,8 @@ class Page:
                 self.said.append(message["params"])
 
     def size(self, width, height):
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        size = {"width": width, "height": height}
+        self.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=self.scale, mobile=False)
 
     def go(self, address):
         self.call("Page.navigate", url=address)
@@ -124,8 +125,9 @@ class Browser:
         self.port = int(place.read_text().split()[0])
         self.pages = []
 
-    def page(self, address):
-        self.pages.append(Page(self, address))
+    def page(self, address, scale=1):
+        """A tab, on a screen that has so many pixels for one of its window, along each side."""
+        self.pages.append(Page(self, address, scale))
         return self.pages[-1]
 
     def close(self):

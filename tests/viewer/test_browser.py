@@ -29,7 +29,7 @@ SECONDS = 120
 @contextlib.contextmanager
 def served(*more, of=(f"scene:radial:particles={PARTICLES}",), size=SIZE):
     """A view that is served, as the command line does it, with pictures of the reference: its address."""
-    words = [*of, "--size", f"{size[0]}x{size[1]}", "--samples", str(SAMPLES)]
+    words = [*of, *([] if size is None else ["--size", f"{size[0]}x{size[1]}"]), "--samples", str(SAMPLES)]
     more = ["--integrator", "samples", "--no-browser", "-q", *more]
     command = [sys.executable, by_reference.__file__, "view", *words, *more]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
@@ -62,9 +62,9 @@ def page(browser, address):
 
 
 @contextlib.contextmanager
-def opened(browser, address):
+def opened(browser, address, scale=1):
     """The page once its picture stands still; nothing may go wrong in it."""
-    made = browser.page(address)
+    made = browser.page(address, scale)
     made.until("document.body.dataset.final == 'true'", SECONDS)
     yield made
     assert not [said for said in made.said if "exceptionDetails" in said or said["entry"]["level"] == "error"]
@@ -288,6 +288,20 @@ def test_in_small_windows_all_controls_can_be_reached(page, size, direction):
     top, bottom, last, window, panel, picture = page.ask(reach)
     assert 0 <= top < bottom <= window + 1 and last <= bottom + 1 and panel > 120 and picture > 60
     page.size(1280, 800)
+
+
+def test_a_picture_has_the_pixels_of_the_screen_that_its_window_has_room_for(browser):
+    room = "[document.querySelector('.frame')].map((e) => e.getBoundingClientRect())"
+    room += ".flatMap((b) => [b.height, b.width]).map((side) => Math.round(devicePixelRatio * side))"
+    with served(size=None) as address, opened(browser, address, 0.1) as page:
+        for size in ((1280, 800), (900, 660)):
+            changed(page, lambda size=size: page.size(*size)) if size != (1280, 800) else None
+            picture = shown(page)
+            assert list(picture.shape[:2]) == page.ask(room) and near(picture, rendered(page)) and picture.max() > 100
+        before = shown(page)
+        page.ask("document.querySelector('.words').textContent = 'word '.repeat(200)")  # words are no window
+        time.sleep(0.5)
+        assert shown(page).shape == before.shape
 
 
 def test_nothing_says_that_a_picture_is_final_until_it_is_that_of_the_view(page):

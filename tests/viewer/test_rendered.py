@@ -63,6 +63,15 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session):
     assert not compiled
 
 
+def test_a_colour_map_compiles_nothing(session):
+    session.wait(seconds=SECONDS)
+    compiled = compiles()
+    session.do({"do": "colormap", "name": "magma"})
+    picture, state = session.wait(seconds=SECONDS), session.snapshot()
+    assert not compiled
+    assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
+
+
 def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, tmp_path, monkeypatch):
     session.do({"do": "cut", "kind": "plane"})
     session.do({"do": "orbit", "right": 0.1, "down": 0})

@@ -298,6 +298,20 @@ def test_settings_of_the_command():
     assert made(command.View(), fluid).tolerance is None  # a surface has none
 
 
+def test_a_view_fits_its_window_unless_a_size_was_asked_for(monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr(command, "run", lambda server, ready: opened.append(server.session))
+    for size in ([], ["--size", "8x8"]):
+        assert commanded(capsys, "view", "scene:radial:particles=50", "--no-browser", *size)[0] == 0
+    for session, size in zip(opened, ([64, 48], [8, 8]), strict=True):
+        session.do({"do": "size", "width": 64, "height": 48})
+        space, seen = {}, session.snapshot().camera
+        exec(session.code()["python"].partition("image = ")[0], space)
+        assert session.state()["size"] == size == [space["camera"].width, space["camera"].height]
+        for one, other in zip(jax.tree.leaves(space["camera"]), jax.tree.leaves(seen), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
 def test_the_token_is_in_no_command_line(tmp_path, monkeypatch, capsys):
     """A browser is started with the name of a file that leads to the address, and that this user alone can read."""
     opened = []

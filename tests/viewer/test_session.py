@@ -13,7 +13,7 @@ import jaxsph as js
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.viewer import session as views
 from jaxsph.viewer.explained import histogram_of
-from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.inputs import MAX_PIXELS, InputError, size_of
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
 
@@ -133,7 +133,10 @@ def test_the_code_that_is_told_makes_the_picture(home, tmp_path, monkeypatch):
      {"do": "points", "points": [[0, 1, 2, 0, 0]]}, {"do": "colormap", "name": "nothing of the kind"}, {"do": "colormap"},
      {"do": "restore"}, {"do": "restore", "pose": {"target": [0, 0]}}, {"do": "pick"}, {"do": "exposure", "stops": True},
      {"do": "restore", "pose": {"target": [0, 0, 0], "pole": [0, 0, 0], "forward": [0, 0, 1], "up": [0, 1, 0], "distance": 4,
-                                "tangent": 0.3, "perspective": True}}],
+                                "tangent": 0.3, "perspective": True}},
+     {"do": "size"}, {"do": "size", "width": 40}, {"do": "size", "width": "wide", "height": 30},
+     {"do": "size", "width": -4, "height": 30}, {"do": "size", "width": 40, "height": 0},
+     {"do": "size", "width": 40, "height": float("nan")}, {"do": "size", "width": 1e9, "height": 3}],
     ids=str,
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused_and_changes_nothing(session, message):
@@ -141,6 +144,43 @@ def test_what_makes_no_sense_is_refused_and_changes_nothing(session, message):
     with pytest.raises(InputError):
         session.do(message)
     assert session.version == version
+
+
+def test_a_view_has_as_many_pixels_as_its_page_has_room_for_and_so_has_its_code():
+    with pictures_by_reference(), Session(scene(), camera(), SETTINGS, fits=True) as made:
+        made.do({"do": "key"})
+        made.do({"do": "size", "width": 40, "height": 36})
+        made.do({"do": "key"})
+        whole = made.wait(seconds=SECONDS)
+        assert made.state()["size"] == whole.header()["size"] == [40, 36] and whole.image.shape == (36, 40)
+        assert {(one.width, one.height) for one in made.path.legs[0].cameras} == {(40, 36)}
+        first, seen = camera(), made.snapshot().camera
+        assert seen.half_height == first.half_height and seen.near == first.near  # of another width alone
+        for message in ({"do": "size", "width": 40, "height": 36}, {"do": "orbit", "right": 0.1, "down": 0}, {"do": "home"}):
+            version = made.version
+            made.do(message)
+            assert (made.version == version) == (message["do"] == "size")
+            space = {"js": js, "dataclasses": dataclasses, "scene": scene(), "camera": first}
+            exec(made.code()["python"].partition("image = ")[0], space)
+            for one, other in zip(jax.tree.leaves(space["camera"]), jax.tree.leaves(made.snapshot().camera), strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
+            assert (space["camera"].width, space["camera"].height) == (40, 36)
+
+
+def test_a_size_that_was_given_stays(home):
+    version = home.version
+    home.do({"do": "size", "width": 40, "height": 36})
+    assert home.version == version and home.state()["size"] == [WIDTH, HEIGHT]
+
+
+@pytest.mark.parametrize("asked", [(1, 1), (1, 9000), (3000, 2000), (9000, 4000), (16384, 16384)], ids=str)
+def test_a_picture_is_as_large_as_there_is_room_within_limits(asked):
+    width, height = size_of({"do": "size", "width": asked[0], "height": asked[1]})
+    assert min(width, height) >= 16 and width * height <= MAX_PIXELS
+    if min(asked) >= 16:
+        assert width / height == pytest.approx(asked[0] / asked[1], rel=1e-3)
+    if min(asked) >= 16 and asked[0] * asked[1] <= MAX_PIXELS:
+        assert (width, height) == asked
 
 
 @pytest.mark.parametrize("within", [None, js.Sphere((0, 0, 0), 0.5)], ids=["everywhere", "in a clip"])
@@ -157,6 +197,7 @@ class Slow:
     def __init__(self, name):
         self.name, self.settings, self.made = name, SETTINGS, 1
         self.begun, self.go, self.seen, self.left = threading.Semaphore(0), threading.Semaphore(0), [], []
+        self.sizes = set()
 
     def camera(self, camera):
         return camera
@@ -166,6 +207,7 @@ class Slow:
 
     def image(self, shown, camera, stop):
         self.seen.append(float(camera.eye[0]))
+        self.sizes.add((camera.width, camera.height))
         self.begun.release()
         assert self.go.acquire(timeout=60)
         if stop():
@@ -210,6 +252,38 @@ def test_a_picture_that_is_old_is_left_at_its_next_stage_and_drafts_go_on_beside
     full.go.release()
     assert slow.wait(FULL, 60).version == 2
     assert len(full.left) == 1 and full.left[0] == full.seen[0]
+
+
+def test_a_colour_map_is_drafted_at_once_beside_what_is_under_way(slow):
+    draft, full = slow.stages
+    draft.go.release(100)
+    slow.wait(DRAFT, 60)
+    assert full.begun.acquire(timeout=60)  # which is now held up
+    slow.do({"do": "colormap", "name": "viridis"})
+    assert slow.wait(DRAFT, 60).version == 2 and not full.left
+
+
+@pytest.mark.parametrize("says", [True, False], ids=["says its size", "says none"])
+def test_a_view_that_fits_begins_with_the_size_of_its_page(monkeypatch, says):
+    """No stage sees another size than its own; where no page says one, the view begins after a while."""
+    made = []
+
+    def stages(*_):
+        made.append((Slow(DRAFT), Slow(FULL)))
+        return made[-1]
+
+    monkeypatch.setattr(views, "stages_of", stages)
+    monkeypatch.setattr(views, "FIRST_SECONDS", 60.0 if says else 0.05)
+    with Session(scene(), camera(), SETTINGS, fits=True) as session:
+        if says:
+            assert not made[0][0].begun.acquire(timeout=0.1)
+            session.do({"do": "size", "width": WIDTH, "height": HEIGHT})  # which it has
+        assert made[0][0].begun.acquire(timeout=30)
+        session.do({"do": "size", "width": 40, "height": 36})
+        for stage in (*made[0], *made[1]):
+            stage.go.release(100)
+        assert session.wait(FULL, 30).version == 2
+    assert made[0][0].sizes == {(WIDTH, HEIGHT)} and made[1][0].sizes == made[1][1].sizes == {(40, 36)} and len(made) == 2
 
 
 def test_a_stage_that_fails_is_told_and_the_view_goes_on(slow, monkeypatch):

@@ -93,15 +93,6 @@ class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, gro
         str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
     ] = None
 
-    def __post_init__(self) -> None:
-        """Check what each group checks, with a size."""
-        if self.size is not None:
-            super().__post_init__()
-            return
-        object.__setattr__(self, "size", (512, 512))
-        super().__post_init__()
-        object.__setattr__(self, "size", None)
-
 
 MOVIE = Movie()
 

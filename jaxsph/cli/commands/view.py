@@ -36,6 +36,8 @@ from jaxsph.viewer.stages import DEFAULT
 from jaxsph.viewer.timeline import Timeline, timeline_of
 
 MAX_PORT = 65535
+SIZE = 960, 720
+"""Until the window says how large it is."""
 SECONDS = 1.0
 """How long the end waits for a picture that is being made."""
 
@@ -45,7 +47,7 @@ SECONDS = 1.0
 class View(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
 
-    size: Annotated[tuple[int, int], option("--size", "WxH", values.size, CAMERA, "pixels (default 960x720)")] = (960, 720)
+    size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: as the window has room for)")] = None
     tolerance: Annotated[
         float | None,
         option("--tolerance", "T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"),
@@ -66,7 +68,7 @@ def view(
     """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
     if not files:
         raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
-    options = dataclasses.replace(asked, source=files[0] if len(files) == 1 else list(files))
+    options = dataclasses.replace(asked, source=files[0] if len(files) == 1 else list(files), size=asked.size or SIZE)
     if not 0 <= options.port <= MAX_PORT:
         raise UsageError(f"--port must lie from 0 to {MAX_PORT}, got {options.port}; 0 takes any that is free")
     if options.json:
@@ -82,7 +84,8 @@ def view(
     settings = _settings(options, scene)
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
-    session = Session(scene, camera, settings, _source(options) if timeline is None else None, timeline)
+    source = _source(options) if timeline is None else None
+    session = Session(scene, camera, settings, source, timeline, fits=asked.size is None)
     server, opens = Server(session, options.port), not options.no_browser
 
     with tempfile.TemporaryDirectory(prefix="jaxsph-") as folder:  # this user's alone, unlike what browsers are started with

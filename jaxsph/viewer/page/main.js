@@ -3,6 +3,7 @@ import { mount } from "./view.js";
 
 const RETRY = 1000; // milliseconds
 const KEEP = 400;
+const STILL = 250;
 
 function link() {
   const heard = [];
@@ -65,7 +66,26 @@ function kept(one) {
   });
 }
 
+// A view fits the window, in the pixels of its screen: at once, then whenever the window has come to rest. Words that come and go
+// below the picture are no reason.
+function fitted(one) {
+  let timer = 0;
+  const fit = () => {
+    const { width, height } = document.querySelector(".frame").getBoundingClientRect();
+    const [across, down] = [width, height].map((side) => Math.round(devicePixelRatio * side));
+    if (across && down) one.send({ do: "size", width: across, height: down });
+  };
+  const soon = () => {
+    clearTimeout(timer);
+    timer = setTimeout(fit, STILL);
+  };
+  fit();
+  new ResizeObserver(soon).observe(document.body);
+  addEventListener("resize", soon); // also where its pixels alone become others
+}
+
 const one = link();
 mount(document.body, one);
 kept(one);
+fitted(one);
 one.open();

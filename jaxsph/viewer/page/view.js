@@ -91,20 +91,26 @@ export function mount(root, link) {
   }
   moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, g: () => send({ do: "key" }), b: () => send({ do: "unkey" }), "?": () => help.showModal() });
 
+  // The height of the canvas, in its middle: where it has got another width, what a former picture shows stays where it was.
+  function paint(what, width, height) {
+    const brush = picture.getContext("2d"), across = (picture.height * width) / height;
+    Object.assign(brush, { imageSmoothingEnabled: true, imageSmoothingQuality: "high" });
+    brush.clearRect(0, 0, picture.width, picture.height);
+    brush.drawImage(what, (picture.width - across) / 2, 0, across, picture.height);
+  }
+  function resize([width, height]) {
+    if (picture.width === width && picture.height === height) return;
+    const former = made("canvas", { width: picture.width, height: picture.height });
+    former.getContext("2d").drawImage(picture, 0, 0);
+    Object.assign(picture, { width, height });
+    paint(former, former.width, former.height);
+  }
   async function show(header, blob) {
     const turn = ++drawing;
     const bitmap = await createImageBitmap(blob);
     if (turn < (shown?.turn ?? 0)) return bitmap.close();
     shown = { ...header, turn };
-    const [width, height] = state ? state.size : [header.width, header.height];
-    if (picture.width !== width || picture.height !== height) {
-      Object.assign(picture, { width, height });
-      place();
-    }
-    const brush = picture.getContext("2d");
-    brush.imageSmoothingEnabled = true;
-    brush.imageSmoothingQuality = "high";
-    brush.drawImage(bitmap, 0, 0, width, height);
+    paint(bitmap, ...header.size);
     bitmap.close();
     clearTimeout(late);
     late = 0;
@@ -172,6 +178,7 @@ export function mount(root, link) {
     else if (message.is === "state") {
       if (numbers.children.length > 2 && state?.version !== message.version) numbers.classList.add("stale");
       state = message;
+      resize(state.size);
       if (shown && shown.version < state.version) awaited();
       complain(message.told || message.frames?.why);
       edit.show(message.look);
