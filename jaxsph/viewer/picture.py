@@ -74,6 +74,7 @@ class Picture:
             "format": self.format,
             "width": width,
             "height": height,
+            "tangent": self.pose.tangent,
             **self.facts,
         }
 

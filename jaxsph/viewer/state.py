@@ -19,6 +19,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.checks import product
 from jaxsph.viewer.code import Source, python_of
 from jaxsph.viewer.control_points import ControlPoints, Steps, first_look, is_flat, looking
 from jaxsph.viewer.cut import Cut, asked, read
@@ -50,7 +51,7 @@ class State:
             ValueError: a camera that is none.
         """
         look = first_look(scene)
-        self._given, self._first, self._resized = camera, Pose.of(camera, scene), False
+        self._asked, self._given, self._first, self._taller = camera, camera, Pose.of(camera, scene), 1.0
         self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
         self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))
         self._base, self._keys = scene, []  # type: Scene, list[tuple[Camera, np.ndarray]]
@@ -109,8 +110,8 @@ class State:
         """The Python that makes it again, in as many pixels."""
         moved, edited = self.moved or source.whole, self.edited or source.whole
         pose, look = self.pose if moved else None, self.transfer if edited else None
-        if self._resized and not moved:
-            size = f"width={self._given.width}, height={self._given.height}"
+        if self._given is not self._asked and not moved:
+            size = f"width={self._given.width}, height={self._given.height}, half_height=camera.half_height * {self._taller!r}"
             source = dataclasses.replace(source, python=f"{source.python}\ncamera = dataclasses.replace(camera, {size})")
         return {"python": python_of(source, self.camera, pose, look, settings, self.scene.within)}
 
@@ -167,11 +168,20 @@ class State:
         self.scene = self._looked()
 
     def resize(self, width: int, height: int) -> bool:
-        """Have so many pixels, of key frames, too, all of one size; whether that is new. What is seen keeps its height."""
+        """Have so many pixels, of key frames, too, all of one size; whether that is new.
+
+        What the camera framed stays in the picture: there is more at its sides, or above and below.
+        """
         if (self._given.width, self._given.height) == (width, height):
             return False
-        self._given, self._resized = dataclasses.replace(self._given, width=width, height=height), True
-        self._keys = [(dataclasses.replace(camera, width=width, height=height), middle) for camera, middle in self._keys]
+        taller = max(1.0, self._asked.width / self._asked.height * height / width)
+        more, self._taller = taller / self._taller, taller
+
+        def sized(camera: Camera, factor: float) -> Camera:
+            return dataclasses.replace(camera, width=width, height=height, half_height=product(camera.half_height, factor))
+
+        self._given, self._keys = sized(self._asked, taller), [(sized(camera, more), middle) for camera, middle in self._keys]
+        self._first, self.pose = (dataclasses.replace(pose, tangent=more * pose.tangent) for pose in (self._first, self.pose))
         return True
 
     def _move(self, pose: Pose) -> None:

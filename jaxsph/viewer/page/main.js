@@ -86,6 +86,6 @@ function fitted(one) {
 
 const one = link();
 mount(document.body, one);
-kept(one);
 fitted(one);
+kept(one); // in the window's own shape
 one.open();

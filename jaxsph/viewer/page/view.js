@@ -91,26 +91,27 @@ export function mount(root, link) {
   }
   moves(picture, send, { ...cut.keys, ...time.keys, p: turnRays, s: save, g: () => send({ do: "key" }), b: () => send({ do: "unkey" }), "?": () => help.showModal() });
 
-  // The height of the canvas, in its middle: where it has got another width, what a former picture shows stays where it was.
-  function paint(what, width, height) {
-    const brush = picture.getContext("2d"), across = (picture.height * width) / height;
+  // In the middle of the canvas: where it has got another size, what a former picture shows is where it will be.
+  function paint(what, width, height, tangent) {
+    const down = picture.height * (tangent / (state?.pose.tangent ?? tangent)), across = (down * width) / height;
+    const brush = picture.getContext("2d");
     Object.assign(brush, { imageSmoothingEnabled: true, imageSmoothingQuality: "high" });
     brush.clearRect(0, 0, picture.width, picture.height);
-    brush.drawImage(what, (picture.width - across) / 2, 0, across, picture.height);
+    brush.drawImage(what, (picture.width - across) / 2, (picture.height - down) / 2, across, down);
   }
-  function resize([width, height]) {
+  function resize([width, height], tangent) {
     if (picture.width === width && picture.height === height) return;
     const former = made("canvas", { width: picture.width, height: picture.height });
     former.getContext("2d").drawImage(picture, 0, 0);
     Object.assign(picture, { width, height });
-    paint(former, former.width, former.height);
+    paint(former, former.width, former.height, tangent);
   }
   async function show(header, blob) {
     const turn = ++drawing;
     const bitmap = await createImageBitmap(blob);
     if (turn < (shown?.turn ?? 0)) return bitmap.close();
     shown = { ...header, turn };
-    paint(bitmap, ...header.size);
+    paint(bitmap, ...header.size, header.tangent);
     bitmap.close();
     clearTimeout(late);
     late = 0;
@@ -177,8 +178,9 @@ export function mount(root, link) {
     if (message.is === "picture") show(message, blob);
     else if (message.is === "state") {
       if (numbers.children.length > 2 && state?.version !== message.version) numbers.classList.add("stale");
+      const { tangent } = (state ?? message).pose;
       state = message;
-      resize(state.size);
+      resize(state.size, tangent);
       if (shown && shown.version < state.version) awaited();
       complain(message.told || message.frames?.why);
       edit.show(message.look);
