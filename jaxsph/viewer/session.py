@@ -208,11 +208,9 @@ class Session:
     def whole(self, seconds: float = 600.0) -> Picture:
         """The best picture of all pixels of the newest state; waits where there is but a draft."""
         picture = self.picture
-        return (
-            picture
-            if picture is not None and picture.version == self._version and picture.stage != DRAFT
-            else self.wait(FULL, seconds)
-        )
+        if picture is not None and picture.version == self._version and picture.stage != DRAFT:
+            return picture
+        return self.wait(FULL, seconds)
 
     # What is done.
 
@@ -233,7 +231,7 @@ class Session:
             raise InputError('a message must be an object such as {"do": "orbit", "right": 0.1, "down": 0}')
         try:
             if message["do"] == "pick":
-                return self._picked(message)
+                return {"is": "picked", **told_of_pixel(*self._pointed(message))}
             if message["do"] == "frame":
                 if self._timeline is None:
                     raise InputError("this view is of no sequence of snapshots")
@@ -267,24 +265,20 @@ class Session:
         self._changed = time.monotonic()
         self._lock.notify_all()
 
-    def _seen(self, message: dict[str, Any]) -> np.ndarray:
-        """The place at half light under a place of the picture."""
+    def _pointed(self, message: dict[str, Any]) -> tuple[Picture, float, float]:
+        """The picture, and the place in it that a message says."""
         picture = self.picture
         right, down = (number(message, name, -10, 10) for name in ("right", "down"))
         if picture is None:
             raise InputError("there is no picture yet")
-        place = place_seen(picture, right, down)
+        return picture, right, down
+
+    def _seen(self, message: dict[str, Any]) -> np.ndarray:
+        """The place at half light under a place of the picture."""
+        place = place_seen(*self._pointed(message))
         if place is None:
             raise InputError("nothing is seen there: no surface, and less than half of the light is absorbed")
         return place
-
-    def _picked(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Numbers of a pixel."""
-        picture = self.picture
-        right, down = (number(message, name, -10, 10) for name in ("right", "down"))
-        if picture is None:
-            raise InputError("there is no picture yet")
-        return {"is": "picked", **told_of_pixel(picture, right, down)}
 
     # Threads.
 

@@ -93,6 +93,19 @@ class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, gro
         str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
     ] = None
 
+    def number_of_frames(self, path: CameraPath | None, snapshots: int) -> int:
+        """As many as are asked for, or as the path or the snapshots have."""
+        if self.frames is not None:
+            return self.frames
+        if path is not None and path.end > path.start:
+            seconds = path.end - path.start
+            if seconds * self.fps >= MAX_FRAMES:
+                long = f"lasts {seconds:g} s, from {path.start:g} to {path.end:g}, and times are seconds of the movie"
+                most = f"at --fps {self.fps:g} that is more than {MAX_FRAMES:,} frames"
+                raise ValueError(f"{self.camera}: {long}: {most}; correct the times, or give --frames")
+            return round(seconds * self.fps) + 1
+        return max(snapshots, round(SECONDS * self.fps))
+
 
 MOVIE = Movie()
 
@@ -114,7 +127,7 @@ def movie(
         sources, camera, shown, center, up = _sequence(options) if len(options.source) > 1 else _still(options)
         path = _path(options, camera, shown, sized)
         number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
-        frames = _number_of_frames(options, path, number)
+        frames = options.number_of_frames(path, number)
         if options.orbit is not None:
             within = sources.scene.within if isinstance(sources, Still) else sources.within
             path = _orbit(dataclasses.replace(options, up=options.up or up), camera, shown, within, center, frames / options.fps)
@@ -232,19 +245,6 @@ def _path(options: Any, camera: Camera, shown: Bounded, sized: bool) -> CameraPa
         return None
     size = {"width": camera.width, "height": camera.height} if sized else {}
     return io.read_camera_path(options.camera, shown=shown, **size)
-
-
-def _number_of_frames(options: Any, path: CameraPath | None, snapshots: int) -> int:
-    if options.frames is not None:
-        return int(options.frames)
-    if path is not None and path.end > path.start:
-        seconds = path.end - path.start
-        if seconds * options.fps >= MAX_FRAMES:
-            long = f"lasts {seconds:g} s, from {path.start:g} to {path.end:g}, and times are seconds of the movie"
-            most = f"at --fps {options.fps:g} that is more than {MAX_FRAMES:,} frames"
-            raise ValueError(f"{options.camera}: {long}: {most}; correct the times, or give --frames")
-        return round(seconds * options.fps) + 1
-    return max(snapshots, round(SECONDS * options.fps))
 
 
 class _OnPath(Sequence[Camera]):
