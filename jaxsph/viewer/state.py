@@ -111,7 +111,8 @@ class State:
         moved, edited = self.moved or source.whole, self.edited or source.whole
         pose, look = self.pose if moved else None, self.transfer if edited else None
         if self._given is not self._asked and not moved:
-            size = f"width={self._given.width}, height={self._given.height}, half_height=camera.half_height * {self._taller!r}"
+            size = f"width={self._given.width}, height={self._given.height}"
+            size += f", half_height=camera.half_height * {self._taller!r}" if self._taller > 1 else ""
             source = dataclasses.replace(source, python=f"{source.python}\ncamera = dataclasses.replace(camera, {size})")
         return {"python": python_of(source, self.camera, pose, look, settings, self.scene.within)}
 
