@@ -51,12 +51,11 @@ def tree(
     def register(kind: Kind) -> Kind:
         made: Any = dataclasses.dataclass(frozen=True, **options)(kind)
         MADE.add(made)
-        dropped = ["placed"] if issubclass(made, Placed) else []
-        names = [field.name for field in dataclasses.fields(made) if field.name not in dropped]
+        names = [field.name for field in dataclasses.fields(made)]
         leaves = [name for name in names if (name not in static if traced is None else name in traced)]
         fixed_names = [name for name in names if name not in leaves]
         if not unchecked:
-            jax.tree_util.register_dataclass(made, leaves, fixed_names, dropped)
+            jax.tree_util.register_dataclass(made, leaves, fixed_names)
             return made
 
         def flatten(one: Any) -> tuple[list[Any], tuple[Any, ...]]:
@@ -74,26 +73,33 @@ def tree(
     return register
 
 
+PAIR = property(lambda own: (getattr(own, own.PLACE), getattr(own, own.REST)))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Placed:
     """A base of what holds a place, and beside it what rounding has left of that.
 
-    `dataclasses.replace` hands on what was left of the former place. So the pair as it was made is known, `placed` (no part of
-    the tree), and of another place nothing is left but where it has the same numbers.
+    `dataclasses.replace` hands on what was left of the former place. So it hands on that pair too, `placed`, which is looked up
+    and no field; and of another place nothing is left but where it has the same numbers.
     """
 
     PLACE: ClassVar[str]
     REST: ClassVar[str]
-    placed: tuple[Any, Any] | None = dataclasses.field(default=None, repr=False, compare=False)
+    placed: dataclasses.InitVar[Any] = PAIR
 
-    def __post_init__(self) -> None:
-        place, rest = getattr(self, self.PLACE), getattr(self, self.REST)
-        former = (place, rest) if self.placed is None else self.placed
-        if rest is former[1] and place is not former[0] and place is not None and np.ndim(rest):
-            xp, (now, before, left) = at_hand((place if hasattr(place, "dtype") else np.asarray(place), *former))
-            same = now == before if now.shape == before.shape else xp.zeros(now.shape, bool)
-            rest = array_of(xp.where(same, left if now.shape == before.shape else 0, 0).astype(left.dtype))
-        fill(self, placed=(place, rest), **{self.REST: rest})
+    def __post_init__(self, placed: Any) -> None:
+        if placed is not PAIR:
+            fill(self, **{self.REST: left_of(getattr(self, self.PLACE), getattr(self, self.REST), *placed)})
+
+
+def left_of(place: Any, rest: Any, former: Any, left: Any) -> Any:
+    """What is left of a place in another's stead, of which `left` was; `rest` where that is of this place."""
+    if rest is not left or place is former or place is None or not np.ndim(rest):
+        return rest
+    xp, (now, before, left) = at_hand((place if hasattr(place, "dtype") else np.asarray(place), former, left))
+    same = now == before if now.shape == before.shape else xp.zeros(now.shape, bool)
+    return array_of(xp.where(same, left if now.shape == before.shape else 0, 0).astype(left.dtype))
 
 
 def unchecked_of(kind: type[Any], /, **fields: Any) -> Any:

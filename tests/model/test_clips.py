@@ -166,6 +166,57 @@ def test_a_corner_far_from_the_origin_keeps_the_digits_of_float64():
     assert np.asarray(jax.jit(lambda box: box.seen_by(camera).sides)(box))[0] == 0.25
 
 
+FAR = np.array([1e8 + 0.7, -7e6 - 0.41, 2e7 + 0.77])
+FAR_OFF = {
+    "sphere": (js.Sphere(FAR, 2.0), "center", {"radius": 3.0}),
+    "plane": (js.Plane(FAR, (0, 0, 1)), "point", {"normal": (0, 1, 0)}),
+    "lower corner": (js.Box(FAR, FAR + 1.5), "lower", {"upper": FAR + 2.25}),
+    "upper corner": (js.Box(FAR - 1.5, FAR), "upper", {"lower": FAR - 2.25}),
+}
+
+
+def exact_place(clip, name):
+    """In float64."""
+    rest = np.asarray(clip.rest, np.float64)
+    return np.asarray(getattr(clip, name), np.float64) + (rest[int(name == "upper")] if isinstance(clip, js.Box) else rest)
+
+
+far_off = pytest.mark.parametrize(("clip", "name", "other"), FAR_OFF.values(), ids=FAR_OFF)
+
+
+@far_off
+def test_a_far_clip_keeps_its_digits_where_other_fields_are_put_in(clip, name, other):
+    """Also of a tree made anew."""
+    wanted = exact_place(clip, name)
+    np.testing.assert_allclose(wanted, FAR, rtol=0, atol=1e-6)
+    again = jax.tree.unflatten(jax.tree.structure(clip), jax.tree.leaves(clip))
+    for one in (clip, again):
+        np.testing.assert_array_equal(exact_place(dataclasses.replace(dataclasses.replace(one, **other)), name), wanted)
+
+
+@far_off
+def test_a_far_clip_takes_the_digits_of_another_place(clip, name, other):
+    place = FAR - 0.125
+    for other_place in (place, place.tolist()):
+        np.testing.assert_allclose(exact_place(dataclasses.replace(clip, **{name: other_place}), name), place, rtol=0, atol=1e-6)
+    coarse = np.asarray(getattr(clip, name)).astype(np.float64).tolist()
+    np.testing.assert_array_equal(exact_place(dataclasses.replace(clip, **{name: coarse}), name), coarse)
+
+
+@far_off
+def test_a_far_clip_moved_along_an_axis_keeps_the_digits_of_the_others(clip, name, other):
+    step = np.float32([0, 0, -1024 if name == "lower" else 1024])
+    moved = np.asarray(getattr(clip, name)) + step
+    for place in (moved, jax.device_put(moved)):
+        found = exact_place(dataclasses.replace(clip, **{name: place}), name)
+        np.testing.assert_array_equal(found[:2], exact_place(clip, name)[:2])
+        assert found[2] == moved[2]
+
+
+def larger(ball, by):
+    return dataclasses.replace(ball, radius=ball.radius + by)
+
+
 def test_clips_are_pytrees_of_arrays():
     clip = PLANE & ~BALL
     again = jax.tree.unflatten(jax.tree.structure(clip), jax.tree.leaves(clip))
@@ -173,8 +224,10 @@ def test_clips_are_pytrees_of_arrays():
     assert len(jax.tree.leaves(jax.tree.map(np.zeros_like, clip))) == 6  # a normal of zeros is no fault of JAX's own copies
     moved = dataclasses.replace(PLANE, point=np.zeros(3, np.float32))
     assert np.allclose(moved.normal, PLANE.normal)
-    compiled = jax.jit(lambda point, normal: js.Plane(point, normal).normal)(np.ones(3, np.float32), np.float32([0, 2, 0]))
+    given_away = np.ones(3, np.float32), np.float32([0, 2, 0]), FAR_OFF["sphere"][0]
+    compiled, ball = jax.jit(lambda point, normal, ball: (js.Plane(point, normal).normal, larger(ball, point[0])))(*given_away)
     assert np.allclose(compiled, [0, 1, 0])
+    np.testing.assert_allclose(exact_place(ball, "center"), FAR, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(

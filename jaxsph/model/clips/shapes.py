@@ -20,13 +20,13 @@ from jaxsph.model.clips.clips import Clip, Ends, Overlap, Place, Spans, ascendin
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.given import plain
-from jaxsph.numerics.trees import fill, tree, unchecked_of
+from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
 
 
 @tree(unchecked=True, init=False)
-class Plane(Clip):
+class Plane(Placed, Clip):
     """What lies on the side of a plane that its normal points to; `~plane` is the other side.
 
     Attributes:
@@ -35,13 +35,14 @@ class Plane(Clip):
         rest: what rounding a float64 point has left, length units.
     """
 
+    PLACE, REST = "point", "rest"
     point: Float[Array, "3"]
     normal: Float[Array, "3"]
     rest: Float[Array, "3"] = dataclasses.field(init=False)
 
-    def __init__(self, point: Any, normal: Any):
+    def __init__(self, point: Any, normal: Any, *, placed: Any = None):
         """Check and pack; a normal of any length but 0, else `ValueError`, as of other shapes and what is not finite."""
-        near, rest = _vector("point", point)
+        near, rest = _vector("point", point, placed)
         if is_traced(normal):
             along = normal / jnp.linalg.norm(normal)
         else:
@@ -115,7 +116,7 @@ class _Boxed(Clip):
 
 
 @tree(unchecked=True, init=False)
-class Box(_Boxed):
+class Box(Placed, _Boxed):
     """A box along the axes; `~box` is all but it.
 
     Attributes:
@@ -126,19 +127,18 @@ class Box(_Boxed):
     lower: Float[Array, "3"]
     upper: Float[Array, "3"]
     rest: Float[Array, "2 3"] = dataclasses.field(init=False)
+    placed = property(lambda own: tuple(zip((own.lower, own.upper), at_hand(own.rest)[1], strict=True)))
 
-    def __init__(self, lower: Any, upper: Any):
+    def __init__(self, lower: Any, upper: Any, *, placed: Any = None):
         """Check and pack; corners ascend, else `ValueError`, as of other shapes and what is not finite."""
-        lower, upper = plain("lower", lower), plain("upper", upper)
-        (low, low_rest), (high, high_rest) = _vector("lower", lower), _vector("upper", upper)
+        of_lower, of_upper = placed or (None, None)
+        (low, low_rest), (high, high_rest) = _vector("lower", lower, of_lower), _vector("upper", upper, of_upper)
         dtype = jnp.promote_types(low.dtype, high.dtype)
-        if not is_traced(lower, upper):
-            ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-            if not (ends[0] < ends[1]).all():
-                raise ValueError(f"`lower` must be below `upper` along each axis, got {ends[0].tolist()} and {ends[1].tolist()}")
         xp, rests = at_hand((low_rest, high_rest))
-        rest = array_of(xp.stack(rests).astype(dtype))
-        fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=rest)
+        fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=array_of(xp.stack(rests).astype(dtype)))
+        if not is_traced(low, high, self.rest) and not np.less(*self.corners()).all():
+            told = " and ".join(str([float(f"{value:.12g}") for value in corner]) for corner in self.corners())
+            raise ValueError(f"`lower` must be below `upper` along each axis, got {told}")
 
     @property
     def sides(self) -> Float[Array, "3"]:
@@ -194,7 +194,7 @@ class _TurnedBox(_Boxed):
 
 
 @tree(unchecked=True, init=False)
-class Sphere(Clip):
+class Sphere(Placed, Clip):
     """A ball; `~sphere` is all but it.
 
     Attributes:
@@ -202,14 +202,15 @@ class Sphere(Clip):
         rest: what rounding a float64 centre has left, length units.
     """
 
+    PLACE, REST = "center", "rest"
     center: Float[Array, "3"]
     radius: Float[Array, ""]
     rest: Float[Array, "3"] = dataclasses.field(init=False)
 
-    def __init__(self, center: Any, radius: Any):
+    def __init__(self, center: Any, radius: Any, *, placed: Any = None):
         """Check and pack; a radius > 0, else `ValueError`, as of other shapes and what is not finite."""
         radius = plain("radius", radius)
-        near, rest = _vector("center", center)
+        near, rest = _vector("center", center, placed)
         if not is_traced(radius):
             require_shape("radius", radius, (), "give one number")
             require_finite("radius", radius, "give a length")
@@ -276,14 +277,18 @@ def _exact(name: str, value: Any) -> tuple[np.ndarray, Any]:
     return exact, jnp.float64 if wide else jnp.float32
 
 
-def _vector(name: str, value: Any) -> tuple[Array, Array]:
-    """A vector as rounded, and what that has left."""
+def _vector(name: str, value: Any, placed: tuple[Any, Any] | None = None) -> tuple[Array, Array]:
+    """A vector as rounded, and what that has left; of what is as fine as the former, `placed`, as `Placed` has it."""
     if is_traced(value):
-        given = jnp.asarray(value)
-        return given, jnp.zeros_like(given)
-    exact, dtype = _exact(name, value)
-    near = exact.astype(dtype)
-    return array_of(near), array_of(exact - near, dtype)
+        near: Any = jnp.asarray(value)
+        rest: Any = jnp.zeros_like(near)
+    else:
+        exact, dtype = _exact(name, value)
+        near = exact.astype(dtype)
+        rest = exact - near
+    if placed is not None and getattr(value, "dtype", None) == placed[1].dtype:
+        rest = left_of(value, placed[1], *placed)
+    return array_of(near), array_of(rest, near.dtype)
 
 
 def _along(axis: Array, place: Place, origin: Array) -> Array:
