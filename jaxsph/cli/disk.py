@@ -59,7 +59,7 @@ def render_options(options: Any, settings: Settings) -> tuple[Image, Camera]:
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
     transfer = cli_look.look(on_disk.sample, options, name)
-    camera = cli_where.camera_of(on_disk, options)
+    camera = cli_where.camera_of(on_disk, cli_where.upward(options))
     say("camera", camera_line(camera))
     started = time.perf_counter()
     try:

@@ -42,7 +42,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
                 raise ValueError(f"{error}; --gaps goes on without") from error
             raise
     _say_survey(survey)
-    options = dataclasses.replace(options, up=options.up or survey.report.up)
+    options = cli_where.upward(options, survey.report.up, survey.report.source)
     looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
     surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
     colored = survey.middle if surface is None else coloured_of(survey.middle)

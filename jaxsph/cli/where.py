@@ -5,6 +5,7 @@ Flow: options -> [where] -> Camera, Scene.within, what there is to frame -> comm
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import operator
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.voice import say
-from jaxsph.io.opening.views import FOV_DEGREES, length_of
+from jaxsph.io.opening.views import FOV_DEGREES, length_of, told_of_up
 from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -101,6 +102,14 @@ def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) 
     if depths is not None:
         return made
     return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)
+
+
+def upward(options: Any, up: Any = UP, source: str = "") -> Any:
+    """The options with what is up: as asked for, or as the kind of file has it, which is said."""
+    if options.up is not None:
+        return options
+    say("up", told_of_up(up, source))
+    return dataclasses.replace(options, up=up)
 
 
 def _up(options: Any) -> Any:

@@ -47,6 +47,7 @@ def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence
         "180 matched",
         "temperature",
         "all 3 snapshots",
+        "y; --up 0,0,1 has z",
         "s_1.npz",
         "m_frames",
         "0.5 s",

@@ -81,6 +81,18 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
     assert found.name == "column.mass" and abs(float(found.total()) / given["mass"].sum() - 1) < 1e-4
 
 
+@pytest.mark.parametrize(("density", "up", "other"), [("density", "y", "0,0,1"), ("Rhop", "z", "0,1,0")])
+def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(file, density, up, other, capsys):
+    given = columns()
+    np.savez("fluid.npz", position=given["position"], support=np.full(COUNT, 0.3), **{density: given["density"]})
+    how = ["fluid.npz", "--of", "number", "--view", "x"]
+    chosen, said = values(capsys, *how)
+    told = [line.split(maxsplit=1)[1] for line in said.splitlines() if line.startswith("up ")]
+    assert len(told) == 1 and told[0].startswith(up) and f"--up {other}" in told[0]
+    asked, said = values(capsys, *how, "--up", other)
+    assert "\nup " not in said and np.abs(asked - chosen).max() > 0.1 * chosen.max()
+
+
 def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
     particles, given, volume = gas()
     camera = js.Camera.along_axis(particles, "x", 18, 12, up=UPWARD)

@@ -138,7 +138,7 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, by_reference, capsys
     plane = ["--plane", "0.5,0.5,0.5,0,0,1", "--color-by", "pressure", "--size", "24x16"]
     for name in ("a.npy", "a.exr", "a.png"):
         code, out, err = run(capsys, "slice", file, "-o", name, *plane)
-        assert (code, err) == (0, []) and "of the pixels inside of supports" in out
+        assert (code, err) == (0, []) and "of the pixels inside of supports" in out and out.count("y; --up 0,0,1 has z") == 1
     particles = io.read_particles(file, "pressure")
     expected = js.slice(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16)
     np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)

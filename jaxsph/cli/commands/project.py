@@ -205,7 +205,7 @@ def _checked(options: Any) -> Any:
     if options.view is not None and options.eye is not None:
         raise UsageError("--view and --eye exclude each other: rays are parallel or spread from the eye")
     if options.eye is None:
-        refuse(options, ("up", "fov_degrees"), "needs --eye: from where should it be looked at?")
+        refuse(options, ("fov_degrees",), "needs --eye: from where should it be looked at?")
     if options.emission is not None and options.weight is not None:
         raise UsageError("--emission is an integral, not a mean: leave out --weight")
     if options.depth_range is not None and not options.depth_range[0] < options.depth_range[1]:
@@ -305,7 +305,7 @@ def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Came
         assert place is not None
         say("center", " ".join(f"{value:.6g}" for value in place))
         options = dataclasses.replace(options, center=tuple(place))
-    options = dataclasses.replace(options, up=options.up or table.up)
+    options = cli_where.upward(options, table.up, table.source)
     return cli_where.camera_of(particles, options, depths, table.units.length)
 
 

@@ -157,7 +157,9 @@ def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | No
             center = place_of(Scene(particles=particles, transfer=transfer), center, None if loaded is None else loaded.table)
         assert center is not None
         say("center", " ".join(f"{value:.6g}" for value in center))
-    up = options.up or (UP if loaded is None or loaded.report is None else loaded.report.up)
+    if loaded is not None and loaded.table is not None:
+        options = cli_where.upward(options, loaded.table.up, loaded.table.source)
+    up = options.up or UP
     if options.plane is not None:
         return center, options.plane, upright(options.plane.normal, up)
     middle = np.mean(particles.bounds(), 0) if center is None else center

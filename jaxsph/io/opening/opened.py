@@ -19,7 +19,7 @@ from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, look_of
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface, within_surface
-from jaxsph.io.opening.views import Said, framed, place_of
+from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
 from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
 from jaxsph.io.settle.quantities import LOG_PREFIX
@@ -152,9 +152,7 @@ def staged(
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     up = UP if rows is None else rows.up
     if view.up is None and rows is not None:
-        said.append(
-            ("up", "y; --up 0,0,1 has z" if up == UP else f"z, as in other files like this ({rows.source}); --up 0,1,0 has y")
-        )
+        said.append(("up", told_of_up(up, rows.source)))
     return Opened(scene, camera, labels or _labels(loaded), tuple(said), center, view.up or up)
 
 

@@ -128,6 +128,11 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera
 
 
+def told_of_up(up: Any, source: str) -> str:
+    """Which way is up in files of this kind, and how it is said otherwise."""
+    return "y; --up 0,0,1 has z" if up == UP else f"z, as in other files like this ({source}); --up 0,1,0 has y"
+
+
 def direction_of(view: View, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
     """The line of sight that is asked for."""
     upward: Any = view.up if view.up is not None else UP if table is None else table.up
