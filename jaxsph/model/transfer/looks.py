@@ -71,10 +71,10 @@ class Preset:
     both_ways: Ramp | None = None
     lift: float = 0.0
 
-    def colors(self) -> np.ndarray:
-        """Of the map, (K, 3)."""
-        rows = colors_of(self.colormap)
-        place = np.linspace(self.lift, 1, len(rows)) * (len(rows) - 1)
+    def colors(self, colormap: str | None = None, above: float = 0.0) -> np.ndarray:
+        """Of what is taken of the map, or of another map, above a share of it, (K, 3)."""
+        rows, lift = colors_of(colormap or self.colormap), 0.0 if colormap else self.lift
+        place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
         return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
 
 
@@ -213,9 +213,11 @@ def preset(
         quantity = _quantity(shown)
     else:
         range, shown = tuple(shown), None
-    given, ramp = _ends(range), chosen.ramp
-    if chosen.domain == "log" and quantity is not None and not quantity.any():  # nothing of these kinds is below 0
-        given = {"low": max(given["low"] or 0.0, 0.0), "high": given["high"] or 1.0}
+    given, ramp, above = _ends(range), chosen.ramp, 0.0
+    if chosen.domain == "log" and quantity is not None and not quantity.any():  # nothing of these kinds is below 0, whose colour
+        low, high = range or (-1.0, 1.0)  # is that in the middle
+        if low < 0 < high:
+            given, above = {"low": 0.0, "high": float(high)}, -low / (high - low)
     if norm is None:
         norm = chosen.domain
         low, high = range or (np.percentile(quantity, TAILS) if quantity is not None and quantity.size else (0.0, 0.0))
@@ -228,7 +230,8 @@ def preset(
         elif norm == "log" and not over_decades:
             norm, ramp = "linear", NARROW
     control = control_values(norm, quantity, **given, points=points)
-    made = TransferFunction.from_colormap(colormap or chosen.colors(), control, ramp(np.linspace(0, 1, points)))
+    colors = colormap if colormap is not None and not above else chosen.colors(colormap, above)
+    made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 
 

@@ -9,7 +9,7 @@ from lookups import look_up
 
 import jaxsph as js
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, reference
-from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, default_transfer, opacity_by_second, value_range
+from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, PRESETS, default_transfer, opacity_by_second, value_range
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.scenes.sampling import scatter
 
@@ -49,6 +49,25 @@ def test_what_is_never_negative_has_colours_from_0_up_where_it_is_constant(name,
     shown = js.Particles.from_arrays(np.random.default_rng(0).random((20, 3)), 0.3, np.full(20, value))
     values = np.asarray(js.TransferFunction.preset(name, shown).values)
     assert 0 <= values[0] <= value <= values[-1] and values[0] < values[-1]
+
+
+@pytest.mark.parametrize("name", ["speed", "density", "temperature", "magnetic", "fluid", "velocity", "scan"])
+@pytest.mark.parametrize("value", [0.0, 2.5])
+@pytest.mark.parametrize("colormap_name", [None, "ice"])
+def test_a_constant_quantity_has_the_colour_in_the_middle_of_its_map(name, value, colormap_name):
+    """Which is seen on black, where those of the ends may not be: a liquid at rest is no shadow."""
+    shown = js.Particles.from_arrays(np.random.default_rng(0).random((20, 3)), 0.3, np.full(20, value))
+    made = js.TransferFunction.preset(name, shown, colormap=colormap_name)
+    rows = colormap(colormap_name or PRESETS[name].colormap)
+    middle = (1 + (0.0 if colormap_name else PRESETS[name].lift)) / 2 * (len(rows) - 1)
+    wanted = [np.interp(middle, np.arange(len(rows)), channel) for channel in rows.T]
+    np.testing.assert_allclose(look_up(made, np.array([value]))[0][0], wanted, atol=0.03)
+
+
+def test_a_quantity_that_is_0_has_the_colour_of_0_in_a_range_that_is_asked_for():
+    shown = js.Particles.from_arrays(np.random.default_rng(0).random((20, 3)), 0.3, np.zeros(20))
+    made = js.TransferFunction.preset("speed", shown, range=(0.0, 5.0))  # as in other pictures of that range
+    np.testing.assert_allclose(look_up(made, np.array([0.0]))[0][0], colormap("ice")[0], atol=1e-6)
 
 
 def test_a_few_odd_values_do_not_take_the_colours():
