@@ -75,10 +75,7 @@ def volume_of_file(path: str, quantity: str | None) -> tuple[Volume, str]:
     """A volume, and the name of its values."""
     table = io.read_volume_table(path)
     say("file", f"{path}: {table.source}, {' x '.join(map(str, table.shape))} points")
-    try:
-        volume, name = io.volume_from_table(table, quantity)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    volume, name = io.volume_from_table(table, quantity)
     say("quantity", f"{name}, {volume.values.dtype}, {span(np.asarray(volume.values))}")
     say_notes(table.conventions)
     return volume, name

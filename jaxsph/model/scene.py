@@ -25,7 +25,7 @@ from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.volume import Volume
+from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.trees import tree
@@ -117,6 +117,8 @@ class Scene:
             if shown.extinction_values is None and shown.extinction.shape != shown.values.shape:
                 told = f"`extinction` of a `TransferFunction` must have shape {shown.values.shape}, as its `values`"
                 raise ValueError(f"{told}, got {shown.extinction.shape}; or give `extinction_values`")
+        for one in _all_of(self.volume):
+            require_grid("`values` of `volume`", one.shape)
         volumes, looks = len(_all_of(self.volume)), len(_all_of(self.volume_transfer))
         if volumes != looks:
             raise ValueError(f"`volume_transfer` must be one for each volume, got {looks} for {volumes}")

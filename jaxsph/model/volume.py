@@ -78,11 +78,7 @@ class Volume(Placed):
         require_real("values", given)
         if given.ndim != 3:
             raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
-        if min(given.shape) < 2:
-            raise ValueError(
-                f"`values` must have at least two points along each axis, got shape {given.shape}; "
-                "repeat a single plane to give it a thickness"
-            )
+        require_grid("`values`", given.shape)
         if not is_traced(given):
             require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
         with np.errstate(over="ignore"):  # what overflows is refused by name
@@ -116,6 +112,13 @@ class Volume(Placed):
         """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""
         lower = np.asarray(self.lower, np.float64) + np.asarray(self.lower_rest, np.float64)
         return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
+
+
+def require_grid(name: str, shape: tuple[int, ...]) -> None:
+    """Raise `ValueError` of an axis of one point: nothing lies between points there."""
+    if min(shape[-3:], default=2) < 2:
+        told = f"{name} must have at least two points along each axis, got shape {shape}"
+        raise ValueError(f"{told}; repeat a single plane to give it a thickness")
 
 
 def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:

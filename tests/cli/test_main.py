@@ -270,6 +270,10 @@ def test_a_volume_is_rendered_and_described(ball, by_reference, capsys):
 
 
 def test_a_volume_is_cut_at_a_level(ball, capsys):
+    np.save("plane.npy", np.ones((1, 9, 9)))
+    for command in ("render", "info"):
+        code, _, err = run(capsys, command, "plane.npy")
+        assert code == 1 and err[0].startswith(f"jaxsph {command}: plane.npy: the array values must have at least two points")
     code, _, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
     assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}
 

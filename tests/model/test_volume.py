@@ -1,5 +1,7 @@
 """A volume is checked when it is made: what cannot be a grid is refused by name, and numbers stay what they are."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,6 +38,16 @@ def holed(value=np.nan):
 def test_what_is_no_grid_is_refused_by_name(changed, match):
     with pytest.raises(ValueError, match=match):
         js.Volume.from_array(**{"values": VALUES, "lower": (0, 0, 0), "spacing": 1.0} | changed)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_single_plane_that_is_put_in_is_refused_by_name(axis):
+    volume = dataclasses.replace(js.Volume.from_array(VALUES), values=np.take(VALUES, [0], axis))
+    transfer = js.TransferFunction.from_points([0, 1], np.eye(3)[:2], [0, 1])
+    scene = js.Scene(volume=volume, volume_transfer=transfer)
+    for shown in (scene.check, lambda: js.IsoSurface.from_volume(volume, 3)):
+        with pytest.raises(ValueError, match="`values` of `volume` must have at least two points along each axis, got shape"):
+            shown()
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ Flow: file -> reader -> VolumeTable -> [volume_files] -> Volume -> write_volume 
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 from pathlib import Path
@@ -34,7 +35,7 @@ def read_volume_table(path: str | os.PathLike[str]) -> VolumeTable:
     if suffix is None:
         raise DataError(f"{path}: volumes are read from {', '.join(READERS)}, not from {file.suffix!r}; convert it")
     table: VolumeTable = _module(suffix).read(regular_file(file))
-    return table
+    return dataclasses.replace(table, path=str(path))
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None, *, lower: Any = None, spacing: Any = None) -> Volume:
@@ -52,19 +53,21 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None, *, lo
         ValueError: another suffix, a damaged file, no such quantity, oblique axes, values that are not finite.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
-    table = read_volume_table(path)
-    with naming(Path(path)):
-        return volume_from_table(table, quantity, lower=lower, spacing=spacing)[0]
+    return volume_from_table(read_volume_table(path), quantity, lower=lower, spacing=spacing)[0]
 
 
 def volume_from_table(
     table: VolumeTable, quantity: str | None = None, *, lower: Any = None, spacing: Any = None
 ) -> tuple[Volume, str]:
     """The volume of one quantity of a table, and what that is called. Raises `ValueError` as `read_volume`."""
-    name, values = table.quantity(quantity)
-    values = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
     lower, spacing = (given if asked is None else asked for given, asked in ((table.lower, lower), (table.spacing, spacing)))
-    return Volume.from_array(values, lower, spacing), name
+    with naming(table.path):
+        name, values = table.quantity(quantity)
+        values = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
+        try:
+            return Volume.from_array(values, lower, spacing), name
+        except ValueError as error:
+            raise DataError(str(error).replace("`values`", f"the array {name}")) from error
 
 
 def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:

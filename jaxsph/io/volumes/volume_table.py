@@ -25,6 +25,7 @@ class VolumeTable:
         lower, spacing: of the grid, (3,), in the file's length unit.
         source: name of the format.
         conventions: what a user should know about how it was read.
+        path: the file, or an empty string.
     """
 
     arrays: dict[str, np.ndarray]
@@ -32,6 +33,7 @@ class VolumeTable:
     spacing: np.ndarray
     source: str
     conventions: tuple[str, ...] = ()
+    path: str = ""
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import bz2
 import gzip
 import itertools
+import re
 
 import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.io.opening.opened import load
 from jaxsph.io.volumes.volume_table import along_axes
 
 BYTES = np.random.default_rng(0).integers(0, 255, (4, 5, 6)).astype(np.uint8)
@@ -87,8 +89,24 @@ def test_values_that_are_no_numbers_are_refused_with_the_file_and_where(tmp_path
     values = FLOATS.copy()
     values[1, 2, 3] = np.nan
     np.save(tmp_path / "v.npy", values)
-    with pytest.raises(ValueError, match=r"v\.npy: `values` must be finite, but 1 of 120 are not, first values\[1, 2, 3\] = nan"):
+    told = r"v\.npy: the array values must be finite, but 1 of 120 are not, first values\[1, 2, 3\] = nan"
+    with pytest.raises(ValueError, match=told):
         js.io.read_volume(tmp_path / "v.npy")
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_single_plane_is_refused_with_the_file_its_array_and_its_shape(suffix, axis, tmp_path):
+    plane, zero = np.take(FLOATS, [1], axis), np.zeros(3, np.float32)
+    path = tmp_path / f"v{suffix}"
+    if suffix == ".vti":
+        js.io.write_volume(path, js.Volume(plane, zero, zero + 1, zero))
+    else:
+        write(path, plane)
+    shape = re.escape(str(plane.shape))
+    for read in (js.io.read_volume, load):
+        with pytest.raises(ValueError, match=rf"v{suffix}: the array values must have at least two points .*{shape}; repeat"):
+            read(path)
 
 
 def test_pieces_of_an_image_are_put_where_they_belong(tmp_path):

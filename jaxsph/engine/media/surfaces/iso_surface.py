@@ -24,7 +24,7 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
-from jaxsph.model.volume import Volume
+from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped, greater, ratio
@@ -98,6 +98,7 @@ class IsoSurface(Medium):
         """Check and pack; `ValueError`: a level that is not finite, a colour or a share outside of [0, 1], another shape."""
         if not isinstance(volume, Volume):
             raise ValueError(f"`volume` must be a `jaxsph.Volume`, got {type(volume).__name__}")
+        require_grid("`values` of `volume`", volume.shape)
         given = {"level": (level, ()), "color": (color, (3,)), "ambient": (ambient, ())}
         for name, (value, shape) in given.items():
             require_shape(name, value, shape, "give red, green and blue" if shape else "give one number")
