@@ -99,8 +99,7 @@ def say_units(table: ParticleTable) -> None:
     stated = [*(["positions"] if table.units.length is not None else []), *table.units.columns]
     if stated:
         say("units", f"stated for {', '.join(stated)}")
-    moment = labels_of(table, "", 1.0).moment
-    if moment:
+    if moment := labels_of(table, "", 1.0).moment:
         say("time", moment)
 
 

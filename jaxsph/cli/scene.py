@@ -124,9 +124,8 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
         say("colours", f"{called} over concentration = {span(transfer.values)}")
         scene = dataclasses.replace(scene, transfer=transfer)
     labels = cli_look.label("concentration", options, "a built-in scene")
-    scene = dataclasses.replace(
-        scene, volume=beside.volume, volume_transfer=beside.volume_transfer, points=beside.points, mix=beside.mix
-    )
+    shared = {name: getattr(beside, name) for name in ("volume", "volume_transfer", "points", "mix")}
+    scene = dataclasses.replace(scene, **shared)
     with wrong_usage():
         if cli_where.is_placed(options):
             camera, clip, said, center = framed(scene, options)

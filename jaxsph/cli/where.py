@@ -55,18 +55,18 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
         at = (lower + upper) / 2 if middle is None else middle
         if across is not None:
             tall = length_of(across, "width", unit)[0] * height / width
-            made = Direction.along(*sight("iso", _up(options)), _fov(options), options.size).camera(at, tall, Scene())
+            made = Direction.along(*sight("iso", options.up), _fov(options), options.size).camera(at, tall, Scene())
             return snug_box(made, lower, upper)
         if middle is not None:
             shown = BoundingBox(at - (upper - lower) / 2, at + (upper - lower) / 2)
-        forward, up = sight("iso", _up(options))
+        forward, up = sight("iso", options.up)
         return Camera.framing(shown, direction=forward, up=up, fov_degrees=_fov(options), width=width, height=height)
 
 
 def _along(shown: Bounded, options: Any, middle: Any, depths: tuple[float, float] | None, unit: CodeUnit | None) -> Camera:
     """With parallel rays along an axis; `depths` are coordinates along it."""
     width, height = options.size
-    whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths, up=_up(options))
+    whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths, up=options.up)
     across = getattr(options, "width", None)
     if across is None and middle is None:
         return whole
@@ -97,7 +97,7 @@ def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) 
     width, height = options.size
     target = (lower + upper) / 2 if options.target is None else options.target
     near, far = depths or (1e-3, 1.0)
-    up = upright(np.subtract(target, options.eye), _up(options))
+    up = upright(np.subtract(target, options.eye), options.up)
     made = Camera.look_at(options.eye, target, up, _fov(options), width, height, near=near, far=far)
     if depths is not None:
         return made
@@ -106,14 +106,9 @@ def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) 
 
 def upward(options: Any, up: Any = UP, source: str = "") -> Any:
     """The options with what is up: as asked for, or as the kind of file has it, which is said."""
-    if options.up is not None:
-        return options
-    say("up", told_of_up(up, source))
-    return dataclasses.replace(options, up=up)
-
-
-def _up(options: Any) -> Any:
-    return UP if options.up is None else options.up
+    if options.up is None:
+        say("up", told_of_up(up, source))
+    return dataclasses.replace(options, up=options.up or up)
 
 
 def _fov(options: Any) -> float:
@@ -123,10 +118,10 @@ def _fov(options: Any) -> float:
 def middle_of(survey: Survey, options: Any) -> tuple[float, float, float] | None:
     """What is to be in the middle of the periodic box of a sequence."""
     given = getattr(options, "center", None)
-    if given is None or survey.box is None:
-        if given is not None:
-            raise UsageError("--center is for periodic boxes, and these files do not have one; give its sides by --box-size")
+    if given is None:
         return None
+    if survey.box is None:
+        raise UsageError("--center is for periodic boxes, and these files do not have one; give its sides by --box-size")
     if given == "mass":
         raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
     center = center_of(survey, list(given) if not isinstance(given, str) else given)

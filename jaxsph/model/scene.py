@@ -10,6 +10,7 @@ all else is out of its range of numbers: each medium takes from a list what is i
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,12 +229,8 @@ def widened(scene: Scene) -> Scene:
 
 def first_spheres(scene: Scene) -> tuple[int, ...]:
     """Number of the first sphere of each point set, static."""
-    number = 0 if scene.particles is None else scene.particles.capacity
-    first = []
-    for points in scene.point_sets:
-        first.append(number)
-        number += points.capacity
-    return tuple(first)
+    sizes = 0 if scene.particles is None else scene.particles.capacity, *(points.capacity for points in scene.point_sets)
+    return tuple(itertools.accumulate(sizes[:-1]))
 
 
 def num_spheres(scene: Scene) -> int:

@@ -94,8 +94,7 @@ class Volume(Placed):
             require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
             require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
         near = exact.astype(dtype)
-        rest = array_of(exact - near, dtype)
-        return cls(packed, array_of(near), array_of(steps, dtype), rest, name_of(unit))
+        return cls(packed, array_of(near), array_of(steps, dtype), array_of(exact - near, dtype), name_of(unit))
 
     @property
     def shape(self) -> tuple[int, int, int]:

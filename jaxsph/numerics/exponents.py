@@ -17,8 +17,7 @@ def split(x: Float[Array, "*any"]) -> tuple[Float[Array, "*any"], Int[Array, "*a
 
     Differentiation: the exponent is a constant.
     """
-    bits, exponent_bits, mantissa_bits, bias = _layout(x)
-    exponent = (bits >> mantissa_bits) & ((1 << exponent_bits) - 1)
+    _, exponent, _, bias = _layout(x)
     normal, exponent = exponent > 0, (exponent - bias).astype(jnp.int32)
     half = exponent // 2  # in two steps, as 2^-127 is no normal number
     mantissa = jnp.where(normal, x, 0) * power_of_two(-half, x.dtype) * power_of_two(half - exponent, x.dtype)
@@ -36,13 +35,12 @@ def power_of_two(exponent: Int[Array, "*any"], dtype: Any) -> Float[Array, "*any
 
 def is_subnormal(x: Float[Array, "*any"]) -> Bool[Array, "*any"]:
     """Whether x is neither zero nor normal, so that arithmetic takes it for zero."""
-    bits, exponent_bits, mantissa_bits, _ = _layout(x)
-    exponent = (bits >> mantissa_bits) & ((1 << exponent_bits) - 1)
+    bits, exponent, mantissa_bits, _ = _layout(x)
     return (exponent == 0) & ((bits & ((1 << mantissa_bits) - 1)) != 0)
 
 
-def _layout(x: Array) -> tuple[Array, int, int, int]:
-    """Bits, numbers of exponent and mantissa bits, exponent bias."""
+def _layout(x: Array) -> tuple[Array, Array, int, int]:
+    """Bits, those of the exponent, number of mantissa bits, exponent bias."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, jnp.int32 if info.bits == 32 else jnp.int64)
-    return bits, int(info.nexp), int(info.nmant), -int(info.minexp) + 1
+    return bits, (bits >> int(info.nmant)) & ((1 << int(info.nexp)) - 1), int(info.nmant), -int(info.minexp) + 1

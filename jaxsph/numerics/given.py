@@ -34,10 +34,8 @@ def plain(name: str, value: Any, why: str = "no unit is known here to convert it
     """Numbers that carry no unit, or that of a pure number, such as percent; `ValueError` of a unit, and as `own`."""
     _require_whole(name, value)
     unit = unit_of(value)
-    if unit is None:
-        return _native(value)
-    pure = _pure(value, unit)
-    if pure is None:
+    pure = value if unit is None else _pure(value, unit)
+    if unit is not None and pure is None:
         raise ValueError(f'`{name}` is in {unit}, but {why}: pass {name}.to_value("{unit}"), {meant}')
     return _native(pure)
 
@@ -69,9 +67,7 @@ def in_unit(name: str, value: Any, unit: Any, power: int = 1, of: str = "positio
     if unit is None:
         return plain(name, value, f"`{of}` has no unit to convert it to")
     _require_whole(name, value)
-    wanted = unit
-    if power != 1:
-        wanted = f"{unit}**{power}" if isinstance(unit, str) else unit**power
+    wanted = unit if power == 1 else f"{unit}**{power}" if isinstance(unit, str) else unit**power
     try:
         same = type(given) is type(wanted) and bool(given == wanted)
         return _native(_numbers(value) if same else _converted(value, wanted))
@@ -105,8 +101,7 @@ def _require_whole(name: str, value: Any) -> None:
         return
     for part in _leaves(value):
         _require_unmasked(name, part)
-        unit = unit_of(part)
-        if unit is not None:
+        if (unit := unit_of(part)) is not None:
             raise ValueError(f"`{name}` is a list of numbers that carry units ({unit}); make it one array, {LIBRARIES}")
 
 

@@ -305,8 +305,7 @@ def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Came
         assert place is not None
         say("center", " ".join(f"{value:.6g}" for value in place))
         options = dataclasses.replace(options, center=tuple(place))
-    options = cli_where.upward(options, table.up, table.source)
-    return cli_where.camera_of(particles, options, depths, table.units.length)
+    return cli_where.camera_of(particles, cli_where.upward(options, table.up, table.source), depths, table.units.length)
 
 
 def _look(options: Any) -> dict[str, Any]:

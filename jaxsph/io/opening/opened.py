@@ -166,10 +166,8 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     place: Any = place_of(scene, view.center, table)
     if place is not None:
         view = dataclasses.replace(view, center=tuple(place))
-    elif view.eye is None and not view.clips and (beside is None or not beside.parts):
-        place = across_faces(scene)
-        if place is not None:
-            said = [("box", f"its middle is {' '.join(f'{one:.6g}' for one in place)}, as what is shown lies across its faces")]
+    elif view.eye is None and not view.clips and not (beside and beside.parts) and (place := across_faces(scene)) is not None:
+        said = [("box", f"its middle is {' '.join(f'{one:.6g}' for one in place)}, as what is shown lies across its faces")]
     if place is None:
         return scene, view, said
     return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said

@@ -89,7 +89,6 @@ def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Fram
     if view.eye is not None:
         return Framed(_from_eye(shown, view, table), clip, [])
     said: Said = []
-    unit = None if table is None else table.units.length
     center = place_of(scene, view.center, table)
     if view.center is not None:
         said.append(("center", " ".join(f"{value:.6g}" for value in center)))  # type: ignore[union-attr]
@@ -103,7 +102,7 @@ def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Fram
             count = scene.particle_set.num_particles
             said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --width all shows them"))
         return Framed(camera, clip, said, center)
-    width, told = length_of(view.width, "width", unit)
+    width, told = length_of(view.width, "width", None if table is None else table.units.length)
     if center is None:
         center = np.array(middle(fitted(shown, direction)))
     said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
@@ -169,8 +168,7 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
         raise ValueError(
             f"`view` = {view!r} needs particles that turn, and their angular momentum is zero; choose x, y, z or iso"
         )
-    turned: np.ndarray = spin / np.linalg.norm(spin)
-    return turned
+    return np.asarray(spin / np.linalg.norm(spin))
 
 
 def place_of(scene: Scene, center: Any, table: ParticleTable | None) -> np.ndarray | None:
@@ -180,9 +178,8 @@ def place_of(scene: Scene, center: Any, table: ParticleTable | None) -> np.ndarr
     lower, upper = scene.bounds()
     if not isinstance(center, str):
         place = np.asarray(center, np.float64)
-        if scene.particles is not None and scene.particles.box is not None:  # of which every place is inside, by its period
-            return place
-        if (place < lower).any() or (place > upper).any():
+        periodic = scene.particles is not None and scene.particles.box is not None  # every place is inside of that
+        if not periodic and ((place < lower).any() or (place > upper).any()):
             ends = " to ".join(" ".join(f"{value:.6g}" for value in end) for end in (lower, upper))
             raise ValueError(f"`center` = {' '.join(f'{v:g}' for v in place)} is outside of everything: that lies from {ends}")
         return place
@@ -208,8 +205,7 @@ def densest(scene: Scene) -> np.ndarray:
     tree = scipy.spatial.KDTree(position)
     distance, _ = tree.query(position, k=min(NEIGHBOURS, len(position)), workers=-1)
     nearest = np.atleast_2d(distance.T).T[:, -1]
-    found: np.ndarray = position[int(np.argmin(np.where(nearest > 0, nearest, support)))]
-    return found
+    return np.asarray(position[int(np.argmin(np.where(nearest > 0, nearest, support)))])
 
 
 def _masses(table: ParticleTable) -> np.ndarray:
@@ -225,9 +221,8 @@ def _from_eye(scene: Scene, view: View, table: ParticleTable | None) -> Camera:
         target = place_of(scene, view.center, None)
     width, height = view.size
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
-    up = view.up
-    if up is None:
-        up = tuple(upright(np.subtract(target, view.eye), UP if table is None else table.up))  # type: ignore[arg-type]
+    found = upright(np.subtract(target, view.eye), UP if table is None else table.up)  # type: ignore[arg-type]
+    up = tuple(found) if view.up is None else view.up
     made = Camera.look_at(view.eye, target, up, fov, width, height, near=1e-3, far=1.0)
     return snug_in_picture(made, scene)
 

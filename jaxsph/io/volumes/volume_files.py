@@ -34,8 +34,7 @@ def read_volume_table(path: str | os.PathLike[str]) -> VolumeTable:
     file, suffix = Path(path), _suffix(path)
     if suffix is None:
         raise DataError(f"{path}: volumes are read from {', '.join(READERS)}, not from {file.suffix!r}; convert it")
-    table: VolumeTable = _module(suffix).read(regular_file(file))
-    return dataclasses.replace(table, path=str(path))
+    return dataclasses.replace(_module(suffix).read(regular_file(file)), path=str(path))  # type: ignore[no-any-return]
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None, *, lower: Any = None, spacing: Any = None) -> Volume:

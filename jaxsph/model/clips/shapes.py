@@ -61,11 +61,11 @@ class Plane(Placed, Clip):
 
     def contains(self, place: Place) -> Bool[Array, "..."]:
         """See `Clip`."""
-        return self._height(place) >= 0
+        return _along(self.normal, place, self.point) >= 0
 
     def spans(self, begin: Place, end: Place) -> Spans:
         """See `Clip`."""
-        return _halves(self._height(begin), self._height(end))
+        return _halves(_along(self.normal, begin, self.point), _along(self.normal, end, self.point))
 
     def over(self, lower: Place, upper: Place) -> Overlap:
         """See `Clip`."""
@@ -84,9 +84,6 @@ class Plane(Placed, Clip):
         crossed = corners[first] + share * (corners[last] - corners[first])
         return ends_of(np.concatenate([corners[height >= 0], crossed]) @ along)
 
-    def _height(self, place: Place) -> Array:
-        return _along(self.normal, place, self.point)
-
 
 class _Boxed(Clip):
     """What boxes have in common, whose frame is their lower corner, their axes and their sides."""
@@ -96,12 +93,14 @@ class _Boxed(Clip):
 
     def contains(self, place: Place) -> Bool[Array, "..."]:
         origin, axes, sides = self._frame()
-        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(_all_along(axes, place, origin), sides, strict=True))
+        along = [_along(axis, place, origin) for axis in axes]
+        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(along, sides, strict=True))
         return x & y & z
 
     def spans(self, begin: Place, end: Place) -> Spans:
         origin, axes, sides = self._frame()
-        ways = zip(_all_along(axes, begin, origin), _all_along(axes, end, origin), sides, strict=True)
+        first, last = ([_along(axis, place, origin) for axis in axes] for place in (begin, end))
+        ways = zip(first, last, sides, strict=True)
         x, y, z = (common(_halves(first, last), _halves(side - first, side - last)) for first, last, side in ways)
         return common(common(x, y), z)
 
@@ -129,10 +128,9 @@ class Box(Placed, _Boxed):
     rest: Float[Array, "2 3"] = dataclasses.field(init=False)
     placed = property(lambda own: tuple(zip((own.lower, own.upper), at_hand(own.rest)[1], strict=True)))
 
-    def __init__(self, lower: Any, upper: Any, *, placed: Any = None):
+    def __init__(self, lower: Any, upper: Any, *, placed: Any = (None, None)):
         """Check and pack; corners ascend, else `ValueError`, as of other shapes and what is not finite."""
-        of_lower, of_upper = placed or (None, None)
-        (low, low_rest), (high, high_rest) = _vector("lower", lower, of_lower), _vector("upper", upper, of_upper)
+        (low, low_rest), (high, high_rest) = _vector("lower", lower, placed[0]), _vector("upper", upper, placed[1])
         dtype = jnp.promote_types(low.dtype, high.dtype)
         xp, rests = at_hand((low_rest, high_rest))
         fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=array_of(xp.stack(rests).astype(dtype)))
@@ -224,11 +222,11 @@ class Sphere(Placed, Clip):
 
     def contains(self, place: Place) -> Bool[Array, "..."]:
         """See `Clip`."""
-        return _square(self._from_center(place)) <= self.radius * self.radius
+        return _square([at - own for at, own in zip(place, self.center, strict=True)]) <= self.radius * self.radius
 
     def spans(self, begin: Place, end: Place) -> Spans:
         """See `Clip`; a chord so short that rounding hides it is none."""
-        first = self._from_center(begin)
+        first = [at - own for at, own in zip(begin, self.center, strict=True)]
         way = [last - own for last, own in zip(end, begin, strict=True)]
         length = _square(way)
         moves = length > 0
@@ -261,9 +259,6 @@ class Sphere(Placed, Clip):
         middle = float(center @ along)
         return max(begin, middle - radius), min(end, middle + radius)
 
-    def _from_center(self, place: Place) -> list[Array]:
-        return [at - own for at, own in zip(place, self.center, strict=True)]
-
 
 def _exact(name: str, value: Any) -> tuple[np.ndarray, Any]:
     """A vector in float64, and the dtype that it is to have."""
@@ -295,10 +290,6 @@ def _along(axis: Array, place: Place, origin: Array) -> Array:
     """Coordinates of points along an axis, from an origin on."""
     x, y, z = (at - own for at, own in zip(place, origin, strict=True))
     return axis[0] * x + axis[1] * y + axis[2] * z
-
-
-def _all_along(axes: Array, place: Place, origin: Array) -> list[Array]:
-    return [_along(axis, place, origin) for axis in axes]
 
 
 def _heights(origin: Array, axis: Array, lower: Place, upper: Place, further: Any = 0.0) -> tuple[Array, Array]:

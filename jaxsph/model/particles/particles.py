@@ -194,8 +194,7 @@ class Particles(Placed):
         """
         settle = {"quantity": quantity, "support": support, "support_in_h": support_in_h, "kernel": kernel, "box": box}
         settle |= {"where": where, "share": share, "opacity_by": opacity_by}
-        made: Particles = found("jaxsph.io.settle.columns:particles_from_columns")(columns, **settle)[0]
-        return made
+        return found("jaxsph.io.settle.columns:particles_from_columns")(columns, **settle)[0]  # type: ignore[no-any-return]
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.

@@ -195,8 +195,7 @@ def _ends(task: SlabTask) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     border = task.border
     if task.depth.shape[1] == border.shape[1]:  # samples on the borders stand for half of what lies on either side
         border = jnp.concatenate([border[:, :1], (border[:, 1:] + border[:, :-1]) / 2, border[:, -1:]], 1)
-    ends = (dataclasses.replace(task, depth=depth).positions() for depth in (border[:, :-1], border[:, 1:]))
-    return tuple(ends)  # type: ignore[return-value]
+    return tuple(dataclasses.replace(task, depth=depth).positions() for depth in (border[:, :-1], border[:, 1:]))  # type: ignore[return-value]
 
 
 def _between(front: Coordinates, back: Coordinates, share: Array) -> Coordinates:
