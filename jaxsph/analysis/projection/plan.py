@@ -1,38 +1,33 @@
 """Capacities of a projection: everything that fixes a shape, counted from the particles that a camera sees.
 
-Flow: particles, camera -> [projection_plan] -> project.
+Flow: particles, camera -> seen -> [projection_plan] -> project.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
-from jaxsph.analysis.projection.column_sums import BLOCK, subrays_of
-from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
+from jaxsph.analysis.projection.rules import PIXELS, Rule, rules_of
+from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
-from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import MAX_CAPACITY, fullest_band
+from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
-from jaxsph.model.particles.periodic import between_faces, num_ghosts, past_faces, runs_through, sees_images, unfolded
-from jaxsph.numerics.checks import require_plan
+from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
+from jaxsph.numerics.checks import array_of, require_plan
 from jaxsph.numerics.trees import on_host
 
-PIXELS = ("mean", "ray")
-SUBRAYS = 3  # of a pixel on each axis in means, where there are no shares: good to 3e-4 of the peak from 2 pixels a support on
-SHARES = 0
-"""Number of rays that stands for shares instead."""
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
+DOUBT = 2.0  # so that what is counted is never less than what a program finds that rounds in another way
 
 
 @jax.tree_util.register_static
@@ -45,7 +40,7 @@ class ProjectionPlan:
         num_particles: entries of the particle arrays, padding included.
         pixel: `"mean"` or `"ray"`.
         bands: horizontal bands that are projected one after the other.
-        rays, shares: lists of the particles of either rule in one band; None where there is none.
+        lists: of the particles of each rule, by its kind, in one band; of rules that nobody follows none.
         tuning: for the machine.
         images: entries for images of a periodic set; None where each particle is taken once.
         through: axis of the box that rays run along from outside through both faces, so that columns are whole; None where not.
@@ -56,8 +51,7 @@ class ProjectionPlan:
     num_particles: int
     pixel: str
     bands: int
-    rays: ListPlan | None
-    shares: ListPlan | None
+    lists: tuple[tuple[str, ListPlan], ...]
     tuning: Tuning = CPU
     images: int | None = None
     through: int | None = None
@@ -65,11 +59,6 @@ class ProjectionPlan:
     def __post_init__(self) -> None:
         if self.pixel not in PIXELS:
             raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {self.pixel!r}")
-
-    @property
-    def rules(self) -> list[tuple[int, ListPlan | None]]:
-        """Rays a pixel on each axis, or `SHARES`, and lists, of each rule that particles may follow."""
-        return [(1, self.rays)] if self.pixel == "ray" else [(SHARES, self.shares), (SUBRAYS, self.rays)]
 
     @property
     def tile_rows(self) -> int:
@@ -82,19 +71,25 @@ class ProjectionPlan:
         """Pixel rows of a band."""
         return self.tile_rows * TILE
 
-    def chunk(self, subrays: int) -> int:
-        """Bundles that are summed together: not more than there are."""
-        lists = self.shares if subrays == SHARES else self.rays
-        return max(min(self.tuning.samples_at_once // (BLOCK * max(subrays, 1) ** 2), lists.num_bundles if lists else 1), 1)
+    def see(self, run: Executor, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
+        """What there is to be projected."""
+        static: dict[str, Any] = {"pixel": self.pixel, "images": self.images, "through": self.through, "tuning": self.tuning}
+        rules = rules_of(particles.kernel, camera.is_perspective, self.pixel)
+        seen: Seen = run.one("grid", see, (particles, amounts, camera, np.float32(doubt)), rules=rules, **static)
+        return seen
 
     def grown(self, needed: ProjectionPlan) -> ProjectionPlan:
         """This plan where it has room for all that another was made for, else the other with at least the room of this."""
-        bare = [dataclasses.replace(one, rays=None, shares=None, images=one.images and 0) for one in (self, needed)]
+        bare = [dataclasses.replace(one, lists=(), images=one.images and 0) for one in (self, needed)]
         if bare[0] != bare[1]:
             return needed
+        lists, others = dict(self.lists), dict(needed.lists)
+        for kind, other in others.items():
+            one = lists.get(kind, other)
+            tiles, pairs = max(one.tile_capacity, other.tile_capacity), max(one.list_capacity, other.list_capacity)
+            lists[kind] = dataclasses.replace(one, tile_capacity=tiles, list_capacity=pairs)
         room = None if self.images is None else max(self.images, needed.images or 0)
-        rays, shares = _larger(self.rays, needed.rays), _larger(self.shares, needed.shares)
-        return dataclasses.replace(self, rays=rays, shares=shares, images=room)
+        return dataclasses.replace(self, lists=tuple(sorted(lists.items())), images=room)
 
     def check(self, particles: Particles, camera: Camera, pixel: str) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given."""
@@ -136,32 +131,30 @@ def plan_projection(
     require_plan("like", like, ProjectionPlan, "plan_projection")
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
-    made = _measured(scaled(particles, digits), scaled_camera(camera, digits), pixel, memory)
+    given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)
+    made = planned(given, pixel, memory, Clock())
     return made if like is None else like.grown(made)
 
 
-def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> ProjectionPlan:
-    """The plan with as few bands as the limit allows."""
+def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> ProjectionPlan:
+    """The plan of particles, amounts and a camera, with as few bands as the limit allows."""
+    particles, amounts, camera = given
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
     images = through = None
     if particles.box is not None and sees_images(particles, camera):
         axis = int(np.argmax(np.abs(np.asarray(camera.axes)[2])))
         through = axis if bool(runs_through(camera, particles.box, axis)) else None
-        beyond = BESIDE_FACES * float(particles.box.sides.min())
-        images = capacity_class(num_ghosts(particles, beyond, through))
-    bare = ProjectionPlan(*size, pixel, 1, None, None, tuning_for(particles.support), images, through)
-    if images is not None:
-        camera, particles = _of_box(particles, camera, beyond, room=images, pixel=pixel, through=through)
-    else:
-        particles = particles.wrapped()
-    placed = placed_by(particles, camera)
-    counts = [measure(_footprints(placed, camera, subrays=n), camera, 1) for n, _ in bare.rules]  # type: ignore[arg-type]
-    there = [bool(WANTED[n](placed).any()) for n, _ in bare.rules]  # be it beside the picture
+        images = capacity_class(num_ghosts(particles, BESIDE_FACES * float(particles.box.sides.min()), through))
+    bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through)
+    seen = bare.see(run, particles, amounts, camera, DOUBT)
+    rules = rules_of(particles.kernel, camera.is_perspective, pixel)
+    counts = {rule: measure(one, camera, 1) for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True) if some}  # type: ignore[arg-type]
     while True:
-        lists = [_lists(one, camera, bands) if some else None for one, some in zip(counts, there, strict=True)]
-        made = dataclasses.replace(bare, bands=bands, rays=lists[-1], shares=lists[0] if pixel == "mean" else None)
-        needed = _bytes(made)
-        if needed <= limit and all(one is None or one.list_capacity <= MAX_CAPACITY for one in lists):
+        made = dataclasses.replace(
+            bare, bands=bands, lists=tuple(sorted((rule.kind, _lists(one, camera, bands)) for rule, one in counts.items()))
+        )
+        needed = _bytes(made, list(counts))
+        if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
         if made.tile_rows == 1:
             raise ValueError(
@@ -171,44 +164,6 @@ def _measured(particles: Particles, camera: Camera, pixel: str, limit: int) -> P
         bands = min(2 * bands, rows)
 
 
-def beside(subrays: int) -> float:
-    """How far from the middle of its pixel a rule looks, in pixels on either axis."""
-    return 0.5 if subrays == SHARES else float(np.max(np.abs(subrays_of(subrays)[0] - 0.5)))
-
-
-WANTED: dict[int, Callable[[Placed], Array]] = {
-    1: lambda placed: placed.live,
-    SHARES: lambda placed: placed.live & placed.small,
-    SUBRAYS: lambda placed: placed.live & placed.large,
-}
-"""Which particles follow each rule."""
-BESIDE_FACES = 1e-4  # of the shortest side of a period, that images may be away from it to be counted: rounding may take them in
-DOUBT = 2  # so that what is counted is never less than what a program finds that rounds in another way
-placed_by = jax.jit(functools.partial(place, doubt=DOUBT))
-
-
-@functools.partial(jax.jit, static_argnames=("room", "pixel", "through"))
-def _of_box(
-    particles: Particles, camera: Camera, beyond: float, *, room: int, pixel: str, through: int | None
-) -> tuple[Camera, Particles]:
-    """What of a periodic set is projected, and what might be."""
-    assert particles.box is not None
-    seen = between_faces(camera, particles.box, pixel)[0] if through is None else past_faces(camera, particles.box)
-    return seen, unfolded(particles, room, beyond, through)[0]
-
-
-@functools.partial(jax.jit, static_argnames="subrays")
-def _footprints(placed: Placed, camera: Camera, *, subrays: int) -> Ordered:
-    return footprints(placed, camera, WANTED[subrays](placed), beside(subrays), DOUBT)
-
-
-def _larger(one: ListPlan | None, other: ListPlan | None) -> ListPlan | None:
-    if one is None or other is None:
-        return one or other
-    tiles, pairs = max(one.tile_capacity, other.tile_capacity), max(one.list_capacity, other.list_capacity)
-    return dataclasses.replace(one, tile_capacity=tiles, list_capacity=pairs)
-
-
 def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan:
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
@@ -216,10 +171,8 @@ def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan:
     return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
 
 
-def _bytes(plan: ProjectionPlan) -> int:
-    lists = [one for _, one in plan.rules if one is not None]
-    pairs = sum(one.tile_capacity * BYTES_OF_TILE_PAIR + one.list_capacity * BYTES_OF_PAIR for one in lists)
-    subrays = max((n for n, one in plan.rules if one is not None), default=1)
-    of_band = plan.band_height * plan.width * BYTES_OF_PIXEL * max(subrays, 1) ** 2
+def _bytes(plan: ProjectionPlan, rules: list[Rule]) -> int:
+    pairs = sum(one.tile_capacity * BYTES_OF_TILE_PAIR + one.list_capacity * BYTES_OF_PAIR for _, one in plan.lists)
+    of_band = plan.band_height * plan.width * BYTES_OF_PIXEL * max((rule.subrays**2 for rule in rules), default=1)
     of_particles = (plan.num_particles + (plan.images or 0)) * BYTES_OF_PARTICLE
     return of_particles + pairs + of_band + plan.width * plan.height * BYTES_OF_PIXEL

@@ -1,12 +1,12 @@
 r"""Projections: integrals of what particles hold along rays, additive and not normalised.
 
-Flow: particles, camera -> place -> lists of bundles -> column_sums -> [project] -> Projection.
+Flow: particles, camera -> see -> lists of bundles -> sum_columns -> join -> [project] -> Projection.
 
 **Accuracy.** Rays are exact to 1e-5 of each particle's peak in float32 and 1e-13 in float64. A mean over a pixel is good to 1e-4
-of that peak where rays are parallel and no depth cuts the support, by shares of the whole column that add up: mass in an image is
-kept to 1e-4, however small supports are. Else it is that of 3 x 3 rays, good to 3e-4 for supports of at least 2 pixels. Of
-smaller ones two things are estimated, while their mass is kept: with perspective, by ellipses along the axes, how it is spread
-over pixels; and where a depth cuts them, as if the share behind it were the same in all pixels.
+of that peak where rays are parallel and no depth cuts the support, and mass in an image is kept to 1e-4, however small supports
+are: see `rules`. Else it is that of 3 x 3 rays, good to 3e-4 for supports of at least 2 pixels. Of smaller ones two things are
+estimated, while their mass is kept: with perspective, by ellipses along the axes, how it is spread over pixels; and where a depth
+cuts them, as if the share behind it were the same in all pixels.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.analysis.projection.column_sums import ColumnInputs, ColumnMethod, column_sums, pixels_of, subrays_of
-from jaxsph.analysis.projection.columns import depth_share
-from jaxsph.analysis.projection.pixel_lists import Placed, footprints, place
-from jaxsph.analysis.projection.plan import SHARES, WANTED, ProjectionPlan, beside, plan_projection
-from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, bundle_origins
+from jaxsph.analysis.projection.plan import ProjectionPlan, planned
+from jaxsph.analysis.projection.rules import Rule, rules_of
+from jaxsph.engine.access.lists import BundleLists, ListPlan, bundle_origins
+from jaxsph.engine.field.blocks import Given, Windows, over_blocks
+from jaxsph.engine.frame.frame import LISTS
+from jaxsph.engine.frame.stages import stage
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Clock, Executor, Traced
+from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for
 from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, unit_held
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
 from jaxsph.model.projection import Projection
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.numerics.fusion import barriers
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
 from jaxsph.numerics.version import __version__
@@ -98,29 +98,22 @@ def project(
         held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
         digits = 0 if traced else digits_to_scale(particles, camera)
         given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
-        planned, plan = plan is None, plan or _planned(given[0], given[2], pixel, traced)
+        if plan is None and traced:
+            raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
+        run, asked = clock or Clock(), plan is not None
+        plan = plan or planned(given, pixel, memory_for(particles.support), run)
         plan.check(particles, camera, pixel)
-        sums, word = _sums(*given, plan=plan) if traced else _eagerly(given, plan, planned, clock)
+        if not traced:
+            run.foresee(lambda forecast: _sums(given, plan, forecast))
+        sums, word = _sums(given, plan, Traced() if traced else run)
+        if not traced and int(word) & faults.OVERFLOWS and asked:
+            raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
+        if not traced and int(word):
+            raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         told = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
         told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
-
-
-def _eagerly(given: tuple[Any, ...], plan: ProjectionPlan, planned: bool, clock: Clock | None) -> tuple[Any, Any]:
-    """Sums by programs that are kept, and no fault that was left unsaid."""
-    sums, word = (clock or Clock()).one("cast", _sums_at_once, given, plan=plan)
-    if int(word) & faults.OVERFLOWS and not planned:
-        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
-    if int(word):
-        raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
-    return sums, word
-
-
-def _planned(particles: Particles, camera: Camera, pixel: str, traced: bool) -> ProjectionPlan:
-    if traced:
-        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
-    return plan_projection(particles, camera, pixel=pixel)
 
 
 def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -> Camera:
@@ -164,110 +157,114 @@ def _require_held(image: Projection, sums: Array) -> None:
             )
 
 
-class _Rule(NamedTuple):
-    """Particles that follow a rule, as a table, and where they can be."""
-
-    method: ColumnMethod
-    lists: ListPlan
-    table: Float[Array, "particles columns"]
-    footprints: Any
-
-
 def _sums(
-    particles: Particles, amounts: Float[Array, "particles channels"], camera: Camera, *, plan: ProjectionPlan
+    given: tuple[Any, ...], plan: ProjectionPlan, run: Executor
 ) -> tuple[Float[Array, "height width channels"], Int[Array, ""]]:
     """Sums of all pixels, and the fault word."""
-    with barriers(plan.tuning.fusion_barriers):
-        dtype = jnp.promote_types(particles.dtype, camera.dtype)
-        camera = jax.tree.map(lambda leaf: leaf.astype(dtype), camera)
-        particles, amounts, camera, pixels, crowded = _shown(particles, amounts, camera, plan)
-        placed = place(particles, camera)
-        amounts = jnp.where(placed.live[:, None], amounts, 0).astype(dtype)
-        word = placed.faults | faults.raised(faults.BAD_PARTICLES, ~jnp.isfinite(amounts).all())
-        rules, missing = [], jnp.zeros((), bool)
-        for subrays, lists in plan.rules:
-            wanted = WANTED[subrays](placed)
-            if lists is None:
-                missing |= wanted.any()
-                continue
-            made = _shares_table if subrays == SHARES else _rays_table
-            method = ColumnMethod(
-                particles.kernel, camera.is_perspective, subrays == SHARES, max(subrays, 1), plan.chunk(subrays)
-            )
-            table = jnp.where(wanted[:, None], made(placed, amounts, camera, particles.kernel), 0)
-            rules.append(_Rule(method, lists, table, footprints(placed, camera, wanted, beside(subrays))))
-        found, word_of_lists = _in_bands(rules, camera, plan, amounts.shape[1])
-        found = found if pixels is None else found * pixels[..., None]
-        return found, word | crowded | word_of_lists | faults.raised(faults.LIST_OVERFLOW, missing)
+    seen = plan.see(run, *given)
+    lists, rules = dict(plan.lists), rules_of(given[0].kernel, given[2].is_perspective, plan.pixel)
+    followed = [(rule, lists[rule.kind], one) for rule, one in zip(rules, seen.spheres, strict=True) if rule.kind in lists]
+    missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.kind not in lists]
 
+    def band(first_row: Array) -> tuple[Array, Array]:
+        found, words = [], []
+        for rule, sizes, spheres in followed:
+            made = run.with_host("grid", LISTS, (spheres, seen.camera, first_row), lists=sizes, tuning=plan.tuning)
+            shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
+            inputs = [(seen.table(rule), made, seen.camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
+            static: dict[str, Any] = {"rule": rule, "lists": sizes, "shards": shards, "tuning": plan.tuning}
+            found.append(tuple(run.each("cast", sum_columns, inputs, **static)))
+            words.append(made.faults)
+        channels, of_rules = given[1].shape[1], tuple((rule, sizes) for rule, sizes, _ in followed)
+        static = {"height": plan.band_height, "width": plan.width, "channels": channels, "rules": of_rules, "tuning": plan.tuning}
+        return run.one("image", join, (tuple(found), tuple(words), seen.camera), **static)  # type: ignore[no-any-return]
 
-_sums_at_once = functools.partial(jax.jit, static_argnames="plan")(_sums)
-
-
-def _shown(
-    particles: Particles, amounts: Array, camera: Camera, plan: ProjectionPlan
-) -> tuple[Particles, Array, Camera, Float[Array, "height width"] | None, Int[Array, ""]]:
-    """Of a periodic set what its box holds, what share of each pixel that is, and faults; else all there is."""
-    if plan.images is None or particles.box is None:
-        return particles.wrapped(), amounts, camera, None, jnp.int32(faults.NONE)
-    seen, pixels = between_faces(camera, particles.box, plan.pixel)
-    found, source, word = with_sources(particles, plan.images, through=plan.through)
-    if plan.through is not None:
-        word |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, particles.box, plan.through))
-        seen = past_faces(camera, particles.box)
-    return found, amounts[source], seen, pixels, word
-
-
-def _in_bands(rules: list[_Rule], camera: Camera, plan: ProjectionPlan, channels: int) -> tuple[Array, Array]:
-    def one(band: Int[Array, ""]) -> tuple[Array, Array]:
-        first_row = band * plan.band_height
-        total, word = jnp.zeros((plan.band_height, camera.width, channels), camera.dtype), jnp.int32(faults.NONE)
-        for rule in rules:
-            found, of_lists = _of_rule(rule, camera, first_row)
-            total, word = total + found[:, : camera.width], word | of_lists
-        return total, word
-
-    if plan.bands == 1:
-        image, word = one(jnp.int32(0))
-        return image[: camera.height], word
-    images, words = lax.map(jax.checkpoint(one, prevent_cse=False), jnp.arange(plan.bands, dtype=jnp.int32))
-    return images.reshape(-1, camera.width, channels)[: camera.height], jnp.bitwise_or.reduce(words)
-
-
-def _of_rule(rule: _Rule, camera: Camera, first_row: Array) -> tuple[Array, Array]:
-    """Pixels of a band, by one of the rules."""
-    method, lists = rule.method, rule.lists
-    made = lax.stop_gradient(build_lists(rule.footprints, lax.stop_gradient(camera), lists, first_row))
-    row, column = bundle_origins(lists, first_row)
-    if method.shares:
-        at = jnp.arange(BUNDLE + 1, dtype=camera.dtype)
+    rows = [array_of(nth * plan.band_height, jnp.int32) for nth in range(plan.bands)]
+    if plan.bands > 1 and isinstance(run, Traced):
+        images, words = lax.map(jax.checkpoint(band, prevent_cse=False), jnp.stack(rows))
+        images, words = list(images), list(words)
     else:
-        at = jnp.asarray(np.arange(BUNDLE)[:, None] + subrays_of(method.subrays)[0], camera.dtype).ravel()
-    across, down = camera.column(column[:, None] + at), camera.row(row[:, None] + at)
-    inputs = ColumnInputs(rule.table, across, down, jnp.stack([camera.near, camera.far]))
-    sums = column_sums(method, inputs, made)
-    return lists.as_image(pixels_of(sums, 1 if method.shares else method.subrays)), made.faults
+        images, words = zip(*map(band, rows), strict=True)
+    return run.one(
+        "image",
+        finish,
+        (tuple(images), tuple(words), tuple(missing), seen.pixels, seen.faults),
+        height=plan.height,
+        tuning=plan.tuning,
+    )  # type: ignore[no-any-return]
 
 
-def _rays_table(placed: Placed, amounts: Array, camera: Camera, kernel: str) -> Array:
-    """Places and reciprocal supports, and amounts a unit of area of the support."""
-    inverse = 1 / placed.support[:, None]
-    return jnp.concatenate([placed.view, inverse, amounts * inverse * inverse], 1)
+class Summed(NamedTuple):
+    """Sums of some bundles, and which these are; past the last none."""
+
+    bundle: Int[Array, " bundles"]
+    sums: list[Float[Array, "bundles down across"]]
 
 
-def _shares_table(placed: Placed, amounts: Array, camera: Camera, kernel: str) -> Array:
-    """Ray coordinates of centres and reciprocals of supports in them, and amounts a unit of area of a pixel.
+@stage("rule", "lists", "shards")
+def sum_columns(
+    table: Float[Array, "particles columns"],
+    made: BundleLists,
+    camera: Camera,
+    first_row: Int[Array, ""],
+    nth: Int[Array, ""],
+    *,
+    rule: Rule,
+    lists: ListPlan,
+    shards: int,
+    tuning: Tuning,
+) -> Summed:
+    """The `nth` of `shards` of a band: bundles in order of how many particles their lists hold, dealt out like cards."""
+    bundles, length = lists.num_bundles, made.end - made.start
+    chunk = min(rule.chunk(tuning.samples_at_once), -(-bundles // shards))
+    room = -(-bundles // (chunk * shards)) * chunk * shards
+    order = jnp.pad(jnp.argsort(-length).astype(jnp.int32), (0, room - bundles), constant_values=bundles)
+    mine = order.reshape(-1, shards)[:, nth].reshape(-1, chunk)
+    safe = jnp.minimum(mine, bundles - 1)
+    windows = Windows(made.rank, made.start[safe], jnp.where(mine < bundles, length[safe], 0))
+    row, column = bundle_origins(lists, first_row)
+    at = jnp.asarray(rule.places, camera.dtype)
+    each = camera.column(column[safe][..., None] + at), camera.row(row[safe][..., None] + at)
+    sums = over_blocks(rule, Given(table, each, jnp.stack([camera.near, camera.far])), windows)
+    return Summed(mine.ravel(), [one.reshape(-1, *one.shape[2:]) for one in sums])
 
-    With perspective a small support is an ellipse in ray coordinates, of an area that is larger by the slant of its ray.
-    """
-    x, y, z = (placed.view[:, k] for k in range(3))
-    inverse, pixel = 1 / placed.support, 2 * camera.half_height / camera.height
-    inside = depth_share(kernel, (camera.near - z) * inverse, (camera.far - z) * inverse)
-    wide, high, area = inverse, inverse, pixel
-    if camera.is_perspective:
-        z = jnp.where(placed.small, z, 1)
-        x, y = x / z, y / z
-        wide, high = z * inverse / jnp.sqrt(1 + x * x), z * inverse / jnp.sqrt(1 + y * y)
-        area = pixel * z / (1 + x * x + y * y) ** 0.25
-    of_area = amounts * (inside / area / area)[:, None]
-    return jnp.concatenate([jnp.stack([x, y, wide, high], 1), of_area], 1)
+
+@stage("height", "width", "channels", "rules", quickly=True)
+def join(
+    found: tuple[tuple[Summed, ...], ...],
+    words: tuple[Int[Array, ""], ...],
+    camera: Camera,
+    *,
+    height: int,
+    width: int,
+    channels: int,
+    rules: tuple[tuple[Rule, ListPlan], ...],
+    tuning: Tuning,
+) -> tuple[Float[Array, "height width channels"], Int[Array, ""]]:
+    """A band of the image, of all rules and shards; and its fault word."""
+    image = [jnp.zeros((height, width), camera.dtype) for _ in range(channels)]
+    for (rule, lists), shards in zip(rules, found, strict=True):
+        bundle = jnp.concatenate([shard.bundle for shard in shards])
+        for k in range(channels):
+            sums = jnp.concatenate([shard.sums[k] for shard in shards])
+            placed = jnp.zeros((lists.num_bundles + 1, *sums.shape[1:]), sums.dtype).at[bundle].set(sums)[:-1]
+            image[k] += lists.as_image(rule.pixels_of(placed))[:, :width]
+    return jnp.stack(image, -1), functools.reduce(jnp.bitwise_or, words, jnp.int32(faults.NONE))
+
+
+@stage("height", quickly=True)
+def finish(
+    bands: tuple[Array, ...],
+    words: tuple[Array, ...],
+    missing: tuple[Array, ...],
+    pixels: Array | None,
+    word: Array,
+    *,
+    height: int,
+    tuning: Tuning,
+) -> tuple[Array, Array]:
+    """The image of its bands, and all faults; `missing`: whether anybody follows a rule that there is no room for."""
+    image = jnp.concatenate(bands)[:height]
+    lost = functools.reduce(jnp.logical_or, missing, jnp.zeros((), bool))
+    word = functools.reduce(jnp.bitwise_or, words, word) | faults.raised(faults.LIST_OVERFLOW, lost)
+    return image if pixels is None else image * pixels[..., None], word

@@ -8,6 +8,8 @@ enter, never by a share of the support.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -23,7 +25,7 @@ def pixel_ranges(
     live: Bool[Array, " particles"],
     camera: Camera,
     between: tuple[Float[Array, ""], Float[Array, ""]],
-    rounding: int = ROUNDING,
+    rounding: Any = ROUNDING,
 ) -> tuple[Int[Array, " particles"], ...]:
     """First and last column, first and last row of pixels whose rays can meet each sphere `between` two depths.
 
@@ -64,7 +66,7 @@ def _lateral(
     return low, high
 
 
-def _pixels(low: Array, high: Array, size: int, rounding: int) -> tuple[Array, Array]:
+def _pixels(low: Array, high: Array, size: int, rounding: Any) -> tuple[Array, Array]:
     """Pixels whose centres lie in [low, high] (image-space units), clipped to the image."""
     margin = jnp.finfo(low.dtype).eps * rounding * size
     margin_low, margin_high = margin * (1 + jnp.abs(low) / size), margin * (1 + jnp.abs(high) / size)

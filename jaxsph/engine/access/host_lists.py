@@ -30,6 +30,7 @@ from jaxsph.engine.access.lists import (
     ListPlan,
     Ranges,
     Sphere,
+    Spheres,
     bundle_ranges,
     children_mask,
     on_nodes,
@@ -145,7 +146,7 @@ class _Pairs(NamedTuple):
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames="lists")
-def find_sides(ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
+def find_sides(ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
     """What all particles of a band are picked by."""
     ranges, kind = bundle_ranges(on_nodes(ordered, camera), lists, first_row), _small(lists)
     nowhere = (ranges.right <= ranges.left) | (ranges.bottom <= ranges.top)

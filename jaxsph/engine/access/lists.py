@@ -98,6 +98,20 @@ class BundleLists:
     faults: Int[Array, ""]
 
 
+@tree()
+class Spheres:
+    """Where spheres are in view space, how far they reach, and which pixels they can touch: all that lists are made from."""
+
+    x: Float[Array, " particles"]
+    y: Float[Array, " particles"]
+    z: Float[Array, " particles"]
+    reach: Float[Array, " particles"]
+    left: Int[Array, " particles"]
+    right: Int[Array, " particles"]
+    top: Int[Array, " particles"]
+    bottom: Int[Array, " particles"]
+
+
 def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Array, Array]:
     """Pixel row and column of each bundle's upper left corner; `first_row` is the band's first pixel row."""
     bundle = jnp.arange(plan.num_bundles, dtype=jnp.int32)
@@ -107,7 +121,7 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
     return row, column
 
 
-def build_lists(ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
+def build_lists(ordered: Ordered | Spheres, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`; of a strided camera, by its nodes."""
     ordered = on_nodes(ordered, camera)
     ranges = bundle_ranges(ordered, plan, first_row)
@@ -116,7 +130,7 @@ def build_lists(ordered: Ordered, camera: Camera, plan: ListPlan, first_row: Int
     return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
 
 
-def on_nodes(ordered: Ordered, camera: Camera) -> Ordered:
+def on_nodes(ordered: Ordered | Spheres, camera: Camera) -> Ordered | Spheres:
     """With the nodes that a strided camera's rays go through counted instead of pixels."""
     if camera.stride == 1:
         return ordered
@@ -145,7 +159,7 @@ class Ranges:
     bottom: Int[Array, " particles"]
 
 
-def bundle_ranges(ordered: Ordered, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
+def bundle_ranges(ordered: Ordered | Spheres, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
     """Bundle columns and rows, counted from the band's corner, of the pixels that each particle can touch."""
     left, right = ordered.left, ordered.right
     top = jnp.maximum(ordered.top - first_row, 0)
@@ -283,7 +297,7 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
 
 
 def _touched_children(
-    ordered: Ordered, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
+    ordered: Ordered | Spheres, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
     rank, tile = pairs

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
-from jaxsph.engine.access.lists import BundleLists, ListPlan
+from jaxsph.engine.access.lists import BundleLists, ListPlan, Spheres
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.adjoint import KEPT, CastMethod
@@ -39,6 +39,7 @@ from jaxsph.engine.frame.stages import (
     least_transmittance,
     limits_of,
     make_grid,
+    make_lists,
     order,
     stage,
     sum_shard,
@@ -92,30 +93,34 @@ def _order_foreseen(run: Forecast, stage: str, viewed: Viewed, camera: Camera, f
     return ordered
 
 
-def _grid(
-    run: Clock, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
-) -> BandGrid:
+def _lists(
+    run: Clock, stage: str, ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **_: Any
+) -> BundleLists:
     sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
     view = (sides.spheres, sides.bundles, camera, first_row)
     touched = run.program(stage, find_touched, (*view, pair_shapes(lists)))
     made = build_lists_on_host(sides, lambda pairs: touched(*view, pairs), lists, cores_at_hand())
     run.mark(stage)
-    grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
-    return grid._replace(lists=made)
+    return made
 
 
-def _grid_foreseen(
-    run: Forecast, stage: str, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **static: Any
-) -> BandGrid:
+def _lists_foreseen(
+    run: Forecast, stage: str, ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **_: Any
+) -> BundleLists:
     sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
     run.one(stage, find_touched, (sides.spheres, sides.bundles, camera, first_row, pair_shapes(lists)))
-    made = list_shapes(lists)
-    grid: BandGrid = run.one(stage, find_windows, (ordered, made, camera, first_row), lists=lists, **static)
+    return list_shapes(lists)
+
+
+def _grid(lists_of: Any, run: Any, stage: str, *seen: Any, **static: Any) -> BandGrid:
+    made = lists_of(run, stage, *seen, **static)
+    grid: BandGrid = run.one(stage, find_windows, (seen[0], made, *seen[1:]), **static)
     return grid._replace(lists=made)
 
 
 ORDER = HostStage(order, _order, _order_foreseen)
-MAKE_GRID = HostStage(make_grid, _grid, _grid_foreseen)
+LISTS = HostStage(make_lists, _lists, _lists_foreseen)
+MAKE_GRID = HostStage(make_grid, functools.partial(_grid, _lists), functools.partial(_grid, _lists_foreseen))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents
-from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
+from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, Spheres, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
 from jaxsph.engine.access.view import Viewed
@@ -152,6 +152,13 @@ def order(
     if found is None:
         return rank_particles(viewed, camera, depths, slab_samples)
     return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
+
+
+@stage("lists")
+def make_lists(spheres: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, tuning: Tuning) -> BundleLists:
+    """The lists of all bundles of the band that begins at a row of pixels."""
+    spheres, camera = jax.tree.map(lax.stop_gradient, (spheres, camera))
+    return build_lists(spheres, camera, lists, first_row)
 
 
 @stage("lists", "samples", "beside")

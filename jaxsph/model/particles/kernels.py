@@ -91,7 +91,7 @@ def _wendland_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
 
 def _quartic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, middle, inner = (_power(_positive(end * size - r, xp), 4) for end in (1.0, 0.6, 0.2))
+    outer, middle, inner = (power(_positive(end * size - r, xp), 4) for end in (1.0, 0.6, 0.2))
     return outer - 5 * middle + 10 * inner
 
 
@@ -99,13 +99,13 @@ def _quartic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     """Of the innermost piece as a polynomial of the square: its parts cancel at the centre."""
     square = part + rest
     r = xp.sqrt(square)
-    outer, middle = (_power(_positive(end * size - r, xp), 3) for end in (1.0, 0.6))
+    outer, middle = (power(_positive(end * size - r, xp), 3) for end in (1.0, 0.6))
     return xp.where(r < 0.2 * size, 12 * square - 2.4 * (size * size), -_positive(2 * outer - 10 * middle, xp) / r)
 
 
 def _quintic(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    outer, middle, inner = (_power(_positive(end * size - r, xp), 5) for end in (1.0, 2 / 3, 1 / 3))
+    outer, middle, inner = (power(_positive(end * size - r, xp), 5) for end in (1.0, 2 / 3, 1 / 3))
     return outer - 6 * middle + 15 * inner
 
 
@@ -113,33 +113,33 @@ def _quintic_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     """As `_quartic_slope`."""
     square = part + rest
     r = xp.sqrt(square)
-    outer, middle = (_power(_positive(end * size - r, xp), 4) for end in (1.0, 2 / 3))
-    inside = 20 * size * square - 25 * square * r - 20 / 9 * _power(size, 3)
+    outer, middle = (power(_positive(end * size - r, xp), 4) for end in (1.0, 2 / 3))
+    inside = 20 * size * square - 25 * square * r - 20 / 9 * power(size, 3)
     return xp.where(r < 1 / 3 * size, inside, -_positive(2.5 * outer - 15 * middle, xp) / r)
 
 
 def _wendland_c4(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    return _power(_positive(size - r, xp), 6) * (size * size + 6 * size * r + 35 / 3 * square)
+    return power(_positive(size - r, xp), 6) * (size * size + 6 * size * r + 35 / 3 * square)
 
 
 def _wendland_c4_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     r = xp.sqrt(part + rest)
-    return -28 / 3 * _power(_positive(size - r, xp), 5) * (size + 5 * r)
+    return -28 / 3 * power(_positive(size - r, xp), 5) * (size + 5 * r)
 
 
 def _wendland_c6(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    outer = _power(_positive(size - r, xp), 4)  # half of the power first, half last: all of it could underflow
+    outer = power(_positive(size - r, xp), 4)  # half of the power first, half last: all of it could underflow
     return outer * (size * size * (size + 8 * r) + square * (25 * size + 32 * r)) * outer
 
 
 def _wendland_c6_slope(part: Any, rest: Any, size: Any, xp: Any) -> Any:
     square = part + rest
     r = xp.sqrt(square)
-    return -11 * _power(_positive(size - r, xp), 7) * (size * size + 7 * size * r + 16 * square)
+    return -11 * power(_positive(size - r, xp), 7) * (size * size + 7 * size * r + 16 * square)
 
 
 def _positive(value: Any, xp: Any) -> Any:
@@ -147,9 +147,9 @@ def _positive(value: Any, xp: Any) -> Any:
     return np.maximum(value, 0) if xp is np else greater(0, value)
 
 
-def _power(value: Any, exponent: int) -> Any:
+def power(value: Any, exponent: int) -> Any:
     """A whole power by multiplications alone."""
-    half = value * value if exponent < 4 else _power(value, exponent // 2)
+    half = value * value if exponent < 4 else power(value, exponent // 2)
     if exponent < 4:
         return half * value if exponent == 3 else half
     return half * half * value if exponent % 2 else half * half

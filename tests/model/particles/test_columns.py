@@ -11,8 +11,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.analysis.projection import columns
-from jaxsph.model.particles import kernels
+from jaxsph.model.particles import columns, kernels
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -71,6 +70,17 @@ def test_single_precision_is_good_to_1e_5_of_the_peak_and_never_negative(name):
     for found in map(np.asarray, found_at(square)[name]):
         assert np.abs(found - truth).max() <= 1e-5 * truth.max()
         assert found.min() >= 0 and (found[square >= 1] == 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_mean_over_a_sixteenth_of_a_support_is_that_of_the_middle_and_the_curvature_to_1e_4_of_the_peak(name):
+    at = (np.stack(np.meshgrid(NODES, NODES), -1) / 2).reshape(-1, 2) / 16
+    weight = np.outer(WEIGHTS, WEIGHTS).ravel() / 4
+    middle = np.stack([np.linspace(0, 1.05, 200), np.linspace(0, 0.2, 200)], -1)
+    truth = columns.whole_column(name, ((middle[:, None] + at) ** 2).sum(-1), np) @ weight
+    square = (middle**2).sum(-1)
+    found = columns.whole_column(name, square, np) + np.asarray(columns.curvature(name, square)) / 16**2 / 24
+    assert np.abs(found - truth).max() < 1e-4 * columns.whole_column(name, np.float64(0), np)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.analysis.projection import columns
-from jaxsph.analysis.projection.columns import pixel_shares
-from jaxsph.model.particles import kernels
+from jaxsph.model.particles import columns, kernels
+from jaxsph.model.particles.columns import pixel_shares
 from jaxsph.numerics.fusion import barriers
 
 NAMES = sorted(kernels.KERNELS)

@@ -1,0 +1,185 @@
+"""Particles as a camera sees them for a projection: which rule each follows, which pixels it can touch, and its row of the table.
+
+Flow: particles, camera -> [seen] -> plan, lists -> sums.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.analysis.projection.rules import CUT, LARGE, SHARES, SMALL, SMOOTH, Rule
+from jaxsph.engine.access.footprint import pixel_ranges
+from jaxsph.engine.access.lists import Spheres
+from jaxsph.engine.access.resolution import ROUNDING, unresolved
+from jaxsph.engine.frame.stages import stage
+from jaxsph.engine.planning.viewing import camera_usable
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles.columns import depth_share
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
+from jaxsph.numerics import faults
+from jaxsph.numerics.trees import tree
+
+NARROW = 1 / 32  # of its depth that a support may have for shares in perspective, unless it is smaller than a pixel: ellipses
+TINY = 2.0  # pixels that it may have where shares are not exact: with more, rays are good to 3e-4 of the peak
+BESIDE_FACES = 1e-4  # of the shortest side of a period, that images may be away from it to be counted: rounding may take them in
+
+
+@tree()
+class Seen:
+    """What a projection is made from.
+
+    Attributes:
+        rays, shares: tables of particles, see `Rule`; None where no rule has shares.
+        spheres: for each rule, with pixels for those that follow it alone.
+        there: for each rule, whether any particle follows it, be it beside the picture.
+        camera: with the depths that rays begin and end at.
+        pixels: what share of each lies between the faces of a period; None where all does.
+        faults: fault word.
+    """
+
+    rays: Float[Array, "particles columns"]
+    shares: Float[Array, "particles columns"] | None
+    spheres: tuple[Spheres, ...]
+    there: tuple[Bool[Array, ""], ...]
+    camera: Camera
+    pixels: Float[Array, "height width"] | None
+    faults: Int[Array, ""]
+
+    def table(self, rule: Rule) -> Float[Array, "particles columns"]:
+        """That rules of its kind read."""
+        return self.shares if rule.kind == SHARES and self.shares is not None else self.rays
+
+
+@stage("rules", "pixel", "images", "through", quickly=True)
+def see(
+    particles: Particles,
+    amounts: Float[Array, "particles channels"],
+    camera: Camera,
+    doubt: Float[Array, ""],
+    *,
+    rules: tuple[Rule, ...],
+    pixel: str,
+    images: int | None,
+    through: int | None,
+    tuning: Tuning,
+) -> Seen:
+    """Particles as seen by a camera.
+
+    Args:
+        particles: in world space.
+        amounts: that they hold.
+        camera: that sees them.
+        doubt: times what rounding may be off by, within which a decision is left open: what may be live is, and what may follow
+            either of two rules follows both. Theorem: with 2 or more, there are at least the pixels that any other program finds
+            with 0: each is off by less than `ROUNDING` eps of what enters, which margins hold once for itself, and `doubt` times
+            more. Programs round differently, and whole layers of a lattice lie on the border of a decision.
+        rules: that they may follow.
+        pixel, images, through: see `ProjectionPlan`.
+        tuning: for the machine.
+
+    Differentiation:
+        Tables have derivatives; which rule a particle follows, and which pixels it can touch, is held fixed.
+    """
+    dtype = jnp.promote_types(particles.dtype, camera.dtype)
+    camera, pixels, crowded = jax.tree.map(lambda leaf: leaf.astype(dtype), camera), None, jnp.int32(faults.NONE)
+    if images is None or particles.box is None:
+        particles = particles.wrapped()
+    else:  # of a periodic set what its box holds
+        box, beyond = particles.box, BESIDE_FACES * jnp.where(doubt > 0, particles.box.sides.min(), 0)
+        inside, pixels = between_faces(camera, box, pixel)
+        particles, source, crowded = with_sources(particles, images, beyond, through)
+        amounts = amounts[source]
+        if through is not None:
+            crowded |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, box, through))
+            inside = past_faces(camera, box)
+        camera = inside
+    offset = camera.offset(particles.position, particles.position_rest)
+    view, distance = camera.rotate(offset), lax.stop_gradient(jnp.abs(offset).max(1))
+    usable = jnp.isfinite(view).all(1) & (particles.support > 0) & jnp.isfinite(particles.support)
+    view, support = jnp.where(usable[:, None], view, 0), jnp.where(usable, particles.support, 1)
+    (x, y, z), reach, still = lax.stop_gradient(view).T, lax.stop_gradient(support), lax.stop_gradient(camera)
+    size = distance + reach + jnp.maximum(jnp.abs(still.near), jnp.abs(still.far))
+    off = doubt.astype(dtype) * ROUNDING * jnp.finfo(dtype).eps * size
+    live = particles.valid & usable & (z + reach >= still.near - off) & (z - reach <= still.far + off)
+    blurred = live & unresolved(lax.stop_gradient(view), distance, reach, still, jnp.zeros(1, dtype))
+    amounts = jnp.where(live[:, None], amounts, 0).astype(dtype)
+    word = crowded | faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any() | ~jnp.isfinite(amounts).all())
+    word |= faults.raised(faults.UNRESOLVED, blurred.any()) | faults.raised(faults.BAD_CAMERA, ~camera_usable(still))
+    followed = _followed(rules, z, reach, still, off)
+    small = followed.get(SHARES, jnp.zeros_like(live))
+    wanted = [live & followed[rule.kind] for rule in rules]
+    margin = ROUNDING * (1 + doubt.astype(dtype))
+    spheres = tuple(
+        _spheres((x, y, z), reach, distance, one, still, rule.beside, margin) for rule, one in zip(rules, wanted, strict=True)
+    )
+    inverse = 1 / support[:, None]
+    rays = jnp.concatenate([view, inverse, amounts * inverse * inverse], 1)
+    shares = _shares_table(view, support, small, amounts, camera, rules[0].kernel) if rules[0].kind == SHARES else None
+    return Seen(rays, shares, spheres, tuple(one.any() for one in wanted), camera, pixels, word)
+
+
+def _followed(
+    rules: tuple[Rule, ...], z: Array, reach: Array, camera: Camera, off: Array
+) -> dict[str, Bool[Array, " particles"]]:
+    """Who follows rules of each kind; within `off` of a decision both."""
+    pixel = 2 * camera.half_height / camera.height
+
+    def whole(off: Array) -> Array:
+        return (z - reach >= camera.near - off) & (z + reach <= camera.far + off)
+
+    def small(off: Array) -> Array:
+        if rules[0].kind != SHARES:
+            return jnp.zeros(z.shape, bool)
+        if camera.is_perspective:
+            return (z + off > 0) & (reach - off < jnp.maximum(jnp.minimum(TINY * pixel, NARROW), pixel) * (z + off))
+        return (reach - off < TINY * pixel) | (whole(off) & (reach - off < SMALL * pixel))
+
+    def smooth(off: Array) -> Array:
+        return (reach + off >= LARGE * pixel) & (SMOOTH in (rule.kind for rule in rules))
+
+    solid, large = whole(off), ~small(-off)
+    return {
+        SHARES: small(off),
+        SMOOTH: solid & large & smooth(off),
+        "whole": solid & large & ~smooth(-off),
+        CUT: ~whole(-off) & large,
+    }
+
+
+def _spheres(
+    view: tuple[Array, ...], support: Array, distance: Array, wanted: Array, camera: Camera, beside: float, margin: Array
+) -> Spheres:
+    """Those `wanted`, with the pixels whose rays, up to `beside` pixels from the middle on either axis, they can touch."""
+    x, y, z = view
+    eps = jnp.finfo(x.dtype).eps * margin
+    reach = support * (1 + eps) + eps * distance
+    aside = math.sqrt(2) * beside * 2 * camera.half_height / camera.height
+    reach = reach + aside * ((jnp.abs(z) + reach) if camera.is_perspective else 1)
+    sides: Any = pixel_ranges(x, y, z, reach, wanted, camera, (camera.near, camera.far), margin)
+    return Spheres(x, y, z, reach, *sides)
+
+
+def _shares_table(view: Array, support: Array, small: Array, amounts: Array, camera: Camera, kernel: str) -> Array:
+    """Ray coordinates of centres and reciprocals of supports in them, and amounts a unit of area of a pixel.
+
+    With perspective a small support is an ellipse in ray coordinates, of an area that is larger by the slant of its ray.
+    """
+    x, y, z = view.T
+    inverse, pixel = 1 / support, 2 * camera.half_height / camera.height
+    inside = depth_share(kernel, (camera.near - z) * inverse, (camera.far - z) * inverse)
+    wide, high, area = inverse, inverse, pixel
+    if camera.is_perspective:
+        z = jnp.where(small, z, 1)
+        x, y = x / z, y / z
+        wide, high = z * inverse / jnp.sqrt(1 + x * x), z * inverse / jnp.sqrt(1 + y * y)
+        area = pixel * z / (1 + x * x + y * y) ** 0.25
+    of_area = jnp.where(small[:, None], amounts * (inside / area / area)[:, None], 0)
+    return jnp.concatenate([jnp.stack([x, y, wide, high], 1), of_area], 1)
