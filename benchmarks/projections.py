@@ -1,20 +1,29 @@
 """Claim: a projection keeps all mass, has the column density of a uniform box to 1e-4, and agrees with other codes to 1e-3.
 
-Of each particle file along z at 512 x 512, and beside a peer at 256 x 256; in periodic boxes between their faces:
+    uniform    the middle of a lattice of equal particles, cubic spline and Wendland C2, whole and cut by depths, to 1e-4.
 
+Of random particles of equal supports in a unit box, along z, in turns in one process: rays and means over pixels of `project` by
+either kernel, and swiftsimio's backends, which sum a Wendland C2 kernel of two dimensions over the same supports:
+
+    seconds    of an image as a user asks for it, plan included, the first apart; and over those of swiftsimio's `fast`;
+    error      against what a pixel of each stands for, by its own kernel and summed in float64, in the middle of the image: rays
+               of `project`, to 1e-5, of `fast` and of `nested`; means of `project`, to 1e-4, and of `subsampled`;
+    column     of swiftsimio's: against the column of Wendland C2 in three dimensions, of which its kernel is not the integral.
+
+Of each particle file along z at 512 x 512, and beside another peer at 256 x 256; in periodic boxes between their faces:
+
+    seconds    as above; and of the peer, compiled, in its own process before;
     mass       in the image, over that of the particles (`--pixel mean`), to 1e-3;
-    uniform    the middle of a lattice of equal particles, cubic spline and Wendland C2, whole and cut by depths, to 1e-4;
     sarracen   column density by the cubic spline over 2 h, where that is the support: its exact means over pixels against
-               `pixel="mean"`, its rays through their middles against `pixel="ray"`. Relative differences in pixels that hold at
-               least 1e-3 of the most, and their 99.9 %; to 1e-3. A periodic box is given to it as copies beside the box along x
-               and y, and rays pass the whole of each copy: of a whole period that is the same. All is moved by 1e-6 of a
-               pixel, as its exact means raise an error where a particle lies on the edge of one;
-    seconds    of `project`, compiled, and what compiling took; and of the peer, compiled, in its own process before.
+               `pixel="mean"`, its rays through their middles against `pixel="ray"`, to 1e-3. A periodic box is given to it as
+               copies beside the box along x and y, and rays pass the whole of each copy: of a whole period that is the same.
+               All is moved by 1e-6 of a pixel, as its exact means raise an error where a particle lies on the edge of one.
 
-Peers are asked in a process of their own, by a Python that has them, and left out where it does not. Writes
+Differences are relative, in pixels that hold at least 1e-3 of the most. Peers are left out where they are not: swiftsimio is
+asked in this process (`pip install "jaxsph[peers]"`), sarracen in one of its own, by a Python that has it. Writes
 `results/projections.json`; ends in asserts.
 
-    python benchmarks/projections.py FILE ... [--peer-python PYTHON] [--sizes 256 512] [--repeats 3] [--check]
+    python benchmarks/projections.py [FILE ...] [--peer-python PYTHON] [--sizes 256 512] [--boxes 200000,512 ...] [--check]
 """
 
 from __future__ import annotations
@@ -27,18 +36,31 @@ import statistics
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
 import jaxsph as js
-from jaxsph.analysis.projection.plan import plan_projection
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.model.particles import kernels
+from jaxsph.reference.columns import KINKS, integral_across
 from jaxsph.trade.measurement import of_this_run
 
+try:
+    import swiftsimio
+    from swiftsimio.visualisation.projection_backends import backends_parallel
+    from swiftsimio.visualisation.projection_backends.kernels import kernel_gamma
+except ImportError:
+    swiftsimio = None
+
 MASS, UNIFORM, PEER, HELD = 1e-3, 1e-4, 1e-3, 1e-3
+ERROR = {"ray": 1e-5, "mean": 1e-4}
 OFF = 1e-6  # pixels
+PAUSE = 0.5  # seconds between turns: threads of OpenMP spin for some 0.2 s after a peer's image, on the next contender's cores
+SPACINGS = 2.4  # supports in mean spacings of the particles of a box
+WINDOW = 64  # pixels on a side, in the middle of a box, whose truth is known
+BACKENDS = {"fast": "ray", "subsampled": "mean", "nested": "ray"}  # of swiftsimio, and what a pixel of each stands for
 LATTICES = {"cubic_spline": 4.2, "wendland_c2": 5.2}  # supports in spacings, for which sums over a lattice are even
 RESULTS = pathlib.Path(__file__).with_name("results") / "projections.json"
 ASK = """
@@ -108,11 +130,90 @@ def asked(python: str, particles: js.Particles, mass: np.ndarray, camera: js.Cam
 def differences(values: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """Relative, in pixels that hold enough."""
     there = truth > HELD * truth.max()
-    off = np.abs(values[there] / truth[there] - 1)
-    of_most = float(np.abs(values - truth).max() / truth.max())
-    return {"pixels": int(there.sum()), "median": float(np.median(off)), "99.9 %": float(np.quantile(off, 0.999))} | {
-        "largest": float(off.max()), "largest of the most": of_most
-    }  # fmt: skip
+    off, of_most = np.abs(values[there] / truth[there] - 1), np.abs(values - truth).max() / truth.max()
+    found = {"median": np.median(off), "99.9 %": np.quantile(off, 0.999), "largest": off.max(), "largest of the most": of_most}
+    return {"pixels": int(there.sum())} | {name: float(each) for name, each in found.items()}
+
+
+def in_turns(runs: dict[Any, Callable[[], Any]], repeats: int) -> dict[Any, tuple[np.ndarray, dict[str, Any]]]:
+    """Image and seconds of each, the first apart."""
+    seconds: dict[Any, list[float]] = {name: [] for name in runs}
+    images = {}
+    for _ in range(repeats + 1):
+        for name, run in runs.items():
+            time.sleep(PAUSE)
+            started = time.perf_counter()
+            images[name] = np.asarray(run())
+            seconds[name].append(time.perf_counter() - started)
+    rows = {name: {"seconds": statistics.median(each[1:]), "first_seconds": each[0]} for name, each in seconds.items()}
+    return {name: (images[name].astype(np.float64), row) for name, row in rows.items()}
+
+
+def ours(particles: js.Particles, camera: js.Camera, of: Any = None) -> dict[str, Callable[[], Any]]:
+    """Both rules of pixels."""
+    return {rule: lambda rule=rule: js.project(particles, camera, of, pixel=rule).values for rule in ("ray", "mean")}
+
+
+def theirs(place: np.ndarray, support: np.ndarray, mass: np.ndarray, size: int) -> dict[str, Callable[[], Any]]:
+    """Backends of swiftsimio, rows from the top; none where it is not there."""
+    if swiftsimio is None:
+        return {}
+    x, y = place[:, :2].T.astype(np.float64)
+    given = x, y, mass, (support / kernel_gamma).astype(np.float32), size
+    return {name: lambda name=name: backends_parallel[name](*given).T[::-1] for name in BACKENDS}
+
+
+def profiles(away: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of kernels of support 1 at distances from their middles, and the kernel in two dimensions of swiftsimio."""
+    found, end = {"swiftsimio": 7 / np.pi * (1 - away) ** 4 * (1 + 4 * away)}, np.ones_like(away)
+    for name in LATTICES:
+        kernel = kernels.by_name(name)
+        column = integral_across(
+            np.array(KINKS), away**2, lambda square, t, of=kernel: of.of_square(square + t * t, np), -end, end
+        )
+        found[name] = kernel.norm * column
+    return found
+
+
+def truth(place: np.ndarray, support: float, mass: float, size: int) -> dict[str, dict[str, np.ndarray]]:
+    """Rays and means of the window by each profile, in float64."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)  # of a pixel on each axis: the one in the middle is its ray
+    x = ((size - WINDOW) / 2 + np.arange(WINDOW)[:, None] + (1 + nodes) / 2).ravel() / size
+    away = np.linspace(0, 1, 2**16 + 1)  # so fine that a line between two is right to 1e-8
+    tables = profiles(away)
+    sums = {name: np.zeros((len(x), len(x))) for name in tables}
+    near = (np.abs(place[:, :2] - 0.5) < WINDOW / 2 / size + support).all(1)
+    for middle in place[near].astype(np.float64):
+        distance = np.hypot(x - middle[0], x[::-1, None] - middle[1]) / support
+        met = np.nonzero(distance < 1)
+        for name, table in tables.items():
+            sums[name][met] += np.interp(distance[met], away, table)
+    parts = {name: (each * mass / support**2).reshape(WINDOW, 3, WINDOW, 3) for name, each in sums.items()}
+    means = {name: np.einsum("isjt,s,t->ij", each, weights / 2, weights / 2) for name, each in parts.items()}
+    return {name: {"ray": parts[name][:, 1, :, 1], "mean": means[name]} for name in parts}
+
+
+def box(count: int, size: int, repeats: int) -> dict[str, Any]:
+    """One box: all contenders."""
+    place = np.random.default_rng(0).random((count, 3)).astype(np.float32)
+    support, mass = np.full(count, SPACINGS * count ** (-1 / 3), np.float32), np.full(count, 1 / count, np.float32)
+    camera = js.Camera.orthographic((0.5, 0.5, 3), (0.5, 0.5, 0), view_height=1, width=size, height=size)
+    runs = {("swiftsimio", name): run for name, run in theirs(place, support, mass, size).items()}
+    for kernel in LATTICES:
+        particles = js.Particles.from_arrays(place, support, 0.0, mass, kernel)
+        runs |= {(kernel, rule): run for rule, run in ours(particles, camera).items()}
+    middle, right = slice((size - WINDOW) // 2, (size + WINDOW) // 2), truth(place, float(support[0]), float(mass[0]), size)
+    rows: dict[str, Any] = {}
+    for (code, name), (values, row) in in_turns(runs, repeats).items():
+        rule, seen = BACKENDS.get(name, name), values[middle, middle]
+        rows[f"{code} {name}"] = row
+        row["error"] = differences(seen, right[code][rule])
+        if "swiftsimio fast" in rows:
+            row["over fast"] = row["seconds"] / rows["swiftsimio fast"]["seconds"]
+        if code == "swiftsimio":
+            row["column"] = differences(seen, right["wendland_c2"][rule])
+        print(f"{count} {size} {code} {name} {json.dumps(row)}", flush=True)
+    return rows
 
 
 def measured(path: str, options: argparse.Namespace) -> dict[str, Any]:
@@ -121,40 +222,35 @@ def measured(path: str, options: argparse.Namespace) -> dict[str, Any]:
     particles = js.io.particles_from_table(table, "x", kernel="cubic_spline")[0]
     name = table.named(*ROLES["mass"])
     mass = np.ones(len(table)) if name is None else choose_quantity(table, name)[0]
+    mass = mass / mass.mean()
     found: dict[str, Any] = {"particles": len(table), "periodic": particles.box is not None, "format": table.source, "sizes": {}}
     for size in sorted(options.sizes):
         camera = js.Camera.along_axis(particles, "z", size, size)
         peer = None
         if options.peer_python and size == min(options.sizes):  # the peer takes minutes
-            peer = asked(options.peer_python, particles, mass / mass.mean(), camera)
-        rows = {rule: row_of(particles, mass / mass.mean(), camera, rule, peer, options.repeats) for rule in ("mean", "ray")}
+            peer = asked(options.peer_python, particles, mass, camera)
         pixel = 2 * float(camera.half_height) / size
-        rows["smallest support in pixels"] = float(particles.to_numpy()["support"].min() / pixel)
+        rows: dict[str, Any] = {"smallest support in pixels": float(particles.to_numpy()["support"].min() / pixel)}
+        for rule, (values, row) in in_turns(ours(particles, camera, mass), options.repeats).items():
+            row["mass"], rows[rule] = float(values.sum() * pixel**2 / mass.sum() - 1), row
+            if peer is not None:
+                row["sarracen"] = differences(values, peer[rule]) | {
+                    "seconds": peer[f"{rule}_seconds"],
+                    "version": peer["version"],
+                }
+                row["sarracen"]["mass"] = float(peer[rule].sum() * pixel**2 / mass.sum() - 1)
         found["sizes"][size] = rows
         print(f"{pathlib.Path(path).name} {size} {json.dumps(rows)}", flush=True)
     return found
 
 
-def row_of(particles: js.Particles, mass: np.ndarray, camera: js.Camera, rule: str, peer: Any, repeats: int) -> dict[str, Any]:
-    """One image, its time, and how far it is from the peer's."""
-    plan, seconds = plan_projection(particles, camera, pixel=rule), []
-    for _ in range(repeats + 1):
-        started = time.perf_counter()
-        image = js.project(particles, camera, mass, pixel=rule, plan=plan)
-        jax.block_until_ready(image.values)
-        seconds.append(time.perf_counter() - started)
-    values, area = np.asarray(image.values, np.float64), float(image.pixel_area)
-    row: dict[str, Any] = {"seconds": statistics.median(seconds[1:]), "first_seconds": seconds[0]}
-    row["mass"] = float(values.sum() * area / mass.sum() - 1)
-    if peer is not None:
-        row["sarracen"] = differences(values, peer[rule]) | {"seconds": peer[f"{rule}_seconds"], "version": peer["version"]}
-        row["sarracen"]["mass"] = float(peer[rule].sum() * area / mass.sum() - 1)
-    return row
-
-
 def check(result: dict[str, Any]) -> None:
     """The claim."""
     assert all(off <= UNIFORM for off in result["uniform"].values()), result["uniform"]
+    for case, rows in result["boxes"].items():
+        for name, row in rows.items():
+            code, rule = name.split()
+            assert code == "swiftsimio" or row["error"]["largest"] <= ERROR[rule], (case, name, row)
     for name, found in result["files"].items():
         for size, rows in found["sizes"].items():
             assert abs(rows["mean"]["mass"]) <= MASS, (name, size)
@@ -168,15 +264,21 @@ def main() -> None:
     parser.add_argument("files", nargs="*", metavar="FILE")
     parser.add_argument("--peer-python")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="the smallest is that of the peer, too")
+    cases = ["32768,512", "200000,512", "1000000,1024"]
+    parser.add_argument("--boxes", nargs="*", default=cases, metavar="PARTICLES,SIZE", help="pixels: a multiple of 16")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--check", action="store_true", help="do not write results")
     options = parser.parse_args()
-    result = {**of_this_run(), "uniform": {kernel: uniform(kernel) for kernel in LATTICES}}
+    result = {**of_this_run(), "swiftsimio": getattr(swiftsimio, "__version__", None)}
+    if swiftsimio is None:
+        print("no swiftsimio here: boxes are projected without a peer")
+    result["uniform"] = {kernel: uniform(kernel) for kernel in LATTICES}
     print("uniform", result["uniform"])
+    result["boxes"] = {case: box(*map(int, case.split(",")), options.repeats) for case in options.boxes}
     result["files"] = {pathlib.Path(path).name: measured(path, options) for path in options.files}
-    check(result)
     if not options.check:
         RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    check(result)
 
 
 if __name__ == "__main__":
