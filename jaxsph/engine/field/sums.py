@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
-from jax import lax
+from jax import custom_jvp, lax
 from jaxtyping import Array, Float
 
 from jaxsph.numerics.fusion import barriers_kept
@@ -43,16 +43,6 @@ class Sums:
         parts = [part for pair in self.packed for part in ((pair.real, pair.imag) if jnp.iscomplexobj(pair) else (pair,))]
         return tuple(parts[: 1 + self.num_quantities])
 
-    @property
-    def weight(self) -> Float[Array, "..."]:
-        """Of V W."""
-        return self.all[0]
-
-    @property
-    def weighted(self) -> tuple[Float[Array, "..."], ...]:
-        """Of (q - reference) V W, for each quantity."""
-        return self.all[1:]
-
 
 def sums_of(channels: list[Float[Array, "..."]]) -> Sums:
     """Those sums, that of weights first."""
@@ -74,6 +64,7 @@ def with_block(sums: Sums, block: Iterable[tuple[Array, Iterable[Array]]]) -> Su
     return sums_of([old + new for old, new in zip(sums.all, added, strict=True)])
 
 
+@custom_jvp
 def in_halves(parts: list[list[Array]]) -> tuple[Array, ...]:
     """Element-wise sums of lists, in one loop: within the halves of `parts` written out, over the halves by a reduction."""
     halves = [
@@ -82,6 +73,10 @@ def in_halves(parts: list[list[Array]]) -> tuple[Array, ...]:
     operands = tuple(jnp.stack(pair) for pair in zip(*halves, strict=True))
     start = tuple(jnp.zeros((), value.dtype) for value in operands)
     return tuple(lax.reduce(operands, start, lambda a, b: tuple(p + q for p, q in zip(a, b, strict=True)), (0,)))
+
+
+# JAX's own rule takes the reduction apart: its sums are rounded otherwise, and may lie on the other side of a kink
+in_halves.defjvp(lambda parts, moves: (in_halves(*parts), in_halves(*moves)))
 
 
 def together_of(first: Array, second: Array) -> Any:

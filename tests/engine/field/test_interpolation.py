@@ -46,5 +46,5 @@ def test_a_cubic_field_is_interpolated_exactly(spacing, x64):
         ]
         zs, ys, xs = np.meshgrid(*at, indexing="ij")
         wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(slab_samples, 64)
-        np.testing.assert_allclose(found.weight[k], wanted, rtol=1e-10, atol=1e-10)
-        np.testing.assert_allclose(found.weighted[0][k], 2 * wanted, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(found.all[0][k], wanted, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(found.all[1][k], 2 * wanted, rtol=1e-10, atol=1e-10)

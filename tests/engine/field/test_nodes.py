@@ -129,7 +129,7 @@ def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x
     grid, reference = stages(particles, camera, plan=plan)
     fullest = np.argsort(np.asarray(grid.windows.count).ravel())[-plan.cast.chunk :].astype(np.int32)
     every, few = (
-        np.asarray(sums.weight) + 1j * np.asarray(*sums.weighted)
+        np.asarray(sums.all[0]) + 1j * np.asarray(sums.all[1])
         for sums in sums_of(grid, reference, camera, fullest, plan=plan, kernel=particles.kernel)
     )
     at = np.ix_(range(len(few)), range(few.shape[1]), SUBSAMPLE, SUBSAMPLE)
