@@ -45,12 +45,13 @@ from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops, added
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
-from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import side_by_side
 from jaxsph.numerics.trees import tree
 
+BESIDE = 64  # eps of a quantity and of what it is relative to, up to which it may lie before a kink and count as behind
 Vectors = list[Float[Array, "tasks rays"]]
 
 
@@ -103,7 +104,20 @@ class SurfaceLook:
         """Red, green and blue before they are lit."""
         if self.segments is None:
             return list(self.color)
-        return read(self.segments, find(self.segments, reference + found.weighted[0] * ratio(1.0, found.weight)), COLORS)
+        return _painted(self.segments, reference + found.weighted[0] * ratio(1.0, found.weight), reference)
+
+
+@jax.custom_jvp
+def _painted(segments: Segments, quantity: Array, reference: Array) -> list[Array]:
+    return look_up(segments, quantity)[COLORS]
+
+
+@_painted.defjvp
+def _painted_moved(primals: tuple[Any, Array, Array], moves: tuple[Any, Array, Any]) -> tuple[list[Array], list[Array]]:
+    """On a kink with the slope of what begins there, though the root that is found again backward is a rounding away."""
+    segments, quantity, reference = primals
+    ahead = quantity + BESIDE * jnp.finfo(quantity.dtype).eps * (abs(quantity) + abs(reference))
+    return _painted(*primals), jax.jvp(look_up, (segments, ahead), moves[:2])[1][COLORS]
 
 
 def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
