@@ -87,12 +87,7 @@ class SurfaceLook:
     light: Float[Array, "3"] | None = None
 
     def shade(self, found: Found, ray: Vectors, reference: Float[Array, "tasks 1"]) -> tuple[Vectors, Vectors]:
-        """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope.
-
-        Args:
-            ray: x, y and z of vectors along the rays.
-            reference: what the quantities that were found are relative to.
-        """
+        """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope."""
         steepest = lax.stop_gradient(jnp.stack([abs(of) for of in found.gradient]).max(0))
         gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
         square = gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2
@@ -128,8 +123,7 @@ def slope_along(found: Found, ray: Vectors) -> Float[Array, "tasks rays"]:
 def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root: Bool[Array, ""]) -> Root:
     """The root in a bracket, by a step of Newton's from its secant, which has the derivatives; and what is found there.
 
-    Args:
-        is_root: whether the secant is the root: then it stays, and the step has the derivatives alone.
+    Where the secant `is_root` it stays, and the step has the derivatives alone.
 
     Differentiation:
         By the particles, the rays and the level, as of an implicit function; the bracket has none.
@@ -152,8 +146,7 @@ def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root
 def pull_root(table: Float[Array, "particles 8"], rays: Piercing, place: Float[Array, "tasks rays"], cotangents: Root) -> OfRoot:
     """Cotangents of all that a root depends on, from those of the root; 0 where the field has no slope along the ray."""
     _, moved = jax.jvp(rays.found, (place,), (jnp.ones_like(place),))
-    of_found = cotangents.found
-    of_place = cotangents.place
+    of_place, of_found = cotangents
     for of, along in zip(jax.tree.leaves(of_found), jax.tree.leaves(moved), strict=True):
         of_place = of_place + of * along
     slope = moved.weight
@@ -293,14 +286,12 @@ class ParticleSurface(Medium):
     def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
         """Opaque where the surface is."""
         path = task.path()
-        each = jnp.arange(path.shape[1], dtype=jnp.int32)[:, None]
-        opaque = (gathered.interval[:, None] == each) & (path > 0)
+        opaque = (gathered.interval[:, None] == jnp.arange(path.shape[1], dtype=jnp.int32)[:, None]) & (path > 0)
         return jnp.where(opaque, ratio(OPAQUE, path), 0), gathered
 
     def colors(self, samples: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
         """Of the surface, lit."""
-        shape = task.between_shape
-        return [jnp.broadcast_to(samples.color[:, k, None], shape) for k in range(3)[channels]]
+        return [jnp.broadcast_to(samples.color[:, k, None], task.between_shape) for k in range(3)[channels]]
 
     def intervals(self, gathered: Hit, task: SlabTask) -> Hit:
         """What was gathered is of intervals."""
