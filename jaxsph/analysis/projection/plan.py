@@ -15,7 +15,7 @@ from jaxsph.analysis.projection.rules import PIXELS, Rule, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
-from jaxsph.engine.planning.measures import Measures, measure
+from jaxsph.engine.planning.measures import pairs_in_view
 from jaxsph.engine.planning.plan import MAX_CAPACITY, fullest_band
 from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
@@ -148,7 +148,9 @@ def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> Proje
     bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through)
     seen = bare.see(run, particles, amounts, camera, DOUBT)
     rules = rules_of(particles.kernel, camera.is_perspective, pixel)
-    counts = {rule: measure(one, camera, 1) for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True) if some}  # type: ignore[arg-type]
+    counts = {
+        rule: pairs_in_view(one, camera)[2:] for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True) if some
+    }
     while True:
         made = dataclasses.replace(
             bare, bands=bands, lists=tuple(sorted((rule.kind, _lists(one, camera, bands)) for rule, one in counts.items()))
@@ -164,10 +166,10 @@ def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> Proje
         bands = min(2 * bands, rows)
 
 
-def _lists(counted: Measures, camera: Camera, bands: int) -> ListPlan:
+def _lists(counted: tuple[np.ndarray, np.ndarray], camera: Camera, bands: int) -> ListPlan:
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
-    pairs = [fullest_band(counts, of_band) for counts in (counted.tile_pairs, counted.bundle_pairs)]
+    pairs = [fullest_band(counts, of_band) for counts in counted]
     return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.analysis.projection.plan import ProjectionPlan, planned
 from jaxsph.analysis.projection.rules import Rule, rules_of
-from jaxsph.engine.access.lists import BundleLists, ListPlan, bundle_origins
+from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.frame.frame import LISTS
 from jaxsph.engine.frame.stages import stage
@@ -103,8 +103,6 @@ def project(
         run, asked = clock or Clock(), plan is not None
         plan = plan or planned(given, pixel, memory_for(particles.support), run)
         plan.check(particles, camera, pixel)
-        if not traced:
-            run.foresee(lambda forecast: _sums(given, plan, forecast))
         sums, word = _sums(given, plan, Traced() if traced else run)
         if not traced and int(word) & faults.OVERFLOWS and asked:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
@@ -198,10 +196,10 @@ class Summed(NamedTuple):
     """Sums of some bundles, and which these are; past the last none."""
 
     bundle: Int[Array, " bundles"]
-    sums: list[Float[Array, "bundles down across"]]
+    sums: list[Float[Array, "down across bundles"]]
 
 
-@stage("rule", "lists", "shards")
+@stage("rule", "lists", "shards", widely=True)
 def sum_columns(
     table: Float[Array, "particles columns"],
     made: BundleLists,
@@ -224,9 +222,9 @@ def sum_columns(
     windows = Windows(made.rank, made.start[safe], jnp.where(mine < bundles, length[safe], 0))
     row, column = bundle_origins(lists, first_row)
     at = jnp.asarray(rule.places, camera.dtype)
-    each = camera.column(column[safe][..., None] + at), camera.row(row[safe][..., None] + at)
+    each = camera.column(column[safe][:, None] + at[:, None]), camera.row(row[safe][:, None] + at[:, None])
     sums = over_blocks(rule, Given(table, each, jnp.stack([camera.near, camera.far])), windows)
-    return Summed(mine.ravel(), [one.reshape(-1, *one.shape[2:]) for one in sums])
+    return Summed(mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums])
 
 
 @stage("height", "width", "channels", "rules", quickly=True)
@@ -246,9 +244,9 @@ def join(
     for (rule, lists), shards in zip(rules, found, strict=True):
         bundle = jnp.concatenate([shard.bundle for shard in shards])
         for k in range(channels):
-            sums = jnp.concatenate([shard.sums[k] for shard in shards])
-            placed = jnp.zeros((lists.num_bundles + 1, *sums.shape[1:]), sums.dtype).at[bundle].set(sums)[:-1]
-            image[k] += lists.as_image(rule.pixels_of(placed))[:, :width]
+            pixels = rule.pixels_of(jnp.concatenate([shard.sums[k] for shard in shards], -1))
+            placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].set(jnp.moveaxis(pixels, -1, 0))
+            image[k] += lists.as_image(placed[:-1])[:, :width]
     return jnp.stack(image, -1), functools.reduce(jnp.bitwise_or, words, jnp.int32(faults.NONE))
 
 

@@ -9,17 +9,15 @@ through the middle will do with the curvature there: $w^4 / 1920$ of fourth deri
 Columns that no depth cuts are read from a fit by the squared distance alone; only those that one cuts need their closed form.
 
 Of a ray the sum is $\sum_j a_j F_j$, with F_j the integral of a kernel of unit integral along the ray between two depths, and a_j
-what the particle holds. Shapes, once: (bundles, particles of a block, places down, places across).
+what the particle holds. Shapes, once: (particles of a block, places down, places across, bundles).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import operator
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -74,64 +72,70 @@ class Rule:
         """How far from the middle of its pixel a rule looks, in pixels on either axis."""
         return 0.5 if self.kind == SHARES else float(np.max(np.abs(_nodes(self.subrays)[0] - 0.5)))
 
-    def pixels_of(self, sums: Float[Array, "bundles down across"]) -> Float[Array, "bundles 8 8"]:
+    def pixels_of(self, sums: Float[Array, "down across bundles"]) -> Float[Array, "8 8 bundles"]:
         """Means over the rays of each pixel, by Gauss-Legendre quadrature on either axis."""
         if self.subrays == 1:
             return sums
         weights = jnp.asarray(_nodes(self.subrays)[1], sums.dtype)
-        parts = sums.reshape(-1, BUNDLE, self.subrays, BUNDLE, self.subrays)
-        return jnp.einsum("bisjt,s,t->bij", parts, weights, weights, precision="highest")
+        parts = sums.reshape(BUNDLE, self.subrays, BUNDLE, self.subrays, -1)
+        return jnp.einsum("isjtb,s,t->ijb", parts, weights, weights, precision="highest")
 
-    def __call__(self, rows: Float[Array, "bundles particles columns"], each: Any, shared: Float[Array, "2"]) -> list[Array]:
-        """What particles add to the places of bundles, for each of the amounts that they hold; see `field.blocks.Body`.
+    def prepare(
+        self, rows: Float[Array, "particles bundles columns"], each: tuple[Array, Array], shared: Float[Array, "2"]
+    ) -> tuple[Array, ...]:
+        """What columns are found from, and amounts. See `field.blocks.Body`; parallel rays have squared distances that add up.
 
         Args:
             rows: for rays x, y, z and reciprocal support; for shares ray coordinates of the centre, and the reciprocals of the
                 support in them. Then amounts.
-            each: ray coordinates of columns and of rows, or of the edges of pixels, (bundles, places).
+            each: ray coordinates of columns and of rows, or of the edges of pixels, (places, bundles).
             shared: near and far depth.
         """
-        amounts = [rows[:, :, k, None, None] for k in range(PLACE, rows.shape[2])]
-        place, always = tuple(rows[:, :, k, None, None] for k in range(PLACE)), rows[0, 0, 0] >= 0
-        if rows.shape[1] < 16 or self.kind not in (SMOOTH, WHOLE) or rows.dtype != jnp.float32:
-            found = fusion_barrier(always, self._columns, place, *each, shared)
-            return [(amount * found).sum(1) for amount in amounts]
-        part = fusion_barrier(always, self._part, place, *each)
-        nth = [jax.tree.map(operator.itemgetter(np.s_[:, k]), part) for k in range(rows.shape[1])]
-        columns = [self._column(one, shared) for one in nth]
-        return [functools.reduce(jnp.add, [amount[:, k] * one for k, one in enumerate(columns)]) for amount in amounts]
-
-    def _columns(self, place: tuple[Array, ...], across: Array, down: Array, ends: Array) -> Array:
-        """Of particles that hold 1, at all places of bundles."""
+        x, y, z, inverse, *amounts = (rows[:, None, None, :, k] for k in range(rows.shape[2]))
+        u, v = each[0], each[1][:, None]
         if self.kind == SHARES:
-            x, y, wide, high = (value[..., 0] for value in place)
-            return pixel_shares(self.kernel, (across[:, None] - x) * wide, (y - down[:, None]) * high)
-        return self._column(self._part(place, across, down), ends)
-
-    def _part(self, place: tuple[Array, ...], across: Array, down: Array) -> tuple[Array, ...]:
-        """What places along rows and along columns have each; of parallel rays squared distances, so that their sums are all."""
-        x, y, z, inverse = place
-        u, v = across[:, None, None, :], down[:, None, :, None]
+            edges = ((u - x) * z)[:, 0], ((y - v) * inverse)[:, :, 0]
+            found = pixel_shares(self.kernel, *(jnp.moveaxis(side, 1, -1) for side in edges))
+            return jnp.moveaxis(found, 1, -1), *amounts
         if self.perspective:
-            return *place, *(jnp.broadcast_to(side, (*x.shape[:2], *side.shape[2:])) for side in (u, v))
-        finer = ((across[:, 1] - across[:, 0])[:, None, None, None] * inverse) ** 2 / 24
-        return ((u - x) * inverse) ** 2, ((v - y) * inverse) ** 2, z, inverse, finer
+            where = tuple(jnp.broadcast_to(side, (x.shape[0], *jnp.broadcast_shapes(side.shape, x.shape[1:]))) for side in (u, v))
+            depths = () if self.kind == WHOLE else tuple(jnp.broadcast_to(end, x.shape) for end in shared)
+            return x, y, z, inverse, *where, *depths, *amounts
+        squares = ((u - x) * inverse) ** 2, ((v - y) * inverse) ** 2
+        if self.kind == WHOLE:
+            return *squares, *amounts
+        if self.kind == CUT:
+            return *squares, (shared[0] - z) * inverse, (shared[1] - z) * inverse, *amounts
+        return *squares, ((u[1] - u[0]) * inverse) ** 2 / 24, *amounts
 
-    def _column(self, part: tuple[Array, ...], ends: Array) -> Array:
-        if self.perspective:
-            x, y, z, inverse, u, v = part
+    def sums(self, part: tuple[Array, ...]) -> list[Array]:
+        """Over particles of a block, at the places of bundles; see `field.blocks.Body`."""
+        own = {SHARES: 1, WHOLE: 6 if self.perspective else 2, CUT: 8 if self.perspective else 4, SMOOTH: 3}[self.kind]
+        place, amounts = part[:own], part[own:]
+        particles = place[0].shape[0]
+        if particles < 16 or place[0].dtype != jnp.float32:
+            columns = fusion_barrier(amounts[0][0, 0, 0, 0] >= 0, self._column, place)
+            return [(amount * columns).sum(0) for amount in amounts]
+        each = [self._column(tuple(value[k] for value in place)) for k in range(particles)]
+        return [functools.reduce(jnp.add, [amount[k] * one for k, one in enumerate(each)]) for amount in amounts]
+
+    def _column(self, place: tuple[Array, ...]) -> Array:
+        """Of particles that hold 1."""
+        if self.kind == SHARES:
+            return place[0]
+        if not self.perspective:
+            square, depths = place[1] + place[0], place[2:]
+        else:
+            x, y, z, inverse, u, v, *ends = place
             slant = 1 + u * u + v * v
             x, y = x - u * z, y - v * z  # from the depth of the centre on, as what is small is no difference of what is large
             further = (x * u + y * v) / slant
             square = ((u * further - x) * inverse) ** 2 + ((v * further - y) * inverse) ** 2 + (further * inverse) ** 2
-            scale, foot = jnp.sqrt(slant) * inverse, z + further
-        else:
-            in_row, in_column, foot, scale, finer = part
-            square = in_column + in_row
+            depths = tuple((end - (z + further)) * (jnp.sqrt(slant) * inverse) for end in ends)
         if self.kind == CUT:
-            return column_between(self.kernel, square, (ends[0] - foot) * scale, (ends[1] - foot) * scale)
+            return column_between(self.kernel, square, *depths)
         column = whole_column(self.kernel, square)
-        return column + finer * curvature(self.kernel, square) if self.kind == SMOOTH else column
+        return column + depths[0] * curvature(self.kernel, square) if self.kind == SMOOTH else column
 
 
 def rules_of(kernel: str, perspective: bool, pixel: str) -> tuple[Rule, ...]:

@@ -4,7 +4,8 @@ Flow: lists -> [blocks] -> sums; cotangents of sums -> [blocks: by jax.vjp, bloc
 
 What a block adds is told by a `body`, in plain JAX. Backward, all blocks are met again: `jax.vjp` of the body gives rows of
 cotangents that are added to a table of all particles, so memory does not grow with the number of pairs. Windows come in chunks
-that are summed together, those of about as many particles, as a chunk takes as many turns as its longest window.
+that are summed together, those of about as many particles, as a chunk takes as many turns as its longest window. They come last
+in all shapes, such that they are summed side by side: with 16 lanes that takes half of the time that rows of 8 pixels take.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.field.fetch import known_at
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.numerics.checks import as_usual
+from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.transposed import linear_map
 
 TWICE = "second derivatives of a projection are not implemented; take differences of `jax.grad`"
@@ -37,8 +39,11 @@ class Body(Protocol, Hashable):  # type: ignore[misc]
     block: int
     block_back: int
 
-    def __call__(self, rows: Float[Array, "windows particles columns"], each: Any, shared: Any) -> list[Array]:
-        """One or two sums (windows, ...) over particles; of rows of zeros nothing."""
+    def prepare(self, rows: Float[Array, "particles windows columns"], each: Any, shared: Any) -> Any:
+        """What is found once a particle and window, to be read at each place."""
+
+    def sums(self, part: Any) -> list[Array]:
+        """One or two sums (..., windows) over particles of what was prepared; of rows of zeros nothing."""
 
 
 class Given(NamedTuple):
@@ -46,7 +51,7 @@ class Given(NamedTuple):
 
     Attributes:
         table: of particles.
-        each: a pytree of what there is for each window, (chunks, windows, ...).
+        each: a pytree of what there is for each window, (chunks, ..., windows).
         shared: a pytree of what all have in common.
     """
 
@@ -64,7 +69,7 @@ class Windows(NamedTuple):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def over_blocks(body: Body, given: Given, windows: Windows) -> list[Float[Array, "chunks windows ..."]]:
+def over_blocks(body: Body, given: Given, windows: Windows) -> list[Float[Array, "chunks ... windows"]]:
     """Sums over all windows.
 
     Differentiation:
@@ -102,11 +107,17 @@ over_blocks.defjvp(_differentiate, symbolic_zeros=True)
 
 
 def _sum(body: Body, given: Given, windows: Windows) -> list[Array]:
+    table = _with_nothing(given.table)
+
     def one(chunk: tuple[Array, Array, Any]) -> list[Array]:
         begin, length, each = chunk
 
+        def fetch(nth: Array) -> Array:
+            return known_at(table, _particles(given.table, windows.rank, begin, length, nth, body.block))
+
         def found(nth: Array) -> list[Array]:
-            return body(_fetch(given.table, windows.rank, begin, length, nth, body.block)[0], each, given.shared)
+            rows = fusion_barrier(nth >= 0, fetch, nth)
+            return body.sums(fusion_barrier(nth >= 0, body.prepare, rows, each, given.shared))
 
         zero = [jnp.zeros(shape.shape, shape.dtype) for shape in jax.eval_shape(found, jnp.int32(0))]
         if len(zero) == 1:
@@ -122,25 +133,28 @@ def _sum(body: Body, given: Given, windows: Windows) -> list[Array]:
 
 def _pull(body: Body, given: Given, windows: Windows, cotangents: list[Array]) -> Given:
     """Cotangents of what is given, for those of the sums: all blocks are met again."""
+    table = _with_nothing(given.table)
+
+    def back(rows: Array, each: Any, shared: Any) -> list[Array]:
+        return body.sums(body.prepare(rows, each, shared))
 
     def one(carry: tuple[Array, Any], chunk: tuple[Array, Array, Any, list[Array]]) -> tuple[tuple[Array, Any], Any]:
         begin, length, each, of_sums = chunk
 
         def add(nth: Array, so_far: tuple[Array, Any, Any]) -> tuple[Array, Any, Any]:
-            table, of_each, of_shared = so_far
-            rows, particle, inside = _fetch(given.table, windows.rank, begin, length, nth, body.block_back)
-            found, more_each, more_shared = jax.vjp(body, rows, each, given.shared)[1](of_sums)
-            found = jnp.where(inside[:, :, None], found, 0).reshape(-1, table.shape[1])
-            table = table.at[particle.ravel()].add(found, mode="promise_in_bounds")
-            return table, *jax.tree.map(jnp.add, (of_each, of_shared), (more_each, more_shared))
+            total, of_each, of_shared = so_far
+            particle = _particles(given.table, windows.rank, begin, length, nth, body.block_back)
+            found, *more = jax.vjp(back, known_at(table, particle), each, given.shared)[1](of_sums)
+            total = total.at[particle.ravel()].add(found.reshape(-1, total.shape[1]), mode="promise_in_bounds")
+            return total, *jax.tree.map(jnp.add, (of_each, of_shared), tuple(more))
 
         start = carry[0], jax.tree.map(jnp.zeros_like, each), carry[1]
-        table, of_each, of_shared = lax.fori_loop(0, _turns(length, body.block_back), add, start)
-        return (table, of_shared), of_each
+        total, of_each, of_shared = lax.fori_loop(0, _turns(length, body.block_back), add, start)
+        return (total, of_shared), of_each
 
-    start = jax.tree.map(jnp.zeros_like, (given.table, given.shared))
-    (table, shared), each = lax.scan(one, start, (windows.begin, windows.length, given.each, cotangents))
-    return Given(table, each, shared)
+    start = jax.tree.map(jnp.zeros_like, (table, given.shared))
+    (total, shared), each = lax.scan(one, start, (windows.begin, windows.length, given.each, cotangents))
+    return Given(total[:-1], each, shared)
 
 
 def _turns(length: Int[Array, " windows"], block: int) -> Int[Array, ""]:
@@ -148,10 +162,13 @@ def _turns(length: Int[Array, " windows"], block: int) -> Int[Array, ""]:
     return (length.max() + block - 1) // block
 
 
-def _fetch(table: Array, rank: Array, begin: Array, length: Array, nth: Array, block: int) -> tuple[Array, Array, Array]:
-    """The nth block of all windows, zeros past their ends; which particles these are, and whether they are any."""
-    index = nth * block + jnp.arange(block, dtype=jnp.int32)
-    inside = index < length[:, None]
-    particle = known_at(rank, jnp.where(inside, begin[:, None] + index, 0))
-    particle = jnp.where(inside, particle, 0)
-    return jnp.where(inside[:, :, None], known_at(table, particle), 0), particle, inside
+def _with_nothing(table: Array) -> Array:
+    """Behind all particles one that holds nothing."""
+    return jnp.pad(table, ((0, 1), (0, 0)))
+
+
+def _particles(table: Array, rank: Array, begin: Array, length: Array, nth: Array, block: int) -> Array:
+    """The nth block of all windows, (particles, windows); past their ends the one that holds nothing."""
+    index = nth * block + jnp.arange(block, dtype=jnp.int32)[:, None]
+    inside = index < length
+    return jnp.where(inside, known_at(rank, jnp.where(inside, begin + index, 0)), table.shape[0])

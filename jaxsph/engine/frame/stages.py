@@ -34,7 +34,7 @@ from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, ful
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
-from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.engine.runtime.programs import QUICKLY, WIDELY, compiled_by
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
@@ -46,8 +46,8 @@ from jaxsph.numerics.fusion import barriers
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
 
 
-def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """Jit a function as a stage, tuned by its keyword `tuning`; `quickly` where it takes longer to compile than to run."""
+def stage(*static: str, quickly: bool = False, widely: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Jit a function as a stage, tuned by its keyword `tuning`; `quickly`, `widely`: see `runtime.programs`."""
 
     def made(function: Callable[..., Any]) -> Any:
         @functools.wraps(function)
@@ -56,7 +56,7 @@ def stage(*static: str, quickly: bool = False) -> Callable[[Callable[..., Any]],
                 return function(*arguments, tuning=tuning, **static)
 
         jitted = jax.jit(tuned, static_argnames=(*static, "tuning"))
-        return compiled_quickly(jitted) if quickly else jitted
+        return compiled_by(QUICKLY if quickly else WIDELY, jitted) if quickly or widely else jitted
 
     return made
 

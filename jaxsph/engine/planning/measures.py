@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan, nodes_between
+from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan, Spheres, nodes_between
 from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.adapt import ControlPlan
@@ -98,15 +98,11 @@ class Measures:
 
 def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Measures:
     """Measure particles in the view of a camera with `samples` along each ray; and for a lattice of rays of some stride."""
-    left, right, top, bottom = (np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom))
-    seen = np.flatnonzero((right >= left) & (bottom >= top))
+    seen, sides, of_tiles, of_bundles = pairs_in_view(viewed, camera)
+    left, right, top, bottom = sides
     some = seen[:: max(1, len(seen) // MAX_MEDIAN_OF)]
-    diameters = right[some] - left[some] + 1
+    diameters = np.asarray(viewed.right)[some] - np.asarray(viewed.left)[some] + 1
     extents = _extents(np.asarray(viewed.z)[some], np.asarray(viewed.reach)[some], camera, samples)
-    sides = left, right, top, bottom = left[seen], right[seen], top[seen], bottom[seen]
-    tile_rows = -(-camera.height // TILE)
-    of_tiles = _pairs_in_rows(sides, TILE, tile_rows)
-    of_bundles = _pairs_in_rows(sides, BUNDLE, 2 * tile_rows).reshape(-1, 2).sum(1)
     ends = (top, bottom), (left, right)
     rows, columns = (
         max(int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1), 1) for first, last in ends
@@ -117,6 +113,18 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
     counts = np.bincount(middle).astype(np.float64)
     crowding = float((counts**2).sum() * np.count_nonzero(counts) / max(counts.sum(), 1) ** 2)
     return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, crowding, of_lattice)
+
+
+def pairs_in_view(
+    viewed: Viewed | Spheres, camera: Camera
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """Which particles are in view, the pixels that they can touch, and how many tiles and bundles in each row of tiles."""
+    sides = [np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom)]
+    seen = np.flatnonzero((sides[1] >= sides[0]) & (sides[3] >= sides[2]))
+    left, right, top, bottom = found = tuple(side[seen] for side in sides)
+    tile_rows = -(-camera.height // TILE)
+    of_bundles = _pairs_in_rows(found, BUNDLE, 2 * tile_rows).reshape(-1, 2).sum(1)
+    return seen, (left, right, top, bottom), _pairs_in_rows(found, TILE, tile_rows), of_bundles
 
 
 def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int) -> tuple[int, int]:
