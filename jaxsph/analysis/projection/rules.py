@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.model.particles.columns import column_between, curvature, pixel_shares, whole_column
+from jaxsph.model.particles.columns import column_between, curvature, pixel_shares, side_shares, whole_column
 from jaxsph.numerics.fusion import fusion_barrier
 
 PIXELS = ("mean", "ray")
@@ -52,13 +52,13 @@ class Rule:
     @property
     def block(self) -> int:
         """Particles that are met at once: written out where a column takes a few operations."""
-        return 16 if self.kind in (SMOOTH, WHOLE) else self.block_back
+        return 16 if self.kind in (SMOOTH, WHOLE) else 8
 
-    block_back = 8
+    block_back = 4
 
     def chunk(self, at_once: int) -> int:
         """Bundles that are summed together, where so many bundles of single samples fit."""
-        return max(at_once // (self.block_back * self.subrays**2), 1)
+        return max(at_once // (8 * self.subrays**2), 1)
 
     @property
     def places(self) -> Float[np.ndarray, " places"]:
@@ -95,8 +95,7 @@ class Rule:
         u, v = each[0], each[1][:, None]
         if self.kind == SHARES:
             edges = ((u - x) * z)[:, 0], ((y - v) * inverse)[:, :, 0]
-            found = pixel_shares(self.kernel, *(jnp.moveaxis(side, 1, -1) for side in edges))
-            return jnp.moveaxis(found, 1, -1), *amounts
+            return *(part for side in edges for part in side_shares(self.kernel, side)), *amounts
         if self.perspective:
             where = tuple(jnp.broadcast_to(side, (x.shape[0], *jnp.broadcast_shapes(side.shape, x.shape[1:]))) for side in (u, v))
             depths = () if self.kind == WHOLE else tuple(jnp.broadcast_to(end, x.shape) for end in shared)
@@ -110,10 +109,10 @@ class Rule:
 
     def sums(self, part: tuple[Array, ...]) -> list[Array]:
         """Over particles of a block, at the places of bundles; see `field.blocks.Body`."""
-        own = {SHARES: 1, WHOLE: 6 if self.perspective else 2, CUT: 8 if self.perspective else 4, SMOOTH: 3}[self.kind]
+        own = {SHARES: 4, WHOLE: 6 if self.perspective else 2, CUT: 8 if self.perspective else 4, SMOOTH: 3}[self.kind]
         place, amounts = part[:own], part[own:]
         particles = place[0].shape[0]
-        if particles < 16 or place[0].dtype != jnp.float32:
+        if particles < self.block or self.kind == CUT or place[0].dtype != jnp.float32:
             columns = fusion_barrier(amounts[0][0, 0, 0, 0] >= 0, self._column, place)
             return [(amount * columns).sum(0) for amount in amounts]
         each = [self._column(tuple(value[k] for value in place)) for k in range(particles)]
@@ -122,7 +121,7 @@ class Rule:
     def _column(self, place: tuple[Array, ...]) -> Array:
         """Of particles that hold 1."""
         if self.kind == SHARES:
-            return place[0]
+            return pixel_shares(self.kernel, place[:2], place[2:])
         if not self.perspective:
             square, depths = place[1] + place[0], place[2:]
         else:

@@ -36,7 +36,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.fusion import barriers_kept
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
 
@@ -274,12 +273,12 @@ class Shares(NamedTuple):
     """The products of a kernel.
 
     Attributes:
-        polynomials: coefficients of g_k by odd Chebyshev polynomials.
-        factors: lambda_k.
+        polynomials: coefficients of g_k times the root of lambda_k's size, by odd Chebyshev polynomials.
+        signs: of lambda_k.
     """
 
     polynomials: Float[np.ndarray, "terms products"]
-    factors: Float[np.ndarray, " products"]
+    signs: list[float]
 
 
 @functools.cache
@@ -292,52 +291,37 @@ def shares_of(name: str) -> Shares:
     largest = np.argsort(-np.abs(factors))[:PRODUCTS]
     factors, polynomials = factors[largest], vectors[:, largest]
     whole = 4 * (factors * polynomials.sum(0) ** 2).sum()  # every polynomial is 1 at 1
-    return Shares(polynomials, factors / whole)
+    return Shares(polynomials * np.sqrt(np.abs(factors / whole)), np.sign(factors).tolist())
+
+
+def side_shares(
+    name: str, edges: Float[Array, "particles edges bundles"]
+) -> tuple[Float[Array, "particles products pixels bundles"], Float[Array, "particles pixels bundles"]]:
+    """What pixels between edges on one axis, counted from a support's centre in supports, have of each of the products.
+
+    Also their squared distance from the centre. Edges ascend.
+    """
+    at = jnp.clip(edges, -1, 1)[:, None]
+    double = 4 * at * at - 2
+    last = before = jnp.zeros_like(at)
+    for row in shares_of(name).polynomials[::-1].astype(at.dtype):  # Clenshaw's recurrence
+        last, before = row[:, None, None] + double * last - before, last
+    values = at * (last - before)
+    nearest = jnp.maximum(jnp.maximum(edges[:, :-1], -edges[:, 1:]), 0)
+    return values[:, :, 1:] - values[:, :, :-1], nearest**2
 
 
 def pixel_shares(
-    name: str, x: Float[Array, "... edges_across"], y: Float[Array, "... edges_down"]
-) -> Float[Array, "... pixels_down pixels_across"]:
-    """Integrals of a column of support 1 over the pixels between edges, counted from its centre; signs follow the edges' order.
+    name: str, across: tuple[Array, Array], down: tuple[Array, Array]
+) -> Float[Array, "*particles down across bundles"]:
+    """Integrals of a column of support 1 over pixels, of what `side_shares` has on either axis; of one particle or several.
 
     What lies outside the support has exactly nothing, and no share is negative.
     """
-    shares = shares_of(name)
-    of_x, of_y = (_between(shares, edges) for edges in (x, y))
-    product = jnp.einsum("...rk,...ck->...rc", of_y * shares.factors.astype(of_y.dtype), of_x, precision="highest")
-    nearest = _nearest(y)[..., :, None] ** 2 + _nearest(x)[..., None, :] ** 2
-    return jnp.where(nearest < 1, jnp.maximum(product, 0), 0)
-
-
-def _between(shares: Shares, edges: Array) -> Float[Array, "... pixels products"]:
-    """Differences of all g_k between neighbouring edges, upwards."""
-    at = jnp.clip(edges, -1, 1)
-    values = (_by_product if barriers_kept() else _by_chain)(shares.polynomials.astype(at.dtype), at)
-    return values[..., 1:, :] - values[..., :-1, :]
-
-
-def _by_product(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
-    """All g_k as one product of matrices: on CPUs, where the chain below takes longer."""
-    double = 4 * at * at - 2  # T_(n+2) = 2 T_2 T_n - T_(n-2)
-    odd = [at, at * (double - 1)]
-    for _ in coefficients[2:]:
-        odd.append(double * odd[-1] - odd[-2])
-    return jnp.matmul(jnp.stack(odd, -1), coefficients, precision="highest")
-
-
-def _by_chain(coefficients: Any, at: Array) -> Float[Array, "... edges products"]:
-    """The same by Clenshaw's recurrence, which accelerators fuse into one chain and hold in registers."""
-    at = at[..., None]
-    double = 4 * at * at - 2
-    last = before = jnp.zeros_like(at * coefficients[0])
-    for row in coefficients[::-1]:
-        last, before = row + double * last - before, last
-    return at * (last - before)
-
-
-def _nearest(edges: Array) -> Array:
-    """Distance of the centre from the span between neighbouring edges, which ascend."""
-    return jnp.maximum(jnp.maximum(edges[..., :-1], -edges[..., 1:]), 0)
+    (of_x, near_x), (of_y, near_y) = across, down
+    products = [of_y[..., k, :, None, :] * of_x[..., k, None, :, :] for k in range(PRODUCTS)]
+    total = functools.reduce(jnp.add, [product * sign for product, sign in zip(products, shares_of(name).signs, strict=True)])
+    return jnp.where(near_y[..., :, None, :] + near_x[..., None, :, :] < 1, jnp.maximum(total, 0), 0)
 
 
 def _corner_integrals(name: str) -> tuple[Any, Any]:

@@ -8,31 +8,29 @@ import pytest
 from derivatives import QUICKLY
 
 from jaxsph.model.particles import columns, kernels
-from jaxsph.model.particles.columns import pixel_shares
-from jaxsph.numerics.fusion import barriers
+from jaxsph.model.particles.columns import pixel_shares, side_shares
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
+def share(name, x, y):
+    """By one kernel, of one particle and bundle."""
+    return pixel_shares(name, *(side_shares(name, edges[None, :, None]) for edges in (x, y)))[0, ..., 0]
+
+
 def of_all(x, y):
-    """Shares by all kernels."""
-    return {name: pixel_shares(name, x, y) for name in NAMES}
+    """By all kernels."""
+    return {name: share(name, x, y) for name in NAMES}
 
 
 shares = jax.jit(of_all, compiler_options=QUICKLY)
 
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
-def without_barriers(x, y):
-    with barriers(False):
-        return of_all(x, y)
-
-
-@functools.partial(jax.jit, compiler_options=QUICKLY)
 def gradients(x, y):
     """Of the share of the first pixel, where edges across move."""
-    return {name: jax.grad(lambda shift, name=name: pixel_shares(name, x + shift, y)[0, 0])(0.0) for name in NAMES}
+    return {name: jax.grad(lambda shift, name=name: share(name, x + shift, y)[0, 0])(0.0) for name in NAMES}
 
 
 def by_quadrature(name, x, y):
@@ -73,10 +71,3 @@ def test_gradients_are_what_crosses_the_edges(name, x64):
     at = np.linspace(-1, 1, 4001)
     crossing = np.trapezoid(columns.whole_column(name, 0.09 + at**2, np), at)
     assert abs(slope - crossing) < 1e-3
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_shares_are_the_same_with_and_without_barriers(name):
-    edges = np.linspace(-1.2, 1.1, 40, dtype=np.float32)
-    found, other = (np.asarray(shown(edges, edges)[name]) for shown in (shares, without_barriers))
-    np.testing.assert_allclose(found, other, atol=2e-5 * other.max())
