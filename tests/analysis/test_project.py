@@ -14,9 +14,10 @@ from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
+from jaxsph.analysis.projection.rules import NESTED, _cubics
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.lengths import scaled, scaled_camera
-from jaxsph.model.particles import kernels
+from jaxsph.model.particles import columns, kernels
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
@@ -94,6 +95,43 @@ def test_means_of_large_supports_and_their_mass_are_those_of_the_oracle():
     truth = js.reference.project(particles, camera, subrays=6).values
     np.testing.assert_allclose(image.values, truth, atol=3e-5 * truth.max())
     assert float(image.total()) == pytest.approx(12, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_interpolation_is_off_by_at_most_what_nesting_says(name):
+    rng, number = np.random.default_rng(0), 24
+    for spacings in (4.0, 6.5, 11.0):
+        middle, fine = number / 2 + rng.uniform(-0.5, 0.5, 2), 8
+        nodes, pixels = np.arange(number + 4) - 2, (np.arange(number * fine) + 0.5) / fine - 0.5
+        of_nodes, truth = (
+            columns.whole_column(name, ((at[:, None] - middle[0]) ** 2 + (at - middle[1]) ** 2) / spacings**2, np)
+            for at in (nodes, pixels)
+        )
+        weights = _cubics(number * fine, fine)
+        off = np.abs(weights @ of_nodes @ weights.T - truth).max() / columns.whole_column(name, np.float64(0), np)
+        assert off < NESTED[name] * spacings**-3.5
+
+
+@pytest.mark.parametrize("pixel", ["mean", "ray"])
+def test_nested_supports_are_those_of_the_oracle_to_the_tolerance_with_derivatives(pixel):
+    rng = np.random.default_rng(3)
+    place, support = rng.uniform(-0.6, 0.6, (12, 3)), rng.uniform(0.5, 0.9, 12)
+    particles = js.Particles.from_arrays(place, support, 0.0, support**2, "cubic_spline")  # of about the same peaks
+    camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.0, near=1, far=9, width=70, height=61)
+    truth = js.reference.project(particles, camera, pixel=pixel, subrays=4).values
+    for tolerance, levels in ((1e-3, 1), (1e-2, 2)):
+        plan = js.plan_projection(particles, camera, pixel=pixel, tolerance=tolerance)
+        found = js.project(particles, camera, pixel=pixel, plan=plan)
+        peak = float(js.project(particles.at(np.array([0])), camera, pixel="ray").values.max())
+        assert plan.levels == levels and np.abs(found.values - truth).max() < 3 * tolerance * peak
+    shift = jax.grad(
+        lambda x: js.project(dataclasses.replace(particles, position=x), camera, pixel=pixel, plan=plan).values[20, 30]
+    )
+    exact = jax.grad(
+        lambda x: js.project(dataclasses.replace(particles, position=x), camera, pixel=pixel, plan=plain).values[20, 30]
+    )
+    plain = js.plan_projection(particles, camera, pixel=pixel)
+    np.testing.assert_allclose(shift(particles.position), exact(particles.position), atol=0.1 * peak)
 
 
 def test_means_of_small_supports_are_those_of_the_oracle_where_rays_hardly_spread():
@@ -339,6 +377,7 @@ def test_nothing_is_nothing():
         ({"weight": -np.ones(40)}, "not negative"),
         ({"pixel": "corner"}, "`pixel` must be"),
         ({"depth_range": (3, 2)}, "two finite depths"),
+        ({"tolerance": -1}, "`tolerance` must be at least 0"),
     ],
 )
 def test_bad_input_is_refused_by_name(given, said):

@@ -6,12 +6,13 @@ Flow: particles, camera -> seen -> [projection_plan] -> project.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.analysis.projection.rules import PIXELS, Rule, rules_of
+from jaxsph.analysis.projection.rules import NESTED, PIXELS, Rule, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
@@ -27,6 +28,7 @@ from jaxsph.numerics.checks import array_of, require_plan
 from jaxsph.numerics.trees import on_host
 
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
+MAX_LEVELS = 6  # of nested lattices
 DOUBT = 2.0  # so that what is counted is never less than what a program finds that rounds in another way
 
 
@@ -40,9 +42,10 @@ class ProjectionPlan:
         num_particles: entries of the particle arrays, padding included.
         pixel: `"mean"` or `"ray"`.
         bands: horizontal bands that are projected one after the other.
-        lists: of the particles of each rule, by its kind, in one band; of rules that nobody follows none.
+        lists: of the particles of each rule, by its name, in one band; of rules that nobody follows none.
         tuning: for the machine.
         images: entries for images of a periodic set; None where each particle is taken once.
+        levels, least: of nested lattices, and spacings of one that the supports on it have at least, see `rules`.
         through: axis of the box that rays run along from outside through both faces, so that columns are whole; None where not.
     """
 
@@ -55,6 +58,8 @@ class ProjectionPlan:
     tuning: Tuning = CPU
     images: int | None = None
     through: int | None = None
+    levels: int = 0
+    least: float = math.inf
 
     def __post_init__(self) -> None:
         if self.pixel not in PIXELS:
@@ -71,10 +76,14 @@ class ProjectionPlan:
         """Pixel rows of a band."""
         return self.tile_rows * TILE
 
+    def rules(self, kernel: str, perspective: bool) -> tuple[Rule, ...]:
+        """That particles may follow."""
+        return rules_of(kernel, perspective, self.pixel, self.levels)
+
     def see(self, run: Executor, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
         """What there is to be projected."""
         static: dict[str, Any] = {"pixel": self.pixel, "images": self.images, "through": self.through, "tuning": self.tuning}
-        rules = rules_of(particles.kernel, camera.is_perspective, self.pixel)
+        rules, static["least"] = self.rules(particles.kernel, camera.is_perspective), self.least
         seen: Seen = run.one("grid", see, (particles, amounts, camera, np.float32(doubt)), rules=rules, **static)
         return seen
 
@@ -115,12 +124,13 @@ def plan_projection(
     *,
     pixel: str = "mean",
     like: ProjectionPlan | None = None,
+    tolerance: float = 0.0,
     memory_limit: int | None = None,
 ) -> ProjectionPlan:
     """Measure the room that a projection needs (host side; values must be concrete).
 
     Args:
-        particles, camera, pixel: as for `jaxsph.project`.
+        particles, camera, pixel, tolerance: as for `jaxsph.project`.
         like: a plan to grow: returned as it is where it has room, else with more; so that one plan, and what is compiled for it,
             serves all frames of a sequence.
         memory_limit: bytes of working memory; default 4 GiB, or half of an accelerator's.
@@ -132,11 +142,11 @@ def plan_projection(
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)
-    made = planned(given, pixel, memory, Clock())
+    made = planned(given, pixel, tolerance, memory, Clock())
     return made if like is None else like.grown(made)
 
 
-def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> ProjectionPlan:
+def planned(given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Clock) -> ProjectionPlan:
     """The plan of particles, amounts and a camera, with as few bands as the limit allows."""
     particles, amounts, camera = given
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
@@ -145,16 +155,19 @@ def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> Proje
         axis = int(np.argmax(np.abs(np.asarray(camera.axes)[2])))
         through = axis if bool(runs_through(camera, particles.box, axis)) else None
         images = capacity_class(num_ghosts(particles, BESIDE_FACES * float(particles.box.sides.min()), through))
-    bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through)
+    bare = ProjectionPlan(
+        *size, pixel, 1, (), tuning_for(particles.support), images, through, *_levels(particles, camera, tolerance)
+    )
     seen = bare.see(run, particles, amounts, camera, DOUBT)
-    rules = rules_of(particles.kernel, camera.is_perspective, pixel)
+    rules = bare.rules(particles.kernel, camera.is_perspective)
     counts = {
-        rule: pairs_in_view(one, camera)[2:] for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True) if some
+        rule: pairs_in_view(one, rule.seen_by(camera))[2:]
+        for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True)
+        if some
     }
     while True:
-        made = dataclasses.replace(
-            bare, bands=bands, lists=tuple(sorted((rule.kind, _lists(one, camera, bands)) for rule, one in counts.items()))
-        )
+        lists = [(rule.name, _lists(one, rule.seen_by(camera), bands if rule.stride == 1 else 1)) for rule, one in counts.items()]
+        made = dataclasses.replace(bare, bands=bands, lists=tuple(sorted(lists)))
         needed = _bytes(made, list(counts))
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
@@ -164,6 +177,18 @@ def planned(given: tuple[Any, ...], pixel: str, limit: int, run: Clock) -> Proje
                 "raise the limit, or project fewer particles or pixels"
             )
         bands = min(2 * bands, rows)
+
+
+def _levels(particles: Particles, camera: Camera, tolerance: float) -> tuple[int, float]:
+    """How many lattices pay, and the least supports on them, in their spacings."""
+    if not 0 <= tolerance < 1:
+        raise ValueError(f"`tolerance` must be at least 0 and less than 1, a share of each particle's peak, got {tolerance}")
+    if tolerance and camera.is_perspective:
+        raise ValueError("`tolerance` is of parallel rays alone: leave it out, or give an orthographic camera")
+    least = (NESTED[particles.kernel] / tolerance) ** (2 / 7) if tolerance else math.inf
+    largest = float(np.max(np.asarray(particles.support), where=np.asarray(particles.valid), initial=0))
+    nodes = largest * camera.height / (2 * float(camera.half_height)) / least
+    return (min(int(math.log2(nodes)), MAX_LEVELS) if 1 < nodes < math.inf else 0), least
 
 
 def _lists(counted: tuple[np.ndarray, np.ndarray], camera: Camera, bands: int) -> ListPlan:

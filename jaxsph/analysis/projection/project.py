@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.analysis.projection.plan import ProjectionPlan, planned
-from jaxsph.analysis.projection.rules import Rule, rules_of
+from jaxsph.analysis.projection.rules import Rule
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.frame.frame import LISTS
@@ -53,6 +53,7 @@ def project(
     *,
     pixel: str = "mean",
     depth_range: tuple[Any, Any] | None = None,
+    tolerance: float = 0.0,
     plan: ProjectionPlan | None = None,
     name: str | None = None,
     unit: str = "",
@@ -73,6 +74,8 @@ def project(
         pixel: `"mean"` over its area, by which mass is kept however small a support is; or `"ray"`, the value along that through
             its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
+        tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
+            lattices of fewer, by parallel rays. An estimate, see `rules`; 0 interpolates nothing. A given `plan` has its own.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
         name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
@@ -101,7 +104,7 @@ def project(
         if plan is None and traced:
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
         run, asked = clock or Clock(), plan is not None
-        plan = plan or planned(given, pixel, memory_for(particles.support), run)
+        plan = plan or planned(given, pixel, tolerance, memory_for(particles.support), run)
         plan.check(particles, camera, pixel)
         sums, word = _sums(given, plan, Traced() if traced else run)
         if not traced and int(word) & faults.OVERFLOWS and asked:
@@ -109,7 +112,8 @@ def project(
         if not traced and int(word):
             raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
-        told = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
+        told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
+        told |= {"jaxsph.tolerance": tolerance} if plan.levels else {}
         told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
 
@@ -160,36 +164,33 @@ def _sums(
 ) -> tuple[Float[Array, "height width channels"], Int[Array, ""]]:
     """Sums of all pixels, and the fault word."""
     seen = plan.see(run, *given)
-    lists, rules = dict(plan.lists), rules_of(given[0].kernel, given[2].is_perspective, plan.pixel)
-    followed = [(rule, lists[rule.kind], one) for rule, one in zip(rules, seen.spheres, strict=True) if rule.kind in lists]
-    missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.kind not in lists]
+    lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
+    followed = [(rule, lists[rule.name], one) for rule, one in zip(rules, seen.spheres, strict=True) if rule.name in lists]
+    missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.name not in lists]
 
-    def band(first_row: Array) -> tuple[Array, Array]:
-        found, words = [], []
-        for rule, sizes, spheres in followed:
-            made = run.with_host("grid", LISTS, (spheres, seen.camera, first_row), lists=sizes, tuning=plan.tuning)
+    def draw(first_row: Array, nested: bool, height: int) -> tuple[Array, Array]:
+        found, words, of_rules = [], [], [one for one in followed if (one[0].stride > 1) == nested]
+        for rule, sizes, spheres in of_rules:
+            camera = rule.seen_by(seen.camera)
+            made = run.with_host("grid", LISTS, (spheres, camera, first_row), lists=sizes, tuning=plan.tuning)
             shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
-            inputs = [(seen.table(rule), made, seen.camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
+            inputs = [(seen.table(rule), made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
             static: dict[str, Any] = {"rule": rule, "lists": sizes, "shards": shards, "tuning": plan.tuning}
             found.append(tuple(run.each("cast", sum_columns, inputs, **static)))
             words.append(made.faults)
-        channels, of_rules = given[1].shape[1], tuple((rule, sizes) for rule, sizes, _ in followed)
-        static = {"height": plan.band_height, "width": plan.width, "channels": channels, "rules": of_rules, "tuning": plan.tuning}
+        static = {"height": height, "width": plan.width, "channels": given[1].shape[1], "tuning": plan.tuning}
+        static["rules"] = tuple((rule, sizes) for rule, sizes, _ in of_rules)
         return run.one("image", join, (tuple(found), tuple(words), seen.camera), **static)  # type: ignore[no-any-return]
 
+    band = functools.partial(draw, nested=False, height=plan.band_height)
     rows = [array_of(nth * plan.band_height, jnp.int32) for nth in range(plan.bands)]
     if plan.bands > 1 and isinstance(run, Traced):
-        images, words = lax.map(jax.checkpoint(band, prevent_cse=False), jnp.stack(rows))
-        images, words = list(images), list(words)
+        images, words = map(list, lax.map(jax.checkpoint(band, prevent_cse=False), jnp.stack(rows)))
     else:
-        images, words = zip(*map(band, rows), strict=True)
-    return run.one(
-        "image",
-        finish,
-        (tuple(images), tuple(words), tuple(missing), seen.pixels, seen.faults),
-        height=plan.height,
-        tuning=plan.tuning,
-    )  # type: ignore[no-any-return]
+        images, words = map(list, zip(*map(band, rows), strict=True))
+    wide, word = draw(rows[0], True, plan.height) if plan.levels else (None, seen.faults)
+    drawn = tuple(images), (*words, word, seen.faults), tuple(missing), wide, seen.pixels
+    return run.one("image", finish, drawn, height=plan.height, tuning=plan.tuning)  # type: ignore[no-any-return]
 
 
 class Summed(NamedTuple):
@@ -246,7 +247,7 @@ def join(
         for k in range(channels):
             pixels = rule.pixels_of(jnp.concatenate([shard.sums[k] for shard in shards], -1))
             placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].set(jnp.moveaxis(pixels, -1, 0))
-            image[k] += lists.as_image(placed[:-1])[:, :width]
+            image[k] += rule.interpolated(lists.as_image(placed[:-1]), height, width)
     return jnp.stack(image, -1), functools.reduce(jnp.bitwise_or, words, jnp.int32(faults.NONE))
 
 
@@ -255,8 +256,8 @@ def finish(
     bands: tuple[Array, ...],
     words: tuple[Array, ...],
     missing: tuple[Array, ...],
+    nested: Array | None,
     pixels: Array | None,
-    word: Array,
     *,
     height: int,
     tuning: Tuning,
@@ -264,5 +265,6 @@ def finish(
     """The image of its bands, and all faults; `missing`: whether anybody follows a rule that there is no room for."""
     image = jnp.concatenate(bands)[:height]
     lost = functools.reduce(jnp.logical_or, missing, jnp.zeros((), bool))
-    word = functools.reduce(jnp.bitwise_or, words, word) | faults.raised(faults.LIST_OVERFLOW, lost)
+    image = image if nested is None else image + nested
+    word = functools.reduce(jnp.bitwise_or, words) | faults.raised(faults.LIST_OVERFLOW, lost)
     return image if pixels is None else image * pixels[..., None], word

@@ -58,7 +58,7 @@ class Seen:
         return self.shares if rule.kind == SHARES and self.shares is not None else self.rays
 
 
-@stage("rules", "pixel", "images", "through", quickly=True)
+@stage("rules", "pixel", "images", "through", "least", quickly=True)
 def see(
     particles: Particles,
     amounts: Float[Array, "particles channels"],
@@ -69,6 +69,7 @@ def see(
     pixel: str,
     images: int | None,
     through: int | None,
+    least: float,
     tuning: Tuning,
 ) -> Seen:
     """Particles as seen by a camera.
@@ -82,7 +83,7 @@ def see(
             with 0: each is off by less than `ROUNDING` eps of what enters, which margins hold once for itself, and `doubt` times
             more. Programs round differently, and whole layers of a lattice lie on the border of a decision.
         rules: that they may follow.
-        pixel, images, through: see `ProjectionPlan`.
+        pixel, images, through, least: see `ProjectionPlan`.
         tuning: for the machine.
 
     Differentiation:
@@ -113,12 +114,13 @@ def see(
     amounts = jnp.where(live[:, None], amounts, 0).astype(dtype)
     word = crowded | faults.raised(faults.BAD_PARTICLES, (particles.valid & ~usable).any() | ~jnp.isfinite(amounts).all())
     word |= faults.raised(faults.UNRESOLVED, blurred.any()) | faults.raised(faults.BAD_CAMERA, ~camera_usable(still))
-    followed = _followed(rules, z, reach, still, off)
+    followed = _followed(rules, z, reach, still, off, least)
     small = followed.get(SHARES, jnp.zeros_like(live))
-    wanted = [live & followed[rule.kind] for rule in rules]
+    wanted = [live & followed[rule.name] for rule in rules]
     margin = ROUNDING * (1 + doubt.astype(dtype))
     spheres = tuple(
-        _spheres((x, y, z), reach, distance, one, still, rule.beside, margin) for rule, one in zip(rules, wanted, strict=True)
+        _spheres((x, y, z), reach, distance, one, rule.seen_by(still), rule.beside, margin)
+        for rule, one in zip(rules, wanted, strict=True)
     )
     inverse = 1 / support[:, None]
     rays = jnp.concatenate([view, inverse, amounts * inverse * inverse], 1)
@@ -127,10 +129,10 @@ def see(
 
 
 def _followed(
-    rules: tuple[Rule, ...], z: Array, reach: Array, camera: Camera, off: Array
+    rules: tuple[Rule, ...], z: Array, reach: Array, camera: Camera, off: Array, least: float
 ) -> dict[str, Bool[Array, " particles"]]:
-    """Who follows rules of each kind; within `off` of a decision both."""
-    pixel = 2 * camera.half_height / camera.height
+    """Who follows rules of each name; within `off` of a decision both."""
+    pixel, last = 2 * camera.half_height / camera.height, max(rule.stride for rule in rules)
 
     def whole(off: Array) -> Array:
         return (z - reach >= camera.near - off) & (z + reach <= camera.far + off)
@@ -142,16 +144,19 @@ def _followed(
             return (z + off > 0) & (reach - off < jnp.maximum(jnp.minimum(TINY * pixel, NARROW), pixel) * (z + off))
         return (reach - off < TINY * pixel) | (whole(off) & (reach - off < SMALL * pixel))
 
-    def smooth(off: Array) -> Array:
-        return (reach + off >= LARGE * pixel) & (SMOOTH in (rule.kind for rule in rules))
+    def of(rule: Rule) -> Array:
+        if rule.kind == SHARES:
+            return small(off)
+        if rule.kind == CUT:
+            return ~whole(-off) & ~small(-off)
+        found = whole(off) & ~small(-off)
+        if rule.stride > 1:
+            found &= reach + off >= least * rule.stride * pixel
+        elif SMOOTH in (other.kind for other in rules):
+            found &= (reach + off >= LARGE * pixel) if rule.kind == SMOOTH else (reach - off < LARGE * pixel)
+        return found if rule.stride == last else found & (reach - off < least * 2 * rule.stride * pixel)
 
-    solid, large = whole(off), ~small(-off)
-    return {
-        SHARES: small(off),
-        SMOOTH: solid & large & smooth(off),
-        "whole": solid & large & ~smooth(-off),
-        CUT: ~whole(-off) & large,
-    }
+    return {rule.name: of(rule) for rule in rules}
 
 
 def _spheres(
