@@ -25,6 +25,7 @@ NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
 SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
 EMPTY = 0  # of a picture, where there is no value
+CUT_TOLD = 0.01  # share of what is in a picture that depths may leave out unsaid
 
 
 @tree(static=("perspective", "name", "unit", "metadata", "length_unit"))
@@ -56,7 +57,13 @@ class Projection(Traceable):
 
     def __repr__(self) -> str:
         told = f"{self.name} {short.span(self.values)} {self.unit}".rstrip()
-        return short.line("Projection", short.kind(self.values), told, f"faults {short.span(self.faults)}")
+        cut = f"{self.cut:.1%} cut off by depths" if self.cut > CUT_TOLD else None
+        return short.line("Projection", short.kind(self.values), told, f"faults {short.span(self.faults)}", cut)
+
+    @property
+    def cut(self) -> float:
+        """Share of the amounts in the picture, or of the weights, that lies nearer or farther than rays go; 0 from a trace."""
+        return float(dict(self.metadata).get("jaxsph.cut", 0.0))
 
     @property
     def shape(self) -> tuple[int, int]:

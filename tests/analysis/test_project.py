@@ -376,8 +376,14 @@ def test_nothing_is_nothing():
         ({"of": np.full(40, np.nan)}, "`of` must be finite"),
         ({"weight": -np.ones(40)}, "not negative"),
         ({"pixel": "corner"}, "`pixel` must be"),
+        ({"of": np.where(np.arange(40) == 6, np.inf, 1)}, r"of\[6\] = inf"),
+        ({"weight": np.where(np.arange(40) == 6, np.nan, 1)}, r"weight\[6\] = nan"),
         ({"depth_range": (3, 2)}, "two finite depths"),
         ({"tolerance": -1}, "`tolerance` must be at least 0"),
+        ({"depth_range": (np.nan, 2)}, "two finite depths"),
+        ({"depth_range": 3}, "`depth_range` must be two finite depths"),
+        ({"depth_range": (1, 2, 3)}, "`depth_range` must be two finite depths"),
+        ({"depth_range": ("a", 3)}, "`depth_range` must hold real numbers"),
     ],
 )
 def test_bad_input_is_refused_by_name(given, said):
@@ -385,11 +391,43 @@ def test_bad_input_is_refused_by_name(given, said):
         js.project(particles_of(), camera_of(), **given)
 
 
-def test_bad_particles_and_missing_plans_are_refused():
+@pytest.mark.parametrize("near", [0.5, None])
+@pytest.mark.parametrize(
+    ("name", "value", "at"),
+    [("position", np.nan, (3, 1)), ("support", np.nan, (3,)), ("support", np.inf, (3,)), ("support", 0, (3,))],
+)
+def test_the_first_particle_that_cannot_be_projected_is_named(name, value, at, near):
+    broken = spoilt(particles_of(), name, value, at)
+    said = rf"`particles\.{name}` must be .*particles\.{name}\[{', '.join(map(str, at))}\] = {float(value)}"
+    with pytest.raises(ValueError, match=said):
+        js.project(broken, camera_of(near=near))
+
+
+def test_depths_of_a_camera_in_the_wrong_order_and_scenes_without_particles_are_refused():
+    camera = dataclasses.replace(camera_of(), near=np.float32(6), far=np.float32(1))
+    with pytest.raises(ValueError, match=r"`camera` must have near < far, both finite, got near = 6\.0 and far = 1\.0"):
+        js.project(particles_of(), camera)
+    for verb in (js.project, js.plan_projection):
+        with pytest.raises(ValueError, match="`particles` must be a `jaxsph.Particles`, or a `jaxsph.Scene` with some"):
+            verb(js.Scene(), camera_of())
+
+
+def test_the_share_that_depths_leave_out_is_that_of_the_particles_in_the_picture():
+    position = np.array([[0, 0, 1.0], [0.5, 0.2, -1.0], [0, 0.5, 0], [50.0, 0, 2.5]])  # depths 2, 4, 3 and, beside it, 0.5
+    particles = js.Particles.from_arrays(position, 0.4, 0.0, kernel="cubic_spline", capacity=CAPACITY)
+    mass = np.array([3.0, 1.0, -4.0, 9.0])
+    for projection in PROJECTIONS:
+        camera = camera_of(projection, eye=(0, 0, 3), target=(0, 0, 0), near=2.5, far=6.0)
+        image = project(particles, camera, mass)
+        assert image.cut == pytest.approx(3 / 8) and "37.5% cut off by depths" in repr(image)
+        assert project(particles, camera, mass, mass**2).cut == pytest.approx(9 / 26)
+        assert js.project(particles, camera, mass, depth_range=(1.0, 6.0), plan=plan_of("mean", CAPACITY)).cut == 0
+    traced = jax.jit(lambda mass: project(particles, camera, mass))(mass)
+    assert traced.cut == 0
+
+
+def test_bad_plans_are_refused():
     particles, camera = particles_of(), camera_of()
-    broken = spoilt(particles, "position", np.nan, (3, 1))
-    with pytest.raises(ValueError, match="not finite"):
-        js.project(broken, camera)
     with pytest.raises(ValueError, match="plan_projection"):
         jax.jit(lambda particles: js.project(particles, camera).values)(particles)
     with pytest.raises(ValueError, match=r"camera\.width"):

@@ -35,6 +35,9 @@ LINES = {
     "Camera(perspective, 8 x 6, eye (0, 0, 4), forward (0, 0, -1), fov 45 degrees, near 2, far 6)": CAMERA,
     "Image(8 x 6, transmittance 1, error 0.25, certified, faults 0)": IMAGE,
     "Projection(float32[6,8], density 0.5 g/cm**2, faults 0)": COLUMNS,
+    "Projection(float32[6,8], density 0.5 g/cm**2, faults 0, 12.5% cut off by depths)": dataclasses.replace(
+        COLUMNS, metadata=(("jaxsph.cut", 0.125),)
+    ),
     f"Scene(particles={PARTICLES!r}, transfer={LOOK!r})": js.Scene(PARTICLES, LOOK),
     f"Scene(volume={VOLUME!r}, volume_transfer={LOOK!r}, mix='opacity')": js.Scene(
         volume=VOLUME, volume_transfer=LOOK, mix="opacity"

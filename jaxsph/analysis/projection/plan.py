@@ -24,8 +24,9 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
+from jaxsph.model.scene import Scene
 from jaxsph.numerics.checks import array_of, require_plan
-from jaxsph.numerics.trees import on_host
+from jaxsph.numerics.trees import fitting, on_host
 
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
 MAX_LEVELS = 6  # of nested lattices
@@ -117,9 +118,22 @@ class ProjectionPlan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
+def particles_in(shown: Any) -> Particles:
+    """What there is to project: of a scene its particles, whatever their look, and without its clip.
+
+    Raises:
+        ValueError: a scene without particles; what is neither.
+    """
+    if isinstance(shown, Scene):
+        if shown.particles is None:
+            raise ValueError("`particles` must be a `jaxsph.Particles`, or a `jaxsph.Scene` with some, and this scene has none")
+        shown = shown.particles
+    return fitting("particles", shown, Particles)
+
+
 @on_host
 def plan_projection(
-    particles: Particles,
+    particles: Particles | Scene,
     camera: Camera,
     *,
     pixel: str = "mean",
@@ -139,6 +153,7 @@ def plan_projection(
         ValueError: under a trace; when even a band of one row of tiles exceeds `memory_limit`.
     """
     require_plan("like", like, ProjectionPlan, "plan_projection")
+    particles = particles_in(particles)
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)

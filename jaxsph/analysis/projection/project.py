@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.analysis.projection.plan import ProjectionPlan, planned
+from jaxsph.analysis.projection.plan import ProjectionPlan, particles_in, planned
 from jaxsph.analysis.projection.rules import Rule
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
@@ -36,8 +36,19 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, unit_held
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
+from jaxsph.model.scene import Scene
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import (
+    array_of,
+    as_usual,
+    at_once,
+    is_traced,
+    module_for,
+    require_finite,
+    require_plan,
+    require_positive,
+    require_real,
+)
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.given import in_unit
@@ -46,7 +57,7 @@ from jaxsph.numerics.version import __version__
 
 
 def project(
-    particles: Particles,
+    particles: Particles | Scene,
     camera: Camera,
     of: Any = None,
     weight: Any = None,
@@ -66,8 +77,10 @@ def project(
     mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.held.emission_measure`.
 
     Args:
-        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`.
-        camera: where from, how large the image is, and the depths that rays begin and end at; where they are None, all there is.
+        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`. Of a scene its
+            own, without clip.
+        camera: where from, how large the image is, and the depths that rays begin and end at; where they are None, as those of
+            `read_scene` are for parallel rays, all there is. What depths leave out is told by `Projection.cut`.
         of: numbers of all particles in their order, or `"volume"` or `"quantity"`. Without weight the amounts $a_j$, default the
             volumes (true ones, which give the path length inside); with weight the values $q_j$, default the quantity.
         weight: the weights $w_j$, as for `of`: masses or volumes. Not negative.
@@ -96,8 +109,8 @@ def project(
     """
     require_plan("plan", plan, ProjectionPlan, "plan_projection")
     with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
-        particles, camera = fitting("particles", particles, Particles), fitting("camera", camera, Camera)
-        camera = with_depths(_between(camera, depth_range, particles.length_unit), particles)
+        particles, camera = particles_in(particles), fitting("camera", camera, Camera)
+        camera = _between(camera, depth_range, particles)
         held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
         digits = 0 if traced else digits_to_scale(particles, camera)
         given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
@@ -110,23 +123,57 @@ def project(
         if not traced and int(word) & faults.OVERFLOWS and asked:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
+            _require_usable(particles, camera)
             raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
         told |= {"jaxsph.tolerance": tolerance} if plan.levels else {}
         told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
+        told |= {"jaxsph.cut": cut} if not traced and (cut := _cut(particles, camera, held)) else {}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
 
 
-def _between(camera: Camera, depths: tuple[Any, Any] | None, unit: str | None) -> Camera:
+def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particles) -> Camera:
+    """With the depths that are asked for, or its own; where it has none, those of all there is."""
     if depths is None:
-        return camera
-    near, far = (in_unit("depth_range", depth, unit) for depth in depths)
-    if not is_traced(near, far) and not (np.isfinite(near) and np.isfinite(far) and float(near) < float(far)):
+        if any(end is None for end in (camera.near, camera.far)) and not is_traced(particles, camera):
+            _require_usable(particles, camera)
+        return with_depths(camera, particles)
+    if not np.iterable(depths) or len(depths) != 2:
+        raise ValueError(f"`depth_range` must be two finite depths that ascend, got {depths!r}")
+    near, far = (in_unit("depth_range", depth, particles.length_unit) for depth in depths)
+    known: Any = [] if is_traced(near, far) else [near, far]
+    require_real("depth_range", np.asarray(known))
+    if known and not (np.isfinite(known).all() and known[0] < known[1]):
         raise ValueError(f"`depth_range` must be two finite depths that ascend, got ({near}, {far})")
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:
         raise ValueError(f"`depth_range` must begin in front of the eye of a perspective camera, at > 0, got {near}")
-    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype))
+    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype), snug=None)
+
+
+def _require_usable(particles: Particles, camera: Camera) -> None:
+    """Raise `ValueError` that names the first entry of particles, or of the camera, that nothing can be projected with."""
+    valid = np.asarray(particles.valid)
+    position, support = np.asarray(particles.position), np.where(valid, particles.support, 1)
+    require_finite("particles.position", np.where(valid[:, None], position, 0), "remove or repair these particles")
+    require_finite("particles.support", support, "remove or repair these particles")
+    require_positive("particles.support", support, "give the support radius H > 0 of every particle")
+    if camera.near is not None and camera.far is not None and not float(camera.near) < float(camera.far):
+        raise ValueError(f"`camera` must have near < far, both finite, got near = {camera.near} and far = {camera.far}")
+
+
+def _cut(particles: Particles, camera: Camera, held: Held) -> float:
+    """Share of what is held by particles in the picture whose middles lie nearer or farther than rays go (host side)."""
+    right, up, ahead = np.asarray(camera.axes, np.float64)
+    offset, (near, far) = particles.exact_position() - camera.exact_eye(), camera.near_and_far()
+    depth = offset @ ahead
+    beyond = (depth < near) | (depth > far)
+    if not beyond.any():
+        return 0.0
+    half = float(camera.half_height) * (depth if camera.is_perspective else 1.0)
+    seen = (np.abs(offset @ right) <= half * (camera.width / camera.height)) & (np.abs(offset @ up) <= half)
+    amounts = np.where(seen, np.abs(np.asarray(held.amounts[:, -1], np.float64)), 0)
+    return float(amounts[beyond].sum() / (amounts.sum() or 1.0))
 
 
 def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera, digits: int) -> Projection:

@@ -9,10 +9,13 @@ import dataclasses
 import os
 from typing import Any
 
+import numpy as np
+
 from jaxsph.io.opening.opened import load, staged
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
+from jaxsph.numerics.checks import array_of
 
 GROUPS = (Source, Look, View)
 
@@ -44,7 +47,7 @@ def read_scene(
         more: any other attribute of `jaxsph.io.opening.options.Source`, `Look` and `View`, such as `where=`, `colormap=`, `eye=`.
 
     Returns:
-        What `jaxsph.render` takes.
+        What `jaxsph.render` takes. Of parallel rays near and far are None, and `camera.near_and_far()` are those of the picture.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -58,7 +61,11 @@ def read_scene(
         known = ", ".join(field.name for group in GROUPS for field in dataclasses.fields(group))
         raise TypeError(f"read_scene has no option {next(iter(given))!r}; there are {known}")
     opened = staged(load(path, source, look), look, seen, source=source)
-    return opened.scene, opened.camera
+    camera = opened.camera
+    if not camera.is_perspective:
+        depths = array_of(np.array(camera.near_and_far()), camera.dtype)
+        camera = dataclasses.replace(camera, near=None, far=None, snug=depths)  # type: ignore[arg-type]
+    return opened.scene, camera
 
 
 def _made(group: Any, given: dict[str, Any]) -> Any:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.camera.framing import parallel_view
 from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, require_finite
 from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import OPEN, Placed, on_host, tree
@@ -74,6 +74,7 @@ class Camera(Placed):
         projection: `"perspective"` or `"orthographic"`.
         eye_rest: what rounding a float64 eye to `eye` has left, length units; None is nothing.
         stride: rays go through every so many pixels of either direction, and through the last: see `strided`.
+        snug: near and far found for a picture, which has them where its camera's own are None; columns go through all there is.
     """
 
     PLACE, REST = "eye", "eye_rest"
@@ -87,6 +88,7 @@ class Camera(Placed):
     projection: str = "perspective"
     eye_rest: Float[Array, "3"] | None = None
     stride: int = 1
+    snug: Float[Array, "2"] | None = None
 
     def __repr__(self) -> str:
         half = short.known(self.half_height)
@@ -315,14 +317,19 @@ class Camera(Placed):
         return place if self.stride == 1 else jnp.minimum((place - 0.5) * self.stride, size - 1) + 0.5
 
     def near_and_far(self) -> tuple[float, float]:
-        """Both depths as numbers, length units (host side).
-
-        Raises:
-            ValueError: where one is None, and no scene is at hand to take it from.
-        """
-        if self.near is None or self.far is None:
+        """Both depths of a picture as numbers, length units (host side); `ValueError` where one is to be that of a scene."""
+        own = self.for_picture()
+        if own.near is None or own.far is None:
             raise ValueError("`near` and `far` must be numbers here, where no scene tells them; give both to the camera")
-        return float(self.near), float(self.far)
+        return float(own.near), float(own.far)
+
+    def for_picture(self) -> Camera:
+        """With depths that were found for a picture, as far as none are given."""
+        if self.snug is None:
+            return self
+        ends = zip((self.near, self.far), at_hand(self.snug)[1], strict=True)
+        near, far = (array_of(found) if own is None else own for own, found in ends)
+        return dataclasses.replace(self, near=near, far=far, snug=None)
 
     def exact_eye(self) -> np.ndarray:
         """The eye in float64, (3,), with what float32 could not hold (host side)."""
@@ -332,11 +339,8 @@ class Camera(Placed):
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()
-        opening = (
-            f"tan(fov/2)={float(self.half_height):.9g}" if self.is_perspective else f"half_height={float(self.half_height):.9g}"
-        )
-        size = f"{self.width}x{self.height}"
-        near, far = self.near_and_far()
+        opening = f"{'tan(fov/2)' if self.is_perspective else 'half_height'}={float(self.half_height):.9g}"
+        size, (near, far) = f"{self.width}x{self.height}", self.near_and_far()
         return f"{self.projection} {size} eye={eye} axes={axes} {opening} near={near:.9g} far={far:.9g}"
 
 
@@ -364,9 +368,8 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
             raise ValueError(f"`{name}` must be an integer from 1 to {MAX_SIDE} pixels, got {size!r}")
     given = {"eye": eye, "target": target, "up": up, "near": near, "far": far}
     eye, target, up, near, far = (plain(name, value) for name, value in given.items())
-    parts = (eye, target, up, half, near, far)
     xp: Any = jnp
-    if not is_traced(*parts):
+    if not is_traced(eye, target, up, half, near, far):
         xp = np
         _check_view(eye, target, up, near, far, projection)
         eye, target, up = (np.asarray(v, np.float64 if not hasattr(v, "dtype") else None) for v in (eye, target, up))
@@ -379,9 +382,8 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
     axes = _axes(forward, up.astype(forward.dtype), xp)
     dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
     rest = array_of(eye - eye.astype(dtype), dtype)
-    eye, axes, half = (array_of(v, dtype) for v in (eye, axes, half))
-    near, far = (end if end is None else array_of(end, dtype) for end in (near, far))
-    return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)
+    eye, axes, half, near, far = (v if v is None else array_of(v, dtype) for v in (eye, axes, half, near, far))
+    return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)  # type: ignore[arg-type]
 
 
 def _check_up(forward: Any, up: Any) -> None:

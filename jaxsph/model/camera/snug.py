@@ -20,12 +20,14 @@ OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet 
 
 
 def with_depths(camera: Camera, shown: Any) -> Camera:
-    """A camera whose near and far, as far as they are None, are those of what is shown: a scene, or a part of one (host side).
+    """A camera whose near and far, as far as they are None, are those of what is shown (host side): of a scene those found for
+    its picture will do, of a part alone, as columns are of, all of it counts.
 
     Raises:
         ValueError: without depths under a trace, with media, which do not say how large they are, or where the depth that is
             given leaves none of what is shown.
     """
+    camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
     if camera.near is not None and camera.far is not None:
         return camera
     if is_traced(camera, shown):  # type: ignore[unreachable]
@@ -48,9 +50,7 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
 
 
 def snug(camera: Camera, *parts: Any, clip: Any = None) -> Camera:
-    """`camera` with near and far moved to supports, radii and boxes of parts, as far as a clip shows them; unchanged where none
-    lies in front of the eye.
-    """
+    """`camera` with near and far moved to what parts reach, as far as a clip shows it; as it is where none is before the eye."""
     spans = [span for part in parts if (span := _span(camera, part)) is not None]
     if not spans:
         return camera

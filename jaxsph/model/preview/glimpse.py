@@ -111,7 +111,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     half = float(camera.half_height)
     v = half * (1 - 2 * (np.arange(rows) + 0.5) / rows)
     u = half * camera.width / camera.height * (2 * (np.arange(columns) + 0.5) / columns - 1)
-    near, far = float(camera.near), float(camera.far)
+    near, far = camera.near_and_far()
     step = (far - near) / steps
     offset = np.random.default_rng(SEED).random((rows, columns))
     depth = near + step * (np.arange(steps) + offset[..., None])

@@ -133,6 +133,16 @@ def test_a_width_is_that_of_the_picture_in_every_view(galaxy, view):
     assert scene.within is not None
 
 
+@pytest.mark.parametrize("view", ["z", "face-on", "iso"])
+def test_depths_of_parallel_rays_are_those_of_the_picture_and_not_of_the_camera(galaxy, view):
+    asked = {"center": (3, 2, 1), "width": 2, "view": view, "size": SIZE}
+    scene, camera = js.io.read_scene(galaxy, **asked)
+    framed = staged(load(galaxy), view=View(**asked)).camera
+    assert (camera.near is None) == (camera.far is None) == (view != "iso")
+    assert camera.near_and_far() == framed.near_and_far()
+    np.testing.assert_array_equal(js.reference.render(scene, camera, SEEN).color, js.reference.render(scene, framed, SEEN).color)
+
+
 def test_face_on_looks_along_the_axis_and_edge_on_across_it(galaxy):
     _, face = js.io.read_scene(galaxy, view="face-on", center="mass", size=SIZE)
     _, edge = js.io.read_scene(galaxy, view="edge-on", center="densest", size=SIZE)

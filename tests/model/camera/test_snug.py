@@ -99,6 +99,21 @@ def test_under_a_trace_depths_are_asked_for():
             jax.eval_shape(render, OPEN)
 
 
+def test_depths_found_for_a_picture_are_its_own_but_not_those_of_columns():
+    closed = with_depths(OPEN, SCENE)
+    found = dataclasses.replace(OPEN, snug=np.array([3.5, 4.25], np.float32))
+    given = dataclasses.replace(OPEN, near=np.float32(3.5), far=np.float32(4.25))
+    assert with_depths(found, SCENE).near_and_far() == found.near_and_far() == (3.5, 4.25)
+    assert with_depths(dataclasses.replace(found, near=np.float32(3)), SCENE).near_and_far() == (3, 4.25)
+    assert with_depths(found, PARTICLES).near_and_far() == closed.near_and_far() and "of the scene" in repr(found)
+    image = js.render(SCENE, given, SETTINGS)
+    np.testing.assert_array_equal(js.render(SCENE, found, SETTINGS).color, image.color)
+    assert dict(js.render(SCENE, found, SETTINGS).metadata) == dict(image.metadata)
+    plan = js.plan(SCENE, found, SETTINGS)
+    shape = jax.eval_shape(lambda camera: js.render(SCENE, camera, SETTINGS, plan=plan).color, found)
+    assert shape.shape == (6, 8, 3)
+
+
 def test_what_cannot_tell_depths_is_refused():
     with pytest.raises(ValueError, match="`near` and `far` must be given with `media`"):
         js.render(in_octree(SCENE), OPEN, SETTINGS)
