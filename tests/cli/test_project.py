@@ -168,6 +168,8 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, capsys):
         (["--target", 0, 0, 0], "--target needs --eye"),
         (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
         (["--depth-range", "2,1"], "--depth-range must ascend"),
+        (["--depth-range", "nan,1"], "--depth-range"),
+        (["--eye", 0, 0, 9, "--depth-range", "-1,1"], "must be > 0"),
         (["--norm", "log"], "are for a picture"),
         (["--eye", 0, 0, 9, "--target", 0, 0, 9], "must differ"),
         (["--size", "0x4"], "at least 1 pixel"),
@@ -188,6 +190,29 @@ def test_what_is_not_in_the_file_is_told_in_one_line(file, capsys):
         assert code == 1 and len(err) == 1 and said in err[0], err
     code, _, err = run(capsys, "bare.npz", "--of", "mass", *TINY)
     assert code == 2 and "has no masses" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("support", 0.0, "--support must be finite and positive"),
+        ("support", np.nan, "support"),
+        ("mass", np.nan, "mass"),
+        ("mass", np.inf, "mass"),
+    ],
+)
+def test_a_row_that_cannot_be_projected_is_told_in_one_line(file, capsys, name, value, said):
+    given = {"support": np.full(COUNT, 0.3)} | columns()
+    given[name][7] = value
+    np.savez("bad.npz", **given)
+    code, _, err = run(capsys, "bad.npz", *TINY, "-o", "out.npy")
+    assert code == 1 and len(err) == 1 and said in err[0] and "7" in err[0], err
+
+
+@pytest.mark.parametrize("arguments", [["--view", "z", "--up", "0,0,1"], ["--eye", "0.5,9,0.5", "--target", "0.5,0.5,0.5"]])
+def test_a_view_along_what_is_up_has_another_direction_upwards(file, capsys, arguments):
+    found, _ = values(capsys, file, *arguments)
+    assert np.isfinite(found).all() and found.max() > 0
 
 
 def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(file, capsys):
@@ -234,11 +259,23 @@ def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code
         assert (units.Unit(header["BUNIT"]) == units.Unit(unit)) if unit else "BUNIT" not in header
 
 
-def test_columns_of_all_there_is_are_those_of_a_camera_without_depths(file, capsys):
-    """One of `read_scene` has the depths of its picture."""
-    found, _ = values(capsys, file, "--center", "0.5,0.5,0.5", "--width", "0.4")
-    scene, camera = io.read_scene(file, view="z", center=(0.5, 0.5, 0.5), width=0.4, size=(18, 12))
-    whole = js.project(scene.particles, dataclasses.replace(camera, near=None, far=None), of=columns()["mass"])
+@pytest.mark.parametrize("view", ["z", "x"])
+def test_what_read_scene_gives_is_projected_as_by_the_command(file, capsys, view):
+    """Columns go through all there is, whatever depths its picture is between."""
+    found, out = values(capsys, file, "--view", view, "--center", "0.5,0.5,0.5", "--width", "0.4")
+    scene, camera = io.read_scene(file, view=view, center=(0.5, 0.5, 0.5), width=0.4, size=(18, 12))
+    whole = js.project(scene.particles, camera, of=columns()["mass"])
     np.testing.assert_allclose(whole.values, found, rtol=1e-4)
-    cut = js.project(scene.particles, camera, of=columns()["mass"])
+    assert whole.cut == 0 and "cut" not in repr(whole) and "lies outside of these depths" not in out
+    np.testing.assert_array_equal(js.project(scene, camera, of=columns()["mass"]).values, whole.values)
+    ends = camera.near_and_far()
+    cut = js.project(scene.particles, camera, of=columns()["mass"], depth_range=ends)
+    given = js.project(scene.particles, dataclasses.replace(camera, near=ends[0], far=ends[1]), of=columns()["mass"])
+    np.testing.assert_array_equal(cut.values, given.values)
     assert float(cut.total()) < 0.9 * float(whole.total())
+
+
+def test_what_depths_leave_out_of_the_picture_is_said(file, capsys):
+    _, out = values(capsys, file, "--view", "x", "--depth-range", "0.25,2")
+    share = columns()["mass"][columns()["position"][:, 0] < 0.25].sum() / columns()["mass"].sum()
+    assert f"{share:.1%} of what is in the picture lies outside of these depths" in out
