@@ -383,7 +383,6 @@ def test_nothing_is_nothing():
         ({"depth_range": (np.nan, 2)}, "two finite depths"),
         ({"depth_range": 3}, "`depth_range` must be two finite depths"),
         ({"depth_range": (1, 2, 3)}, "`depth_range` must be two finite depths"),
-        ({"depth_range": ("a", 3)}, "`depth_range` must hold real numbers"),
     ],
 )
 def test_bad_input_is_refused_by_name(given, said):
@@ -408,7 +407,7 @@ def test_depths_of_a_camera_in_the_wrong_order_and_scenes_without_particles_are_
     with pytest.raises(ValueError, match=r"`camera` must have near < far, both finite, got near = 6\.0 and far = 1\.0"):
         js.project(particles_of(), camera)
     for verb in (js.project, js.plan_projection):
-        with pytest.raises(ValueError, match="`particles` must be a `jaxsph.Particles`, or a `jaxsph.Scene` with some"):
+        with pytest.raises(ValueError, match="this scene has none"):
             verb(js.Scene(), camera_of())
 
 

@@ -119,11 +119,7 @@ class ProjectionPlan:
 
 
 def particles_in(shown: Any) -> Particles:
-    """What there is to project: of a scene its particles, whatever their look, and without its clip.
-
-    Raises:
-        ValueError: a scene without particles; what is neither.
-    """
+    """Of a scene its particles, without look and clip; `ValueError` where it has none, and of what is neither."""
     if isinstance(shown, Scene):
         if shown.particles is None:
             raise ValueError("`particles` must be a `jaxsph.Particles`, or a `jaxsph.Scene` with some, and this scene has none")

@@ -33,22 +33,12 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for
 from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
-from jaxsph.model.particles.held import Held, held_by, unit_held
+from jaxsph.model.particles.held import Held, held_by, require_usable, unit_held
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import (
-    array_of,
-    as_usual,
-    at_once,
-    is_traced,
-    module_for,
-    require_finite,
-    require_plan,
-    require_positive,
-    require_real,
-)
+from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.given import in_unit
@@ -123,7 +113,7 @@ def project(
         if not traced and int(word) & faults.OVERFLOWS and asked:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
-            _require_usable(particles, camera)
+            require_usable(particles)
             raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
@@ -137,29 +127,18 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particle
     """With the depths that are asked for, or its own; where it has none, those of all there is."""
     if depths is None:
         if any(end is None for end in (camera.near, camera.far)) and not is_traced(particles, camera):
-            _require_usable(particles, camera)
-        return with_depths(camera, particles)
-    if not np.iterable(depths) or len(depths) != 2:
-        raise ValueError(f"`depth_range` must be two finite depths that ascend, got {depths!r}")
-    near, far = (in_unit("depth_range", depth, particles.length_unit) for depth in depths)
-    known: Any = [] if is_traced(near, far) else [near, far]
-    require_real("depth_range", np.asarray(known))
-    if known and not (np.isfinite(known).all() and known[0] < known[1]):
-        raise ValueError(f"`depth_range` must be two finite depths that ascend, got ({near}, {far})")
+            require_usable(particles)
+        camera = with_depths(camera, particles)
+        if not is_traced(camera.near, camera.far) and not float(camera.near) < float(camera.far):
+            raise ValueError(f"`camera` must have near < far, both finite, got near = {camera.near} and far = {camera.far}")
+        return camera
+    pair = tuple(depths) if np.iterable(depths) else ()
+    near, far = (in_unit("depth_range", depth, particles.length_unit) for depth in (pair if len(pair) == 2 else (1, 0)))
+    if not is_traced(near, far) and not (np.isfinite(near) and np.isfinite(far) and float(near) < float(far)):
+        raise ValueError(f"`depth_range` must be two finite depths that ascend, got {depths}")
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:
         raise ValueError(f"`depth_range` must begin in front of the eye of a perspective camera, at > 0, got {near}")
     return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype), snug=None)
-
-
-def _require_usable(particles: Particles, camera: Camera) -> None:
-    """Raise `ValueError` that names the first entry of particles, or of the camera, that nothing can be projected with."""
-    valid = np.asarray(particles.valid)
-    position, support = np.asarray(particles.position), np.where(valid, particles.support, 1)
-    require_finite("particles.position", np.where(valid[:, None], position, 0), "remove or repair these particles")
-    require_finite("particles.support", support, "remove or repair these particles")
-    require_positive("particles.support", support, "give the support radius H > 0 of every particle")
-    if camera.near is not None and camera.far is not None and not float(camera.near) < float(camera.far):
-        raise ValueError(f"`camera` must have near < far, both finite, got near = {camera.near} and far = {camera.far}")
 
 
 def _cut(particles: Particles, camera: Camera, held: Held) -> float:

@@ -63,6 +63,15 @@ def held_by(particles: Particles, of: Any, weight: Any) -> Held:
     return Held(*_scaled(particles, [values * weights, weights]), True, name)
 
 
+def require_usable(particles: Particles) -> None:
+    """Raise `ValueError` that names the first position or support that has no column (host side)."""
+    valid = np.asarray(particles.valid)
+    support = np.where(valid, particles.support, 1)
+    require_finite("particles.position", np.where(valid[:, None], particles.position, 0))
+    require_finite("particles.support", support)
+    require_positive("particles.support", support, "give the support radius H > 0 of every particle")
+
+
 def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0) -> Any:
     r"""Amounts whose projection is the integral of $A \rho^n$ along rays: $A_j \rho_j^{n-1} m_j$.
 
