@@ -50,7 +50,7 @@ class State:
         Raises:
             ValueError: a camera that is none.
         """
-        look = first_look(scene)
+        look, camera = first_look(scene), camera.for_picture()
         self._asked, self._given, self._first, self._taller = camera, camera, Pose.of(camera, scene), 1.0
         self.pose, self.moved, self.cut = self._first, False, None  # type: Pose, bool, Cut | None
         self._steps = None if look is None else Steps(ControlPoints.of(look, flat=is_flat(scene)))

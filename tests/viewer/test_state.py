@@ -87,6 +87,14 @@ def test_what_is_up_in_the_first_view_is_so_along_all_axes(up, eye):
         assert abs(right) < 1e-9 and (upright > 0.5 or ahead == -1)
 
 
+def test_a_view_of_a_camera_whose_depths_were_found_is_between_these():
+    scene, camera = js.scenes.load("radial", 60, width=12, height=8)
+    found = dataclasses.replace(camera, near=None, far=None, snug=np.array(camera.near_and_far(), np.float32))
+    there, same = State(scene, found), State(scene, camera)
+    assert there.camera.near == camera.near and there.camera.far == camera.far
+    assert there.pose.told() == same.pose.told()
+
+
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_a_box_and_a_sphere_are_sized_around_the_middle_of_the_view(state, kind):
     state.do({"do": "cut", "kind": kind, "share": 0.2}, nowhere)
