@@ -56,7 +56,8 @@ def read_scene(
         TypeError: an option that there is not.
     """
     given = {"color_by": color_by, "opacity_by": opacity_by, "center": center, "width": width, "view": view, "size": size} | more
-    source, look, seen = (_made(group, given) for group in GROUPS)
+    groups: Any = [(group, [field.name for field in dataclasses.fields(group) if field.name in given]) for group in GROUPS]
+    source, look, seen = (group(**{name: given.pop(name) for name in own}) for group, own in groups)
     if given:
         known = ", ".join(field.name for group in GROUPS for field in dataclasses.fields(group))
         raise TypeError(f"read_scene has no option {next(iter(given))!r}; there are {known}")
@@ -66,8 +67,3 @@ def read_scene(
         depths = array_of(np.array(camera.near_and_far()), camera.dtype)
         camera = dataclasses.replace(camera, near=None, far=None, snug=depths)  # type: ignore[arg-type]
     return opened.scene, camera
-
-
-def _made(group: Any, given: dict[str, Any]) -> Any:
-    """A group of options, of which `given` loses those that are its own."""
-    return group(**{field.name: given.pop(field.name) for field in dataclasses.fields(group) if field.name in given})

@@ -138,7 +138,8 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
     for candidate in candidates:
         values, full_name = choose_quantity(table, candidate, density=density)
         if len(values) == 0 or values.min() < values.max():
-            if (candidate in scaled or candidate == "density") and _spans_decades(values):
+            wide = len(values) and values.min() > 0 and np.log10(values.max()) - np.log10(values.min()) > LOG_DECADES
+            if (candidate in scaled or candidate == "density") and wide:
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)
@@ -148,10 +149,6 @@ def _hardly_varies(values: np.ndarray) -> bool:
     """Whether a density is that of a liquid, which is nearly the same everywhere."""
     low, high = np.percentile(values, LIQUID_BETWEEN) if len(values) else (0.0, 0.0)
     return bool(low > 0 and high < LIQUID * low)
-
-
-def _spans_decades(values: np.ndarray) -> bool:
-    return bool(len(values) and values.min() > 0 and np.log10(values.max()) - np.log10(values.min()) > LOG_DECADES)
 
 
 def _log10(values: np.ndarray, name: str) -> np.ndarray:

@@ -327,9 +327,9 @@ class Camera(Placed):
         """With depths that were found for a picture, as far as none are given."""
         if self.snug is None:
             return self
-        ends = zip((self.near, self.far), at_hand(self.snug)[1], strict=True)
-        near, far = (array_of(found) if own is None else own for own, found in ends)
-        return dataclasses.replace(self, near=near, far=far, snug=None)
+        ends = dict(zip(("near", "far"), at_hand(self.snug)[1], strict=True))
+        found: Any = {name: array_of(end) for name, end in ends.items() if getattr(self, name) is None}
+        return dataclasses.replace(self, snug=None, **found)
 
     def exact_eye(self) -> np.ndarray:
         """The eye in float64, (3,), with what float32 could not hold (host side)."""

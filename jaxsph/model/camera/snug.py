@@ -20,12 +20,10 @@ OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet 
 
 
 def with_depths(camera: Camera, shown: Any) -> Camera:
-    """A camera whose near and far, as far as they are None, are those of what is shown (host side): of a scene those found for
-    its picture will do, of a part alone, as columns are of, all of it counts.
+    """With near and far of what is shown, where they are None (host side): those found for a scene's picture, or all of a part.
 
     Raises:
-        ValueError: without depths under a trace, with media, which do not say how large they are, or where the depth that is
-            given leaves none of what is shown.
+        ValueError: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be shown.
     """
     camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
     if camera.near is not None and camera.far is not None:
