@@ -67,10 +67,9 @@ def project(
     mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.held.emission_measure`.
 
     Args:
-        particles: kernel and supports are theirs; nothing is normalised. For periodic sets see `model.periodic`. Of a scene its
-            own, without clip.
-        camera: where from, how large the image is, and the depths that rays begin and end at; where they are None, as those of
-            `read_scene` are for parallel rays, all there is. What depths leave out is told by `Projection.cut`.
+        particles: kernel and supports are theirs; or a scene's, without its clip. For periodic sets see `model.periodic`.
+        camera: where from, how large the image is, and the depths that rays begin and end at (`Projection.cut` says what is
+            beyond); where they are None, as of `read_scene` with parallel rays, all there is.
         of: numbers of all particles in their order, or `"volume"` or `"quantity"`. Without weight the amounts $a_j$, default the
             volumes (true ones, which give the path length inside); with weight the values $q_j$, default the quantity.
         weight: the weights $w_j$, as for `of`: masses or volumes. Not negative.
@@ -150,7 +149,7 @@ def _cut(particles: Particles, camera: Camera, held: Held) -> float:
     if not beyond.any():
         return 0.0
     half = float(camera.half_height) * (depth if camera.is_perspective else 1.0)
-    seen = (np.abs(offset @ right) <= half * (camera.width / camera.height)) & (np.abs(offset @ up) <= half)
+    seen = (np.abs(offset @ right) <= half * camera.width / camera.height) & (np.abs(offset @ up) <= half)
     amounts = np.where(seen, np.abs(np.asarray(held.amounts[:, -1], np.float64)), 0)
     return float(amounts[beyond].sum() / (amounts.sum() or 1.0))
 

@@ -142,10 +142,9 @@ def _check(options: Any) -> None:
     suffix = None if options.output is None else options.output.suffix.lower()
     low, high = options.depth_range or (0, 1)
     picture, colours = suffix == ".png", any(getattr(options, name) is not None for name in LOOKS)
+    named = options.source.startswith(SCENE)
     wrong = {
-        f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": (
-            options.source.startswith(SCENE)
-        ),
+        f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
         f"{options.output}: a projection must be {', '.join(SUFFIXES)}": suffix not in (None, *SUFFIXES),
         "--fov needs --eye: from where should it be looked at?": options.fov_degrees is not None and options.eye is None,
         "--emission is an integral, not a mean: leave out --weight": None not in (options.emission, options.weight),
