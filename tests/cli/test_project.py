@@ -227,6 +227,15 @@ def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(f
         assert total == pytest.approx(4 * np.pi / 3, rel=0.15)
 
 
+def test_volumes_are_those_of_the_particles_where_masses_differ_and_no_density_is_there(file, capsys):
+    given = {name: column for name, column in columns().items() if name != "density"}
+    np.savez("weighed.npz", support=np.full(COUNT, 0.3), **given)
+    found, _ = values(capsys, "weighed.npz", "--of", "volume")
+    particles = io.read_particles("weighed.npz", "x")
+    own = js.project(particles, js.Camera.along_axis(particles, "z", 18, 12), of="volume")
+    np.testing.assert_allclose(found, own.values, rtol=1e-5, atol=1e-6 * found.max())
+
+
 def test_compiling_is_told_apart_in_the_time(file, capsys):
     line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
     assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))

@@ -28,6 +28,7 @@ from jaxsph.engine.runtime.executors import Clock
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
+from jaxsph.io.settle.assemble import volumes_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
 from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
@@ -195,10 +196,8 @@ class _Columns:
 
     @functools.cached_property
     def volume(self) -> np.ndarray:
-        """As the file has it, else mass over density."""
-        own = self._particles.to_numpy()[VOLUME] if self.table.volume is None else self.table.volume
-        known = self.table.volume is not None or self.mass_name is None
-        return own.astype(np.float64) if known else self.values(MASS) / self.density
+        """Those of the particles."""
+        return volumes_of(self.table, self.mass_name, self._stored, lambda: self._summed(weighed=False))[0]
 
     def unit(self, options: Any) -> str:
         """The unit of what is asked for, as far as the file states those that it is made of."""
@@ -225,9 +224,9 @@ class _Columns:
         right, up = (np.asarray(projected(self._particles, coarse, part, weight).values) * labels.factor for part in parts.T)
         return right, up, name, labels.unit
 
-    def _summed(self) -> np.ndarray:
+    def _summed(self, weighed: bool = True) -> np.ndarray:
         support = self._particles.to_numpy()["support"].astype(np.float64)
-        mass = None if self.mass_name is None else self.values(MASS)
+        mass = self.values(MASS) if weighed and self.mass_name is not None else None
         return io.kernel_sum(self.table.position, support, mass, kernel=self._particles.kernel, box=self.table.box_size)
 
 

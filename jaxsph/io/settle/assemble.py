@@ -170,7 +170,7 @@ def _assemble(
         return summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
-    volumes, volume_origin = _volumes(table, mass_name, stored, number_density)
+    volumes, volume_origin = volumes_of(table, mass_name, stored, number_density)
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
     notes += [rounding] if (rounding := rounding_note(table.position, supports)) else []
@@ -214,7 +214,7 @@ def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
     return table.kernel, sentence.removeprefix("kernel = ")
 
 
-def _volumes(
+def volumes_of(
     table: ParticleTable, mass_name: str | None, stored: StoredDensity, number_density: Callable[[], np.ndarray]
 ) -> tuple[np.ndarray, str]:
     """Volumes, and one sentence on where they come from."""
