@@ -11,6 +11,7 @@ from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jaxsph import io, reference, scale, scenes, sequence
+    from jaxsph.analysis.at_places import sample
     from jaxsph.analysis.explanation.explain import explain
     from jaxsph.analysis.projection.plan import plan_projection
     from jaxsph.analysis.projection.project import project
@@ -67,6 +68,7 @@ __all__ = [
     "render",
     "render_frames",
     "resample",
+    "sample",
     "scale",
     "scenes",
     "sequence",
@@ -102,6 +104,7 @@ NAMES = {
     "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
+    "sample": "jaxsph.analysis.at_places:sample",
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
     "explain": "jaxsph.analysis.explanation.explain:explain",

@@ -1,40 +1,41 @@
-r"""What particles are at any places in space, in float64: field, coverage, its gradient, and who makes it (host side).
+r"""What particles are at any places in space: field, coverage, its gradient, and who makes it.
 
-Flow: Particles, places -> [at_places] -> pixels explained, the view.
+Flow: Particles, places -> [at_places] -> sample; slices, pixels explained, the view.
 
-$C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field.
+$C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field. What is
+known is summed up in float64 by NumPy, over pairs that a tree finds; what has derivatives by JAX, over the same pairs; what is
+traced over all pairs, as which are near is not known then.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
-from jaxtyping import Float, Int
+from jax import lax
+from jaxtyping import Array, Float, Int
 
+from jaxsph.engine.lengths import times
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.particles import Particles
-from jaxsph.reference.where import places_of
+from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
+from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, require_finite, require_real, require_shape
+from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.given import in_unit
+from jaxsph.numerics.trees import fitting
+from jaxsph.reference.where import columns_of
 
 BLOCK = 1 << 14
 """Places that are looked at in one go: of liquids a million pairs of a place and a particle."""
-
-
-class Near(NamedTuple):
-    """Pairs of a place and a particle whose support holds it, in any order.
-
-    Attributes:
-        place: numbers of the places.
-        entry: entries of the particles, as they are given; of a periodic set in any copy.
-        weight: $V_j W_j$.
-        gradient: of that by the place, a unit length.
-    """
-
-    place: Int[np.ndarray, " pairs"]
-    entry: Int[np.ndarray, " pairs"]
-    weight: Float[np.ndarray, " pairs"]
-    gradient: Float[np.ndarray, "pairs 3"]
+ALL_PAIRS = 1 << 18
+"""Pairs of a block where all are summed up: some MB of offsets."""
 
 
 class AtPlaces(NamedTuple):
@@ -63,28 +64,19 @@ class ParticleField:
     """Particles in float64, with every copy of a periodic set that reaches into its box; asked for places many times."""
 
     def __init__(self, particles: Particles) -> None:
-        self._position, self._entry = places_of(particles)
-        self._support, self._volume = (
-            np.asarray(column, np.float64)[self._entry] for column in (particles.support, particles.volume)
-        )
-        self._quantities = np.asarray(particles.quantity, np.float64)
+        self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
         self._kernel = kernels.by_name(particles.kernel)
 
-    def near(self, places: Float[np.ndarray, "places 3"]) -> Near:
-        """Who makes what is at some places."""
+    def pairs(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers of places, those of the copies of particles whose supports hold them, and how far from these (pairs, 3)."""
         if not len(places):
-            return Near(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
+            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3))
         gap = np.maximum(np.maximum(places.min(0) - self._position, self._position - places.max(0)), 0)
         reaching = np.flatnonzero((gap < self._support[:, None]).all(1))
         found = scipy.spatial.cKDTree(places).query_ball_point(self._position[reaching], self._support[reaching])
         which = np.repeat(reaching, [len(one) for one in found])
         place = np.concatenate([np.zeros(0, int), *(np.asarray(one, int) for one in found if one)])
-        offset, support = places[place] - self._position[which], self._support[which]
-        square = (offset**2).sum(1) / support**2
-        strength = self._kernel.norm * self._volume[which] / support**3
-        slope = self._kernel.slope(self._kernel.prepare(square, 1.0), 0.0, 1.0, np)
-        weight = strength * self._kernel.of_square(square, np)
-        return Near(place, self._entry[which], weight, (2 * strength * slope / support**2)[:, None] * offset)
+        return place, which, places[place] - self._position[which]
 
     def at(self, places: Float[np.ndarray, "places 3"]) -> AtPlaces:
         """What is at places (P, 3), length units."""
@@ -92,13 +84,144 @@ class ParticleField:
         return AtPlaces(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
     def _at(self, places: np.ndarray) -> AtPlaces:
-        near, count = self.near(places), len(places)
+        place, which, offset = self.pairs(places)
+        support, count = self._support[which], len(places)
+        square = (offset**2).sum(1) / support**2
+        strength = self._kernel.norm * self._volume[which] / support**3
+        slope = self._kernel.slope(self._kernel.prepare(square, 1.0), 0.0, 1.0, np)
+        weight = strength * self._kernel.of_square(square, np)
 
         def summed(values: np.ndarray) -> np.ndarray:
-            return np.bincount(near.place, values, count).astype(np.float64)  # of none they are whole numbers
+            return np.bincount(place, values, count).astype(np.float64)  # of none they are whole numbers
 
-        coverage = summed(near.weight)
-        weighted = summed(near.weight * self._quantities[near.entry])
+        coverage, weighted = summed(weight), summed(weight * self._quantity[which])
         quantity = np.divide(weighted, coverage, out=np.full(count, np.nan), where=coverage > 0)
-        gradient = np.stack([summed(component) for component in near.gradient.T], 1)
-        return AtPlaces(coverage, gradient, quantity, np.bincount(near.place, minlength=count))
+        gradient = np.stack([summed(2 * strength * slope / support**2 * along) for along in offset.T], 1)
+        return AtPlaces(coverage, gradient, quantity, np.bincount(place, minlength=count))
+
+
+def sample(particles: Particles, points: Any, of: Any = None, normalised: bool = True) -> Float[Array, " points"]:
+    r"""The field at points, $Q(x) = \sum_j q_j V_j W_j(x) / \sum_j V_j W_j(x)$, or the plain sum $\sum_j a_j W_j(x)$.
+
+    Args:
+        particles: kernel and supports are theirs; of a periodic set points outside of its box are moved into it.
+        points: (M, 3) length units.
+        of: numbers of all particles in their order, or `"volume"` or `"quantity"`: the values $q_j$, default the quantity (of
+            two that of colours); or the amounts $a_j$, default the volumes, which give the coverage. Masses give the density.
+        normalised: whether it is the field; else the plain sum, whose integral is $\sum_j a_j$.
+
+    Returns:
+        (M,) in the dtype of the particles, in units of `of`, or of that over length cubed. Outside of every support the field is
+        NaN, a sum 0.
+
+    Differentiation:
+        By positions, supports, volumes, `of` and points; who is near is held fixed. Eagerly, derivatives included, a tree on the
+        host finds that. Where `jit` or `vmap` hide places, all pairs are summed up, in blocks.
+
+    Raises:
+        ValueError: points or numbers of another shape, or not finite; a unit that is none of lengths; sums beyond the dtype.
+
+    References:
+        Hochstetter, Orthmann & Kolb 2016, equations 1 and 2; Price 2012, equation 6 (the sum).
+    """
+    with as_usual() if (traced := is_traced(particles, points, of)) else at_once():
+        particles, exponent = carrying(fitting("particles", particles, Particles), of, normalised)
+        points = in_unit("points", points, particles.length_unit)
+        points = points if is_traced(points) else np.asarray(points)
+        require_real("points", points)
+        require_shape("points", points, (None, 3), "one row (x, y, z) a point")
+        places = points, dataclasses.replace(particles, quantity=particles.support, volume=particles.support)
+        there, known = jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if is_traced(leaf) else leaf, places)
+        if not is_traced(there):
+            require_finite("points", there)
+        is_known = len(points) > 0 and not is_traced(there, known)
+        if is_known and particles.box is not None:
+            lower, upper = known.box.corners()
+            there = lower + (np.asarray(there, np.float64) - lower) % (upper - lower)
+        if not traced:
+            found = ParticleField(particles).at(np.asarray(there, np.float64))
+            return array_of(rounded(found.quantity if normalised else found.coverage, exponent, particles.dtype))
+        first, digits = points.astype(particles.dtype), 0
+        parts = first, (points - first).astype(particles.dtype)  # what is known has digits that only both hold
+        if not is_traced(known.support):
+            digits = int(np.frexp(np.asarray(known.support).max())[1])
+        blocks: Any = _pairs_of(ParticleField(known), np.asarray(there, np.float64)) if is_known else [(np.s_[:], None)]
+        sums = functools.partial(_sums, particles, unit=np.asarray(2.0**digits, particles.dtype), normalised=normalised)
+        values = jnp.concatenate([sums(tuple(part[one] for part in parts), pairs) for one, pairs in blocks])
+        return times(values, exponent - (0 if normalised else 3 * digits))  # type: ignore[no-any-return]
+
+
+def carrying(particles: Particles, of: Any, normalised: bool) -> tuple[Particles, int]:
+    """Particles that hold `of`, as quantity or, where sums are not normalised, as volume; over a power of two, whose exponent."""
+    for name, column in {} if is_traced(particles) else particles.to_numpy().items():
+        require_finite(name, column)
+    name = "quantity" if normalised else "volume"
+    held = held_by(particles, name if of is None else of, None)
+    changed: dict[str, Any] = {name: held.amounts[:, 0]}
+    return dataclasses.replace(particles, **changed), held.exponents[0]
+
+
+def rounded(values: np.ndarray, exponent: int, dtype: Any) -> np.ndarray:
+    """Values times a power of two in a dtype; `ValueError` of what it cannot hold."""
+    values = np.ldexp(np.asarray(values, np.float64), exponent)
+    largest, most = float(np.abs(values).max(initial=0, where=~np.isnan(values))), float(np.finfo(dtype).max)
+    if largest > most:
+        raise ValueError(f"`of` makes {largest:.3g}, and {dtype} ends at {most:.3g}: give it in another unit")
+    return values.astype(dtype)
+
+
+def _pairs_of(field: ParticleField, there: np.ndarray) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
+    """Blocks of places with their pairs: places, entries and offsets; padded, so that programs recur, with a place beyond all."""
+    for block in (slice(begin, begin + BLOCK) for begin in range(0, len(there), BLOCK)):
+        place, which, offset = field.pairs(there[block])
+        room = 0, capacity_class(len(place)) - len(place)
+        place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(field.entry[which], room)
+        yield block, (place, entry, np.pad(offset, (room, (0, 0))))
+
+
+@functools.partial(jax.jit, static_argnames="normalised")
+def _sums(
+    particles: Particles, points: tuple[Array, Array], pairs: tuple[Array, ...] | None, unit: Array, normalised: bool
+) -> Float[Array, " points"]:
+    """Over the pairs given, whose offsets are exact and have derivatives by both ends, or all; a plain sum by cubes of a unit."""
+    kernel, support = kernels.by_name(particles.kernel), particles.support
+    held, inverse = jnp.where(particles.valid, particles.volume, 0), unit / support
+    if normalised:  # ratios alone count
+        most, least = lax.stop_gradient((held.max(), support.min()))
+        weight = held / jnp.where(most > 0, most, 1) * (least / support) ** 3
+        table = jnp.stack([particles.quantity * weight, weight], 1)
+    else:
+        table = (held * inverse * inverse * (inverse * kernel.norm))[:, None]  # float32 may not hold the cube of a length
+    if pairs is None:
+        sums = _over_all(particles, points, table)
+    else:
+        place, entry, offset = pairs
+        moved = points[0][place] - particles.position[entry]
+        offset = (offset.astype(moved.dtype) + (moved - lax.stop_gradient(moved))) / support[entry, None]
+        terms = kernel.of_square((offset**2).sum(1), jnp)[:, None] * table[entry]
+        sums = jax.ops.segment_sum(terms, place, len(points[0]))
+    return jnp.where(sums[:, 1] > 0, ratio(sums[:, 0], sums[:, 1]), jnp.nan) if normalised else sums[:, 0]
+
+
+def _over_all(particles: Particles, points: tuple[Array, Array], table: Array) -> Float[Array, "points channels"]:
+    """Sums over all particles and, of a periodic set, the two copies nearest along each axis: supports reach no third."""
+    count, rows = len(points[0]), max(ALL_PAIRS // particles.capacity, 1)
+    particles, kernel, box = particles.wrapped(), kernels.by_name(particles.kernel), particles.box
+    blocks = jnp.pad(jnp.stack(points, 1), ((0, -count % rows), (0, 0), (0, 0))).reshape(-1, rows, 2, 3)
+
+    @jax.checkpoint
+    def block(parts: Array) -> Array:
+        offset, left = two_sum(parts[:, None, 0], -particles.position)
+        left = left + parts[:, None, 1] - (0 if particles.position_rest is None else particles.position_rest)
+        offsets = [offset + left]
+        if box is not None:
+            sides, left_of_sides = sides_of(box)
+            turns = jnp.round(lax.stop_gradient(offset) / sides)
+            offset = (offset - turns * sides) + (left - turns * left_of_sides)  # of those near the first difference is exact
+            offsets = [offset, offset + jnp.where(offset < 0, sides, -sides)]
+        squares = [(one / particles.support[:, None]) ** 2 for one in offsets]
+        ways = itertools.product(squares, repeat=3)
+        weight: Any = sum(kernel.of_square(x[..., 0] + y[..., 1] + z[..., 2], jnp) for x, y, z in ways)
+        return jnp.matmul(weight, table, precision=lax.Precision.HIGHEST)
+
+    return lax.map(block, blocks).reshape(-1, table.shape[1])[:count]  # type: ignore[no-any-return]

@@ -12,12 +12,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import math
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from jaxsph.analysis.at_places import carrying, rounded
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import with_ghosts
@@ -32,8 +32,17 @@ BEYOND = 4.0  # a squared distance in supports, at which every kernel is 0
 
 
 @on_host
-def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, int, int], *, fill: float = 0.0) -> Volume:
-    r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid (host side, float64 sums).
+def resample(
+    particles: Particles,
+    lower: Any,
+    spacing: Any,
+    shape: tuple[int, int, int],
+    *,
+    fill: float = 0.0,
+    of: Any = None,
+    normalised: bool = True,
+) -> Volume:
+    r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid, or a plain sum (host side, float64).
 
     Args:
         particles: whose quantity is resampled; of two, that of colours. Of a periodic set one period: there is nothing outside.
@@ -42,7 +51,9 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
         shape: points along x, y and z, at least 2 each.
         fill: value of points outside of every support. Particles show nothing there, a volume what its transfer function makes of
             `fill`: give a value beyond the quantities, and extinction 0 from there to the first that is to be shown. Between a
-            point inside and one outside the volume is interpolated, so borders are blurred by a cell.
+            point inside and one outside the volume is interpolated, so borders are blurred by a cell. Of a plain sum, which is 0
+            outside of supports, that of points outside of a period.
+        of, normalised: as for `jaxsph.sample`: the plain sum of masses is the density, whose integral is the mass.
 
     Returns:
         Volume of the particles' dtype.
@@ -62,45 +73,41 @@ def resample(particles: Particles, lower: Any, spacing: Any, shape: tuple[int, i
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
-    ghosted = with_ghosts(particles)
-    grid = _Sums(lower, np.broadcast_to(spacing, 3), tuple(int(points) for points in shape), ghosted)
+    (held, exponent), spacing = carrying(particles, of, normalised), np.broadcast_to(spacing, 3)
+    grid = _Sums(lower, spacing, tuple(int(points) for points in shape), with_ghosts(held), normalised)
     for box in grid.boxes():
         grid.add(*box)
-    inside = (grid.weight > 0) & _in_period(particles, lower, spacing, shape)
-    quantity = np.where(inside, grid.weighted / np.where(inside, grid.weight, 1), fill)
-    made = Volume.from_array(quantity.reshape(shape).astype(particles.dtype), lower, spacing)
+    inside = _in_period(particles, lower, spacing, shape) & ((grid.weight > 0) | (not normalised))
+    sums = grid.weighted / np.where(inside, grid.weight, 1) if normalised else grid.weight
+    values = np.where(inside, rounded(sums, exponent, particles.dtype), fill)
+    made = Volume.from_array(values.reshape(shape).astype(particles.dtype), lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
 
 
 def _in_period(particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Points of a grid in the box of a periodic set; all where there is none. Of what rounding has moved over a face, too."""
-    if particles.box is None:
-        return np.ones(math.prod(shape), bool)
-    ends, steps = particles.box.corners(), np.broadcast_to(spacing, 3)
-    slack = ON_FACE * steps
-    axes = [corner + step * np.arange(points) for corner, step, points in zip(lower, steps, shape, strict=True)]
-    sides = [(at >= ends[0][k] - slack[k]) & (at <= ends[1][k] + slack[k]) for k, at in enumerate(axes)]
-    return np.asarray(sides[0][:, None, None] & sides[1][:, None] & sides[2]).ravel()
+    inside, ends = np.ones(shape, bool), () if particles.box is None else zip(*particles.box.corners(), strict=True)
+    for axis, (low, high) in enumerate(ends):
+        at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
+        inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
+    return inside.ravel()
 
 
-@dataclasses.dataclass
 class _Sums:
     """Sums of weights, and of quantities times weights, at all points of a grid."""
 
-    lower: np.ndarray
-    spacing: np.ndarray
-    shape: tuple[int, ...]
-    particles: Particles
-
-    def __post_init__(self) -> None:
-        valid, columns = np.asarray(self.particles.valid), self.particles.to_numpy()
-        self.position = (self.particles.exact_position()[valid] - self.lower) / self.spacing
+    def __init__(self, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], particles: Particles, normalised: bool):
+        valid, columns, self.spacing, self.shape = np.asarray(particles.valid), particles.to_numpy(), spacing, shape
+        self.position = (particles.exact_position()[valid] - lower) / spacing
         self.support, self.quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
-        strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(self.support)  # ratios alone count, however far apart
-        largest = strength.max(initial=-np.inf, where=volume > 0)
-        self.strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
-        self.kernel = kernels.by_name(self.particles.kernel)
-        self.weight, self.weighted = np.zeros((2, int(np.prod(self.shape))))
+        self.kernel = kernels.by_name(particles.kernel)
+        if normalised:  # ratios alone count, however far apart
+            strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(self.support)
+            largest = strength.max(initial=-np.inf, where=volume > 0)
+            self.strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
+        else:
+            self.strength = self.kernel.norm * volume / self.support**3
+        self.weight, self.weighted = np.zeros((2, int(np.prod(shape))))
 
     def boxes(self) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[range, ...]]]:
         """Particles whose supports span boxes of one size: which, the first point of each, and the offsets of all its points."""
@@ -108,7 +115,7 @@ class _Sums:
         first = np.maximum(np.ceil(self.position - reach), 0).astype(np.int64)
         last = np.minimum(np.floor(self.position + reach), np.array(self.shape) - 1).astype(np.int64)
         points = last - first + 1
-        some = np.flatnonzero((points > 0).all(1) & (self.strength > 0))
+        some = np.flatnonzero((points > 0).all(1) & (self.strength != 0))
         sizes = np.array([capacity_class(count) for count in range(max(self.shape) + 1)])[points[some]]
         ways, of_size = np.unique(sizes, axis=0, return_inverse=True)
         for k, size in enumerate(ways.tolist()):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxsph.analysis.at_places import carrying, rounded, sample
 from jaxsph.engine.render import render
 from jaxsph.io.images import slices as files
 from jaxsph.io.images.fits import PlaneAxes, middle_of
@@ -33,6 +34,7 @@ from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
+from jaxsph.reference.where import inside
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
 ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
@@ -43,7 +45,7 @@ class Slice:
     """The field on a plane; made by `slice`. Row 0 is the top, column 0 the left.
 
     Attributes:
-        values: the quantity Q, float32 or float64; NaN outside of every support.
+        values: the quantity Q, float32 or float64, NaN outside of every support; or a plain sum, NaN where nothing is shown.
         camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
         metadata: strings and numbers for the file header.
         length_unit: what the unit of lengths is called; empty where it is not known.
@@ -114,8 +116,10 @@ def slice(
     view_height: float | None = None,
     width: int = 512,
     height: int = 512,
+    of: Any = None,
+    normalised: bool = True,
 ) -> Slice:
-    """The field of particles on a plane (host side).
+    """The field of particles on a plane, or a plain sum over them (host side).
 
     Args:
         particles: whose quantity is shown; of a periodic set one period.
@@ -125,6 +129,8 @@ def slice(
         up: (3,) direction that points upwards; default y, or z where the normal is along x or y.
         view_height: visible height, length units; default all of the particles.
         width, height: size in pixels.
+        of, normalised: as for `jaxsph.sample`: the plain sum of masses is the density. There is none outside of a period or of
+            `within`, and it is 0 outside of every support.
 
     Raises:
         ValueError: arguments out of range, particles that cannot be rendered.
@@ -132,13 +138,14 @@ def slice(
     if not isinstance(plane, Plane):
         raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
     unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
+    point = np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64)
     center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
     if up is None:
         up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()
     middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
     require_shape("center", middle, (3,), "give x, y and z")
-    foot = middle - ((middle - _point(plane)) @ normal) * normal
+    foot = middle - ((middle - point) @ normal) * normal
     if view_height is None:
         axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
@@ -146,13 +153,19 @@ def slice(
         view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
     deep = view_height / height
     camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
-    said = ("jaxsph.slice", f"point={_point(plane).tolist()} normal={normal.round(9).tolist()}")
+    said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
-    return Slice(_field(particles, camera, within, deep), camera, metadata, unit or "")
-
-
-def _point(plane: Plane) -> np.ndarray:
-    return np.asarray(np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64))
+    found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
+    if normalised and of is None:
+        values = _field(particles, camera, within, deep)
+    elif normalised:
+        held, exponent = carrying(particles, of, normalised)
+        values = rounded(_field(held, camera, within, deep), exponent, particles.dtype)
+    else:
+        places = found.positions()
+        values = np.asarray(sample(particles, places.reshape(-1, 3), of, normalised)).reshape(height, width)
+        values = np.where(inside(particles.box, places) & inside(within, places), values, np.nan)
+    return dataclasses.replace(found, values=values)
 
 
 def _field(particles: Particles, camera: Camera, within: Clip | None, deep: float) -> np.ndarray:

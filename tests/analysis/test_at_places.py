@@ -1,6 +1,12 @@
 """What particles are at places is the sums of their definition, in periods and out of every support, too."""
 
+import dataclasses
+import functools
+import itertools
+
 import formulas
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -36,8 +42,11 @@ def test_sums_and_slopes_are_those_of_the_definition(kernel, monkeypatch):
         ahead, behind = (ParticleField(particles).at(places + sign * step * np.eye(3)[axis]).coverage for sign in (1, -1))
         np.testing.assert_allclose(found.gradient[:, axis], (ahead - behind) / (2 * step), atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(found.normal[:-1], axis=1), 1)
-    near = ParticleField(particles).near(places[:1])
-    np.testing.assert_allclose(near.weight.sum(), coverage[0], rtol=1e-5)
+    field = ParticleField(particles)
+    _, which, offset = field.pairs(places[:1])
+    reaching = np.linalg.norm(places[0] - position, axis=1) < particles.to_numpy()["support"]
+    np.testing.assert_array_equal(np.sort(field.entry[which]), np.flatnonzero(reaching))
+    np.testing.assert_allclose(places[0] - offset, position[field.entry[which]], atol=1e-12)
 
 
 def test_supports_reach_across_the_faces_of_a_period():
@@ -54,3 +63,136 @@ def test_of_no_particles_or_no_places_there_is_nothing():
     assert not found.coverage.any() and np.isnan(found.quantity).all()
     somebody = js.Particles.from_arrays(np.zeros((1, 3)), 0.3, np.zeros(1))
     assert [len(column) for column in ParticleField(somebody).at(np.zeros((0, 3)))] == [0, 0, 0, 0]
+
+
+SIDES = np.array([1.0, 1.2, 0.9])
+WAYS = pytest.mark.parametrize(
+    ("of", "normalised"),
+    [(None, True), ("masses", True), (None, False), ("masses", False)],
+    ids=["field", "mean", "C", "density"],
+)
+
+
+def drawn(box=None, dtype=np.float64, origin=0.0, size=1.0):
+    """Particles whose supports are up to most of a period, points of which some are outside, and masses."""
+    rng = np.random.default_rng(4)
+    position, support = origin + size * rng.uniform(0, 1, (24, 3)) * SIDES, size * rng.uniform(0.15, 0.6, 24)
+    columns = [column.astype(dtype) for column in (support, rng.normal(size=24), rng.uniform(0.1, 1, 24))]
+    particles = js.Particles.from_arrays(position, *columns, "wendland_c4", box=box)
+    return particles, origin + size * rng.uniform(-0.5, 1.5, (19, 3)), rng.uniform(1, 3, 24)
+
+
+def brute_force(particles, points, of, normalised):
+    """Of all pairs and all images in float64."""
+    columns = {name: column.astype(np.float64) for name, column in particles.to_numpy().items()}
+    sides = 0 if particles.box is None else np.subtract(*particles.box.corners()[::-1])
+    turns = [(0, 0, 0)] if particles.box is None else itertools.product(range(-3, 4), repeat=3)
+    away = points[:, None] - particles.exact_position()[: len(columns["support"])]
+    distance = (np.linalg.norm(away + np.array(turn) * sides, axis=-1) / columns["support"] for turn in turns)
+    weight = sum(formulas.KERNELS[particles.kernel](np.minimum(one, 1)) for one in distance) / columns["support"] ** 3
+    held = columns["quantity" if normalised else "volume"] if of is None else of
+    with np.errstate(invalid="ignore"):
+        weighted = weight * columns["volume"]
+        return (weighted @ held) / weighted.sum(1) if normalised else weight @ held
+
+
+@functools.partial(jax.jit, static_argnames="normalised")
+def within_jit(particles, points, of, normalised):
+    return js.sample(particles, points, of, normalised)
+
+
+@WAYS
+@pytest.mark.parametrize("box", [None, SIDES], ids=["free", "periodic"])
+def test_samples_are_the_sums_of_their_definition_eagerly_and_within_jit(x64, of, normalised, box):
+    particles, points, masses = drawn(box)
+    of = masses if of else None
+    truth = brute_force(particles, points, of, normalised)
+    assert box is not None or 0 < (np.isnan(truth) | (truth == 0)).sum() < len(points)
+    for found in (js.sample(particles, points, of, normalised), within_jit(particles, points, of, normalised)):
+        assert found.dtype == np.float64
+        np.testing.assert_allclose(found, truth, rtol=1e-12, atol=1e-13)
+
+
+@WAYS
+@pytest.mark.parametrize("box", [None, SIDES], ids=["free", "periodic"])
+def test_derivatives_by_all_that_a_sample_is_made_of_are_those_of_differences(x64, of, normalised, box):
+    particles, points, masses = drawn(box)
+    rng = np.random.default_rng(5)
+
+    def total(position, support, of, points):
+        found = js.sample(dataclasses.replace(particles, position=position, support=support), points, of, normalised)
+        return jnp.where(jnp.isnan(found), 0, found) @ shares
+
+    shares = jnp.asarray(rng.normal(size=len(points)))
+    given = particles.position, particles.support, jnp.asarray(masses if of else particles.volume), jnp.asarray(points)
+    move = [rng.normal(size=one.shape) for one in given]
+    ahead, behind = (float(total(*(a + sign * 1e-6 * b for a, b in zip(given, move, strict=True)))) for sign in (1, -1))
+    by_pairs, by_all = (how(jax.grad(total, (0, 1, 2, 3)))(*given) for how in (lambda one: one, jax.jit))
+    slope = sum(float((one * other).sum()) for one, other in zip(by_pairs, move, strict=True))
+    np.testing.assert_allclose(slope, (ahead - behind) / 2e-6, rtol=1e-6)
+    for one, other in zip(by_pairs, by_all, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("given", [{"origin": 3e5, "size": 0.01}, {"size": 1e20}], ids=["far", "large"])
+def test_low_digits_of_far_positions_count_and_lengths_need_no_cube_in_float32(given):
+    particles, points, masses = drawn(dtype=np.float32, **given)
+    assert particles.dtype == np.float32 and (particles.position_rest is None) == ("origin" not in given)
+    masses = np.float32(masses * given["size"] ** 1.5)
+    truth = brute_force(particles, points, masses, False)
+    by_pairs, pull = jax.vjp(lambda masses: js.sample(particles, points, masses, False), jnp.float32(masses))
+    by_all = jax.jit(lambda particles, masses: js.sample(particles, points, masses, False))(particles, masses)
+    for found in (js.sample(particles, points, masses, False), by_all, by_pairs):
+        np.testing.assert_allclose(found, truth, rtol=2e-5, atol=2e-6 * truth.max())
+    shares = jnp.full(19, 1 / truth.max(), np.float32)
+    np.testing.assert_allclose(masses @ pull(shares)[0], truth.sum() / truth.max(), rtol=1e-5)
+
+
+def test_a_batch_of_points_is_that_many_samples():
+    particles, points, _ = drawn(SIDES, np.float32)
+    points = np.float32(points[:18].reshape(2, 9, 3))
+    found = jax.vmap(lambda some: js.sample(particles, some))(points)
+    np.testing.assert_allclose(found, [js.sample(particles, some) for some in points], atol=1e-5)
+
+
+@pytest.mark.parametrize("normalised", [True, False])
+def test_of_no_particles_samples_are_nothing_and_of_no_points_there_are_none(normalised):
+    nobody, somebody = js.Particles.from_arrays(np.zeros((0, 3)), 0.3, np.zeros(0)), drawn(None, np.float32)[0]
+    for how in (js.sample, within_jit):
+        np.testing.assert_array_equal(how(nobody, np.zeros((2, 3)), None, normalised), [np.nan if normalised else 0] * 2)
+        assert how(somebody, np.zeros((0, 3)), None, normalised).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"points": np.zeros(3)}, r"`points` must have shape \(N, 3\), got \(3,\)"),
+        ({"points": [[0, np.nan, 0]]}, r"`points` must be finite, but 1 of 3 are not, first points\[0, 1\]"),
+        ({"points": [["a", "b", "c"]]}, "`points` must hold real numbers"),
+        ({"of": np.ones(3)}, r"`of` must have shape \(24,\)"),
+        ({"of": "mass"}, "`of` must be 'volume' or 'quantity'"),
+        ({"of": np.full(24, 1e43)}, "`of` makes 1e[+]43, and float32 ends at 3.4e[+]38"),
+        ({"particles": None}, "`particles` must be a `jaxsph.Particles`, got NoneType"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused_by_name(changed, said):
+    particles, _, _ = drawn(None, np.float32)
+    with pytest.raises(ValueError, match=said):
+        js.sample(**{"particles": particles, "points": np.full((1, 3), 0.5)} | changed)
+
+
+def test_particles_that_are_no_numbers_are_refused_and_not_left_out():
+    particles, points, _ = drawn(None, np.float32)
+    broken = dataclasses.replace(particles, position=particles.position.at[3, 1].set(np.nan))
+    with pytest.raises(ValueError, match=r"`position` must be finite, but 1 of 72 are not, first position\[3, 1\]"):
+        js.sample(broken, points)
+
+
+def test_points_in_another_unit_are_converted_and_those_that_cannot_be_are_refused():
+    units = pytest.importorskip("astropy.units")
+    particles, points, _ = drawn(None, np.float32)
+    in_km = js.Particles.from_arrays(np.asarray(particles.position) * units.km, particles.support, particles.quantity)
+    plain = js.Particles.from_arrays(particles.position, particles.support, particles.quantity)
+    np.testing.assert_allclose(js.sample(in_km, points * 1000 * units.m), js.sample(plain, points), rtol=1e-6)
+    with pytest.raises(ValueError, match="`points` is in s, which cannot be converted to km"):
+        js.sample(in_km, points * units.s)

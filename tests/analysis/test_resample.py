@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 
 import numpy as np
@@ -37,6 +38,31 @@ def test_values_are_those_of_all_pairs(kernel, monkeypatch):
     assert volume.values.shape == shape and 0.05 < (truth == -9).mean() < 0.95
     np.testing.assert_allclose(volume.values, truth, atol=2e-6)
     np.testing.assert_allclose(volume.bounds()[0], lower)
+
+
+@pytest.mark.parametrize("box", [None, (2.0, 2.0, 2.0)], ids=["free", "periodic"])
+def test_a_plain_sum_of_masses_is_the_density_at_points_and_its_integral_the_mass(box):
+    given = drawn("cubic_spline", decades=0.3)
+    columns = {name: column for name, column in given.to_numpy().items() if name != "position"}
+    particles = js.Particles.from_arrays(given.to_numpy()["position"] + 1, **columns, kernel=given.kernel, box=box)
+    masses = np.random.default_rng(7).uniform(1e25, 3e25, 60)
+    lower, spacing, count = (0.025, 0.05, 40) if box else (-0.6, 0.05, 65)
+    volume = js.resample(particles, (lower,) * 3, spacing, (count,) * 3, of=masses, normalised=False, fill=-1.0)
+    values = np.asarray(volume.values, np.float64)
+    np.testing.assert_allclose(values.sum() * spacing**3, masses.sum(), rtol=1e-3)
+    chosen = np.random.default_rng(8).integers(0, count, (50, 3))
+    truth = js.sample(particles, lower + spacing * chosen, masses, normalised=False)
+    np.testing.assert_allclose(values[tuple(chosen.T)], truth, rtol=1e-5, atol=1e-6 * values.max())
+    assert (values == 0).any() or box
+
+
+def test_values_of_their_own_are_resampled_as_a_quantity_is():
+    particles = drawn("poly6")
+    values = np.random.default_rng(9).normal(size=60)
+    carried = dataclasses.replace(particles, quantity=np.pad(np.float32(values), (0, particles.capacity - 60)))
+    grid = (-0.9, -0.9, -0.9), 0.2, (9, 9, 9)
+    found, expected = js.resample(particles, *grid, of=values), js.resample(carried, *grid)
+    np.testing.assert_array_equal(found.values, expected.values)
 
 
 def test_nothing_is_fill_everywhere():

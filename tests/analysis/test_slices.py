@@ -1,5 +1,6 @@
 """Slices: the field on a plane as the reference has it, nowhere else anything, of periodic sets and within clips, too."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -84,6 +85,27 @@ def test_within_a_clip_values_stay_and_there_are_none_outside():
     inside = np.linalg.norm(part.positions() - (0.4, 0.6, 0.4), axis=-1) < 0.35
     assert np.isnan(part.values[~inside]).all() and np.isfinite(part.values[inside]).any()
     np.testing.assert_allclose(part.values[inside], whole.values[inside], atol=1e-5)
+
+
+@pytest.mark.parametrize("box", [None, SIDES], ids=["free", "periodic"])
+def test_a_plain_sum_is_that_of_samples_where_it_is_shown(box):
+    particles, plane, ball = particles_of(box), js.Plane((0.5, 0.6, 0.4), (0.2, 0, 1)), js.Sphere((0.4, 0.6, 0.4), 0.6)
+    masses = np.random.default_rng(3).uniform(1, 2, 150)
+    found = js.slice(particles, plane, within=ball, view_height=1.8, of=masses, normalised=False, **SIZE)
+    place = found.positions()
+    shown = np.linalg.norm(place - (0.4, 0.6, 0.4), axis=-1) < 0.6
+    shown &= (box is None) | ((place >= 0) & (place <= SIDES)).all(-1)
+    np.testing.assert_array_equal(np.isfinite(found.values), shown)
+    np.testing.assert_array_equal(found.values[shown], js.sample(particles, place[shown], masses, False))
+    assert found.values.dtype == np.float32 and 0 < (found.values[shown] == 0).mean() < 0.5 or box is not None
+
+
+def test_values_of_their_own_are_sliced_as_a_quantity_is():
+    particles, plane = particles_of(), js.Plane((0.5, 0.6, 0.4), (0, 0, 1))
+    values = 1e12 * np.random.default_rng(3).normal(size=150)
+    carried = dataclasses.replace(particles, quantity=np.pad(np.float32(values), (0, particles.capacity - 150)))
+    found, expected = js.slice(particles, plane, of=values, **SIZE), js.slice(carried, plane, **SIZE)
+    agree(found.values, expected.values, 1e-5 * np.ptp(values))
 
 
 @pytest.mark.slow
