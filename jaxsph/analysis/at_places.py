@@ -78,6 +78,14 @@ class ParticleField:
         place = np.concatenate([np.zeros(0, int), *(np.asarray(one, int) for one in found if one)])
         return place, which, places[place] - self._position[which]
 
+    def blocks(self, places: Float[np.ndarray, "places 3"]) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
+        """Places with their pairs, of entries: padded, so that programs recur, with a place beyond all."""
+        for block in (slice(begin, begin + BLOCK) for begin in range(0, len(places), BLOCK)):
+            place, which, offset = self.pairs(places[block])
+            room = 0, capacity_class(len(place)) - len(place)
+            place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
+            yield block, (place, entry, np.pad(offset, (room, (0, 0))))
+
     def at(self, places: Float[np.ndarray, "places 3"]) -> AtPlaces:
         """What is at places (P, 3), length units."""
         blocks = [self._at(places[begin : begin + BLOCK]) for begin in range(0, max(len(places), 1), BLOCK)]
@@ -141,11 +149,10 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
         if not traced:
             found = ParticleField(particles).at(np.asarray(there, np.float64))
             return array_of(rounded(found.quantity if normalised else found.coverage, exponent, particles.dtype))
-        first, digits = points.astype(particles.dtype), 0
+        first = points.astype(particles.dtype)
         parts = first, (points - first).astype(particles.dtype)  # what is known has digits that only both hold
-        if not is_traced(known.support):
-            digits = int(np.frexp(np.asarray(known.support).max())[1])
-        blocks: Any = _pairs_of(ParticleField(known), np.asarray(there, np.float64)) if is_known else [(np.s_[:], None)]
+        digits = 0 if is_traced(known.support) else int(np.frexp(np.asarray(known.support).max())[1])
+        blocks: Any = ParticleField(known).blocks(np.asarray(there, np.float64)) if is_known else [(np.s_[:], None)]
         sums = functools.partial(_sums, particles, unit=np.asarray(2.0**digits, particles.dtype), normalised=normalised)
         values = jnp.concatenate([sums(tuple(part[one] for part in parts), pairs) for one, pairs in blocks])
         return times(values, exponent - (0 if normalised else 3 * digits))  # type: ignore[no-any-return]
@@ -168,15 +175,6 @@ def rounded(values: np.ndarray, exponent: int, dtype: Any) -> np.ndarray:
     if largest > most:
         raise ValueError(f"`of` makes {largest:.3g}, and {dtype} ends at {most:.3g}: give it in another unit")
     return values.astype(dtype)
-
-
-def _pairs_of(field: ParticleField, there: np.ndarray) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-    """Blocks of places with their pairs: places, entries and offsets; padded, so that programs recur, with a place beyond all."""
-    for block in (slice(begin, begin + BLOCK) for begin in range(0, len(there), BLOCK)):
-        place, which, offset = field.pairs(there[block])
-        room = 0, capacity_class(len(place)) - len(place)
-        place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(field.entry[which], room)
-        yield block, (place, entry, np.pad(offset, (room, (0, 0))))
 
 
 @functools.partial(jax.jit, static_argnames="normalised")

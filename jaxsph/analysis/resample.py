@@ -77,20 +77,15 @@ def resample(
     grid = _Sums(lower, spacing, tuple(int(points) for points in shape), with_ghosts(held), normalised)
     for box in grid.boxes():
         grid.add(*box)
-    inside = _in_period(particles, lower, spacing, shape) & ((grid.weight > 0) | (not normalised))
+    inside = grid.weight.reshape(shape) > 0 if normalised else np.ones(shape, bool)
+    for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
+        at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
+        inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
+    inside = inside.ravel()
     sums = grid.weighted / np.where(inside, grid.weight, 1) if normalised else grid.weight
     values = np.where(inside, rounded(sums, exponent, particles.dtype), fill)
     made = Volume.from_array(values.reshape(shape).astype(particles.dtype), lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
-
-
-def _in_period(particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Points of a grid in the box of a periodic set; all where there is none. Of what rounding has moved over a face, too."""
-    inside, ends = np.ones(shape, bool), () if particles.box is None else zip(*particles.box.corners(), strict=True)
-    for axis, (low, high) in enumerate(ends):
-        at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
-        inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
-    return inside.ravel()
 
 
 class _Sums:

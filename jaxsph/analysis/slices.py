@@ -156,10 +156,8 @@ def slice(
     said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
-    if normalised and of is None:
-        values = _field(particles, camera, within, deep)
-    elif normalised:
-        held, exponent = carrying(particles, of, normalised)
+    if normalised:
+        held, exponent = (particles, 0) if of is None else carrying(particles, of, normalised)
         values = rounded(_field(held, camera, within, deep), exponent, particles.dtype)
     else:
         places = found.positions()

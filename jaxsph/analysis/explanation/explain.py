@@ -140,26 +140,11 @@ def explain(
     ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
     truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
     budget = budget_of(scene, camera, settings, row, column, plan)
-    return Explanation(
-        (row, column),
-        budget.sources,
-        budget.total,
-        budget.certified,
-        note_of(settings, budget.total),
-        budget.levels,
-        budget.color,
-        1 - budget.transmittance,
-        np.asarray(truth.color[0]),
-        1 - float(truth.transmittance[0]),
-        budget.depth,
-        ray.depth,
-        ray.quantities[0],
-        ray.quantities[1] if len(ray.quantities) > 1 else None,
-        ray.extinction,
-        ray.transmittance,
-        ray.particles,
-        ray.added,
-    )
+    error = budget.sources, budget.total, budget.certified, note_of(settings, budget.total), budget.levels
+    rendered, seen = (budget.color, 1 - budget.transmittance), (np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]))
+    second = ray.quantities[1] if len(ray.quantities) > 1 else None
+    met: Any = ray.depth, ray.quantities[0], second, ray.extinction, ray.transmittance, ray.particles, ray.added
+    return Explanation((row, column), *error, *rendered, *seen, budget.depth, *met)
 
 
 def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 r"""By which rule a particle's column is laid into pixels, and what blocks of particles that follow it add.
 
-Flow: seen -> [rules] -> field.blocks.
+Flow: projection.seen -> [columns] -> blocks.
 
 A column along a ray is exact there, and says nothing of the rest of the pixel: a support smaller than a pixel is met by chance.
 A mean over a pixel is found by what the size of the support allows. *Shares* are differences of corner integrals, which keep
