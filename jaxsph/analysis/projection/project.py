@@ -4,9 +4,9 @@ Flow: particles, camera -> see -> lists of bundles -> sum_columns -> join -> [pr
 
 **Accuracy.** Rays are exact to 1e-5 of each particle's peak in float32 and 1e-13 in float64. A mean over a pixel is good to 1e-4
 of that peak where rays are parallel and no depth cuts the support, and mass in an image is kept to 1e-4, however small supports
-are: see `engine.field.columns`. Else it is that of 3 x 3 rays, good to 3e-4 for supports of at least 2 pixels. Of smaller ones two things are
-estimated, while their mass is kept: with perspective, by ellipses along the axes, how it is spread over pixels; and where a depth
-cuts them, as if the share behind it were the same in all pixels.
+are: see `engine.field.columns`. Else it is that of 3 x 3 rays, good to 3e-4 for supports of at least 2 pixels. Of smaller ones two
+things are estimated, while their mass is kept: with perspective, by ellipses along the axes, how it is spread over pixels; and
+where a depth cuts them, as if the share behind it were the same in all pixels.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def project(
             its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
         tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
-            lattices of fewer, by parallel rays. An estimate, see `engine.field.columns`; 0 interpolates nothing. A given `plan` has its own.
+            lattices of fewer, by parallel rays. An estimate, see `engine.field.columns`; 0 interpolates nothing. A `plan` has its own.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
         name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
         clock: that books the seconds of compiling and of casting apart; eager only.
