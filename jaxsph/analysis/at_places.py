@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -26,16 +25,16 @@ from jaxsph.engine.lengths import times
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
+from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, require_finite, require_real, require_shape
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
 from jaxsph.reference.where import columns_of
 
-BLOCK = 1 << 14
-"""Places that are looked at in one go: of liquids a million pairs of a place and a particle."""
-ALL_PAIRS = 1 << 18
-"""Pairs of a block where all are summed up: some MB of offsets."""
+BLOCK, MOST_PAIRS = 1 << 14, 1 << 22  # places that are looked at in one go, and how many pairs of these there may be or so
+FEW = 64  # places that tell how many there are
+ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
 
 
 class AtPlaces(NamedTuple):
@@ -64,6 +63,9 @@ class ParticleField:
     """Particles in float64, with every copy of a periodic set that reaches into its box; asked for places many times."""
 
     def __init__(self, particles: Particles) -> None:
+        for name, column in (columns := particles.to_numpy()).items():
+            require_finite(name, column)
+        checks.require_positive("support", columns["support"], "give the support radius H > 0 of every particle")
         self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
         self._kernel = kernels.by_name(particles.kernel)
 
@@ -78,18 +80,25 @@ class ParticleField:
         place = np.concatenate([np.zeros(0, int), *(np.asarray(one, int) for one in found if one)])
         return place, which, places[place] - self._position[which]
 
-    def blocks(self, places: Float[np.ndarray, "places 3"]) -> Iterator[tuple[slice, tuple[np.ndarray, ...]]]:
-        """Places with their pairs, of entries: padded, so that programs recur, with a place beyond all."""
-        for block in (slice(begin, begin + BLOCK) for begin in range(0, len(places), BLOCK)):
-            place, which, offset = self.pairs(places[block])
-            room = 0, capacity_class(len(place)) - len(place)
-            place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
-            yield block, (place, entry, np.pad(offset, (room, (0, 0))))
+    def padded(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same with entries, padded so that programs recur: with a place beyond all."""
+        place, which, offset = self.pairs(places)
+        room = 0, capacity_class(len(place)) - len(place)
+        place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
+        return place, entry, np.pad(offset, (room, (0, 0)))
+
+    def blocks(self, places: Float[np.ndarray, "places 3"]) -> list[slice]:
+        """Places that are looked at in one go: fewer where supports hold many of them, as some tell."""
+        some, size = places[:: len(places) // FEW + 1], BLOCK
+        if len(some) > 1:
+            number = scipy.spatial.cKDTree(some).query_ball_point(self._position, self._support, return_length=True).sum()
+            size = int(np.clip(MOST_PAIRS * len(some) // max(number, 1), 1, BLOCK))
+        return [slice(begin, begin + size) for begin in range(0, max(len(places), 1), size)]
 
     def at(self, places: Float[np.ndarray, "places 3"]) -> AtPlaces:
         """What is at places (P, 3), length units."""
-        blocks = [self._at(places[begin : begin + BLOCK]) for begin in range(0, max(len(places), 1), BLOCK)]
-        return AtPlaces(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
+        found = [self._at(places[block]) for block in self.blocks(places)]
+        return AtPlaces(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
     def _at(self, places: np.ndarray) -> AtPlaces:
         place, which, offset = self.pairs(places)
@@ -123,11 +132,11 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
         NaN, a sum 0.
 
     Differentiation:
-        By positions, supports, volumes, `of` and points; who is near is held fixed. Eagerly, derivatives included, a tree on the
-        host finds that. Where `jit` or `vmap` hide places, all pairs are summed up, in blocks.
+        By positions, supports, volumes, `of` and points; who is near is held fixed: a tree on the host finds that, eagerly under
+        `jax.grad`, too. Where `jit` or `vmap` hide places, all pairs are summed up, in blocks.
 
     Raises:
-        ValueError: points or numbers of another shape, or not finite; a unit that is none of lengths; sums beyond the dtype.
+        ValueError: another shape, what is not finite, a unit that is none of lengths, sums beyond the dtype.
 
     References:
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2; Price 2012, equation 6 (the sum).
@@ -143,25 +152,25 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
         if not is_traced(there):
             require_finite("points", there)
         is_known = len(points) > 0 and not is_traced(there, known)
+        there = np.asarray(there, np.float64) if is_known else there
         if is_known and particles.box is not None:
             lower, upper = known.box.corners()
-            there = lower + (np.asarray(there, np.float64) - lower) % (upper - lower)
+            there = lower + (there - lower) % (upper - lower)
         if not traced:
-            found = ParticleField(particles).at(np.asarray(there, np.float64))
-            return array_of(rounded(found.quantity if normalised else found.coverage, exponent, particles.dtype))
+            at = ParticleField(particles).at(there)
+            return array_of(rounded(at.quantity if normalised else at.coverage, exponent, particles.dtype))
         first = points.astype(particles.dtype)
         parts = first, (points - first).astype(particles.dtype)  # what is known has digits that only both hold
         digits = 0 if is_traced(known.support) else int(np.frexp(np.asarray(known.support).max())[1])
-        blocks: Any = ParticleField(known).blocks(np.asarray(there, np.float64)) if is_known else [(np.s_[:], None)]
+        field = ParticleField(known) if is_known else None
+        blocks = field.blocks(there) if field else [np.s_[:]]
         sums = functools.partial(_sums, particles, unit=np.asarray(2.0**digits, particles.dtype), normalised=normalised)
-        values = jnp.concatenate([sums(tuple(part[one] for part in parts), pairs) for one, pairs in blocks])
-        return times(values, exponent - (0 if normalised else 3 * digits))  # type: ignore[no-any-return]
+        found = [sums(tuple(part[one] for part in parts), field and field.padded(there[one])) for one in blocks]
+        return times(jnp.concatenate(found), exponent - (0 if normalised else 3 * digits))  # type: ignore[no-any-return]
 
 
 def carrying(particles: Particles, of: Any, normalised: bool) -> tuple[Particles, int]:
     """Particles that hold `of`, as quantity or, where sums are not normalised, as volume; over a power of two, whose exponent."""
-    for name, column in {} if is_traced(particles) else particles.to_numpy().items():
-        require_finite(name, column)
     name = "quantity" if normalised else "volume"
     held = held_by(particles, name if of is None else of, None)
     changed: dict[str, Any] = {name: held.amounts[:, 0]}
@@ -218,8 +227,8 @@ def _over_all(particles: Particles, points: tuple[Array, Array], table: Array) -
             offset = (offset - turns * sides) + (left - turns * left_of_sides)  # of those near the first difference is exact
             offsets = [offset, offset + jnp.where(offset < 0, sides, -sides)]
         squares = [(one / particles.support[:, None]) ** 2 for one in offsets]
-        ways = itertools.product(squares, repeat=3)
-        weight: Any = sum(kernel.of_square(x[..., 0] + y[..., 1] + z[..., 2], jnp) for x, y, z in ways)
+        square = (x[..., 0] + y[..., 1] + z[..., 2] for x, y, z in itertools.product(squares, repeat=3))
+        weight: Any = sum(kernel.of_square(one, jnp) for one in square)
         return jnp.matmul(weight, table, precision=lax.Precision.HIGHEST)
 
     return lax.map(block, blocks).reshape(-1, table.shape[1])[:count]  # type: ignore[no-any-return]

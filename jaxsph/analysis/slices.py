@@ -34,7 +34,7 @@ from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
-from jaxsph.reference.where import inside
+from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
 ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
@@ -66,11 +66,9 @@ class Slice:
 
     def positions(self) -> Float[np.ndarray, "height width 3"]:
         """Places of all values, float64, length units."""
-        columns, rows = np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5
-        right = (columns - self.camera.width / 2) * self.pixel_size
-        up = (self.camera.height / 2 - rows) * self.pixel_size
-        axes = np.asarray(self.camera.axes, np.float64)
-        return self.camera.exact_eye() + right[:, None] * axes[0] + up[:, None, None] * axes[1]
+        u, v = ray_coordinates(self.camera, np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5)
+        across, down = np.meshgrid(u, v)
+        return to_world(lines(across, down, False)[0], self.camera)
 
     def image(self, transfer: TransferFunction) -> Image:
         """A picture by the colours of a transfer function, opaque wherever there is a value."""

@@ -186,6 +186,18 @@ def test_particles_that_are_no_numbers_are_refused_and_not_left_out():
     broken = dataclasses.replace(particles, position=particles.position.at[3, 1].set(np.nan))
     with pytest.raises(ValueError, match=r"`position` must be finite, but 1 of 72 are not, first position\[3, 1\]"):
         js.sample(broken, points)
+    with pytest.raises(ValueError, match=r"`support` must be > 0, but support\[0\]"):
+        jax.grad(lambda support: js.sample(dataclasses.replace(particles, support=support), points).sum())(-particles.support)
+
+
+def test_of_supports_that_hold_many_places_few_are_looked_at_at_once(monkeypatch):
+    particles, points, _ = drawn(SIDES, np.float32)
+    field, whole = ParticleField(particles), ParticleField(particles).at(points)
+    monkeypatch.setattr(at_places, "MOST_PAIRS", 40)
+    blocks = field.blocks(points)
+    assert 1 < len(blocks) <= len(points)
+    np.testing.assert_array_equal(np.concatenate([points[block] for block in blocks]), points)
+    np.testing.assert_array_equal(field.at(points).coverage, whole.coverage)
 
 
 def test_points_in_another_unit_are_converted_and_those_that_cannot_be_are_refused():
