@@ -81,6 +81,10 @@ class ProjectionPlan:
         """That particles may follow."""
         return rules_of(kernel, perspective, self.pixel, self.levels)
 
+    def tolerance(self, kernel: str) -> float:
+        """What its lattices are off by, as a share of the peak of a particle of the least support."""
+        return float(f"{NESTED[kernel] * self.least**-3.5:.3g}")
+
     def see(self, run: Executor, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
         """What there is to be projected."""
         static: dict[str, Any] = {"pixel": self.pixel, "images": self.images, "through": self.through, "tuning": self.tuning}
@@ -177,8 +181,11 @@ def planned(given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, ru
         if some
     }
     while True:
-        lists = [(rule.name, _lists(one, rule.seen_by(camera), bands if rule.stride == 1 else 1)) for rule, one in counts.items()]
-        made = dataclasses.replace(bare, bands=bands, lists=tuple(sorted(lists)))
+        plain = _lists([one for rule, one in counts.items() if rule.stride == 1], camera, bands)  # one program sorts for all
+        nested = {rule: _lists([one], rule.seen_by(camera), 1) for rule, one in counts.items() if rule.stride > 1}
+        made = dataclasses.replace(
+            bare, bands=bands, lists=tuple(sorted((rule.name, nested.get(rule, plain)) for rule in counts))
+        )
         needed = _bytes(made, list(counts))
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
@@ -202,10 +209,11 @@ def _levels(particles: Particles, camera: Camera, tolerance: float) -> tuple[int
     return (min(int(math.log2(nodes)), MAX_LEVELS) if 1 < nodes < math.inf else 0), least
 
 
-def _lists(counted: tuple[np.ndarray, np.ndarray], camera: Camera, bands: int) -> ListPlan:
+def _lists(counts: list[tuple[np.ndarray, np.ndarray]], camera: Camera, bands: int) -> ListPlan:
+    """With room for the most of several."""
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
-    pairs = [fullest_band(counts, of_band) for counts in counted]
+    pairs = [max((fullest_band(one[k], of_band) for one in counts), default=0) for k in range(2)]
     return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
 
 

@@ -2,10 +2,10 @@ r"""Projections: integrals of what particles hold along rays, additive and not n
 
 Flow: particles, camera -> see -> lists of bundles -> sum_columns -> join -> [project] -> Projection.
 
-**Accuracy.** Rays are exact to 1e-5 of each particle's peak in float32 and 1e-13 in float64. A mean over a pixel is good to 1e-4
+**Accuracy.** Rays are exact to 1e-5 of each particle's peak in float32 and 1e-13 in float64. Means over pixels are good to 1e-4
 of that peak where rays are parallel and no depth cuts the support, and mass in an image is kept to 1e-4, however small supports
-are: see `engine.field.columns`. Else it is that of 3 x 3 rays, good to 3e-4 for supports of at least 2 pixels. Of smaller ones two
-things are estimated, while their mass is kept: with perspective, by ellipses along the axes, how it is spread over pixels; and
+are: see `engine.field.columns`. Else they are those of 3 x 3 rays, good to 3e-4 for supports of 2 pixels or more. Of smaller ones
+two things are estimated, while mass is kept: with perspective how it is spread over pixels, by ellipses along the axes; and
 where a depth cuts them, as if the share behind it were the same in all pixels.
 """
 
@@ -38,12 +38,15 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, is_traced, module_for, require_plan
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
 from jaxsph.numerics.version import __version__
+
+_FORETOLD: set[Any] = set()
+"""Kinds of projections whose programs have been compiled side by side."""
 
 
 def project(
@@ -58,7 +61,6 @@ def project(
     plan: ProjectionPlan | None = None,
     name: str | None = None,
     unit: str = "",
-    clock: Clock | None = None,
 ) -> Projection:
     r"""Integrate what particles hold along the rays of an image.
 
@@ -77,10 +79,9 @@ def project(
             its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
         tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
-            lattices of fewer, by parallel rays. An estimate, see `engine.field.columns`; 0 interpolates nothing. A `plan` has its own.
+            lattices of fewer, by parallel rays. An estimate, see `engine.field.columns`; 0 interpolates nothing. A plan has its.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
         name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
-        clock: that books the seconds of compiling and of casting apart; eager only.
 
     Returns:
         Values in the dtype of the particles, in units of `of`, over length squared without weight.
@@ -96,7 +97,24 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
+    what = of, weight, name, unit
+    return projected(Clock(), particles, camera, what, pixel=pixel, depth_range=depth_range, tolerance=tolerance, plan=plan)
+
+
+def projected(
+    run: Clock,
+    particles: Particles | Scene,
+    camera: Camera,
+    what: tuple[Any, Any, str | None, str],
+    *,
+    pixel: str = "mean",
+    depth_range: tuple[Any, Any] | None = None,
+    tolerance: float = 0.0,
+    plan: ProjectionPlan | None = None,
+) -> Projection:
+    """The same, given a clock that books the seconds of its stages; of what: `of`, `weight`, `name` and `unit`."""
     require_plan("plan", plan, ProjectionPlan, "plan_projection")
+    of, weight, name, unit = what
     with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
         particles, camera = particles_in(particles), fitting("camera", camera, Camera)
         camera = _between(camera, depth_range, particles)
@@ -105,20 +123,23 @@ def project(
         given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
         if plan is None and traced:
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
-        run, asked = clock or Clock(), plan is not None
-        plan = plan or planned(given, pixel, tolerance, memory_for(particles.support), run)
+        asked, plan = plan is not None, plan or planned(given, pixel, tolerance, memory_for(particles.support), run)
         plan.check(particles, camera, pixel)
+        kind = plan, particles.kernel, camera.is_perspective, held.amounts.shape
+        if not traced and kind not in _FORETOLD:
+            run.foresee(lambda forecast: _sums(given, plan, forecast))
+            _FORETOLD.add(kind)
         sums, word = _sums(given, plan, Traced() if traced else run)
         if not traced and int(word) & faults.OVERFLOWS and asked:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
             require_usable(particles)
             raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
-        named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
-        told |= {"jaxsph.tolerance": tolerance} if plan.levels else {}
+        told |= {"jaxsph.tolerance": plan.tolerance(particles.kernel)} if plan.levels else {}
         told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
         told |= {"jaxsph.cut": cut} if not traced and (cut := _cut(particles, camera, held)) else {}
+        named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
 
 
@@ -154,29 +175,30 @@ def _cut(particles: Particles, camera: Camera, held: Held) -> float:
     return float(amounts[beyond].sum() / (amounts.sum() or 1.0))
 
 
-def _image(sums: Float[Array, "height width channels"], held: Held, camera: Camera, digits: int) -> Projection:
+def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera, digits: int) -> Projection:
     """Amounts, or means of values, where lengths of the camera are in a unit that is `2 ** -digits` of what is meant."""
     area: Any = array_of((2 * module_for(camera).asarray(camera.half_height) / camera.height) ** 2)
     if digits and not camera.is_perspective:
         area = np.float64(area) * 4.0**-digits  # float32 may not hold it
-    values, weight = sums[..., 0], None
+    xp, (values, *weights) = at_hand(sums)
+    weight = None
     if held.is_mean:
-        weight = sums[..., 1]
-        values = jnp.where(weight > 0, ratio(values, weight), jnp.nan)
-        weight = times(weight, held.exponents[1] + 2 * digits)
+        (some,) = weights
+        values = xp.where(some > 0, ratio(values, some) if xp is jnp else values / np.where(some > 0, some, 1), xp.nan)
+        weight = array_of(times(some, held.exponents[1] + 2 * digits))
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
-    image = Projection(times(values, first), weight, area, camera.is_perspective)
+    image = Projection(array_of(times(values, first)), weight, area, camera.is_perspective)
     if digits:
         _require_held(image, sums)
     return image
 
 
-def _require_held(image: Projection, sums: Array) -> None:
+def _require_held(image: Projection, sums: list[Array]) -> None:
     """Raise where amounts over a length squared are no numbers of the dtype, though there are some."""
     amounts = {"values": image.values} if image.weight is None else {"weight": image.weight}
     for name, found in amounts.items():
-        largest = float(jnp.max(jnp.abs(found)))
-        if bool((sums[..., -1] != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
+        largest = float(np.max(np.abs(found)))
+        if bool((np.asarray(sums[-1]) != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
             what = "overflow" if largest else "underflow"
             raise ValueError(
                 f"`{name}` of the projection, amounts over a length squared, {what} {found.dtype}: give the amounts in "
@@ -186,17 +208,17 @@ def _require_held(image: Projection, sums: Array) -> None:
 
 def _sums(
     given: tuple[Any, ...], plan: ProjectionPlan, run: Executor
-) -> tuple[Float[Array, "height width channels"], Int[Array, ""]]:
+) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
     """Sums of all pixels, and the fault word."""
     seen = plan.see(run, *given)
     lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
-    followed = [(rule, lists[rule.name], one) for rule, one in zip(rules, seen.spheres, strict=True) if rule.name in lists]
+    each = zip(rules, seen.spheres, seen.cameras, strict=True)
+    followed = [(rule, lists[rule.name], *one) for rule, *one in each if rule.name in lists]
     missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.name not in lists]
 
     def draw(first_row: Array, nested: bool, height: int) -> tuple[Array, Array]:
         found, words, of_rules = [], [], [one for one in followed if (one[0].stride > 1) == nested]
-        for rule, sizes, spheres in of_rules:
-            camera = rule.seen_by(seen.camera)
+        for rule, sizes, spheres, camera in of_rules:
             made = run.with_host("grid", LISTS, (spheres, camera, first_row), lists=sizes, tuning=plan.tuning)
             shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
             inputs = [(seen.table(rule), made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
@@ -204,8 +226,8 @@ def _sums(
             found.append(tuple(run.each("cast", sum_columns, inputs, **static)))
             words.append(made.faults)
         static = {"height": height, "width": plan.width, "channels": given[1].shape[1], "tuning": plan.tuning}
-        static["rules"] = tuple((rule, sizes) for rule, sizes, _ in of_rules)
-        return run.one("image", join, (tuple(found), tuple(words), seen.camera), **static)  # type: ignore[no-any-return]
+        static["rules"] = tuple((rule, sizes) for rule, sizes, *_ in of_rules)
+        return run.one("image", join, (tuple(found), tuple(words), seen.cameras[0]), **static)  # type: ignore[no-any-return]
 
     band = functools.partial(draw, nested=False, height=plan.band_height)
     rows = [array_of(nth * plan.band_height, jnp.int32) for nth in range(plan.bands)]
@@ -286,10 +308,11 @@ def finish(
     *,
     height: int,
     tuning: Tuning,
-) -> tuple[Array, Array]:
-    """The image of its bands, and all faults; `missing`: whether anybody follows a rule that there is no room for."""
+) -> tuple[list[Array], Array]:
+    """The image of its bands, by channels, and all faults; `missing`: whether anybody follows a rule that there is no room for."""
     image = jnp.concatenate(bands)[:height]
     lost = functools.reduce(jnp.logical_or, missing, jnp.zeros((), bool))
     image = image if nested is None else image + nested
     word = functools.reduce(jnp.bitwise_or, words) | faults.raised(faults.LIST_OVERFLOW, lost)
-    return image if pixels is None else image * pixels[..., None], word
+    image = image if pixels is None else image * pixels[..., None]
+    return [image[..., k] for k in range(image.shape[-1])], word

@@ -40,7 +40,7 @@ class Seen:
         rays, shares: tables of particles, see `Rule`; None where no rule has shares.
         spheres: for each rule, with pixels for those that follow it alone.
         there: for each rule, whether any particle follows it, be it beside the picture.
-        camera: with the depths that rays begin and end at.
+        cameras: for each rule, with the depths that rays begin and end at.
         pixels: what share of each lies between the faces of a period; None where all does.
         faults: fault word.
     """
@@ -49,7 +49,7 @@ class Seen:
     shares: Float[Array, "particles columns"] | None
     spheres: tuple[Spheres, ...]
     there: tuple[Bool[Array, ""], ...]
-    camera: Camera
+    cameras: tuple[Camera, ...]
     pixels: Float[Array, "height width"] | None
     faults: Int[Array, ""]
 
@@ -93,15 +93,10 @@ def see(
     camera, pixels, crowded = jax.tree.map(lambda leaf: leaf.astype(dtype), camera), None, jnp.int32(faults.NONE)
     if images is None or particles.box is None:
         particles = particles.wrapped()
-    else:  # of a periodic set what its box holds
-        box, beyond = particles.box, BESIDE_FACES * jnp.where(doubt > 0, particles.box.sides.min(), 0)
-        inside, pixels = between_faces(camera, box, pixel)
-        particles, source, crowded = with_sources(particles, images, beyond, through)
+    else:
+        beyond = BESIDE_FACES * jnp.where(doubt > 0, particles.box.sides.min(), 0)
+        particles, source, camera, pixels, crowded = _in_box(particles, camera, beyond, pixel, images, through)
         amounts = amounts[source]
-        if through is not None:
-            crowded |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, box, through))
-            inside = past_faces(camera, box)
-        camera = inside
     offset = camera.offset(particles.position, particles.position_rest)
     view, distance = camera.rotate(offset), lax.stop_gradient(jnp.abs(offset).max(1))
     usable = jnp.isfinite(view).all(1) & (particles.support > 0) & jnp.isfinite(particles.support)
@@ -117,15 +112,28 @@ def see(
     followed = _followed(rules, z, reach, still, off, least)
     small = followed.get(SHARES, jnp.zeros_like(live))
     wanted = [live & followed[rule.name] for rule in rules]
-    margin = ROUNDING * (1 + doubt.astype(dtype))
+    margin, cameras = ROUNDING * (1 + doubt.astype(dtype)), tuple(rule.seen_by(camera) for rule in rules)
     spheres = tuple(
-        _spheres((x, y, z), reach, distance, one, rule.seen_by(still), rule.beside, margin)
-        for rule, one in zip(rules, wanted, strict=True)
+        _spheres((x, y, z), reach, distance, one, lax.stop_gradient(own), rule.beside, margin)
+        for rule, own, one in zip(rules, cameras, wanted, strict=True)
     )
     inverse = 1 / support[:, None]
     rays = jnp.concatenate([view, inverse, amounts * inverse * inverse], 1)
     shares = _shares_table(view, support, small, amounts, camera, rules[0].kernel) if rules[0].kind == SHARES else None
-    return Seen(rays, shares, spheres, tuple(one.any() for one in wanted), camera, pixels, word)
+    return Seen(rays, shares, spheres, tuple(one.any() for one in wanted), cameras, pixels, word)
+
+
+def _in_box(
+    particles: Particles, camera: Camera, beyond: Array, pixel: str, images: int, through: int | None
+) -> tuple[Particles, Array, Camera, Array, Array]:
+    """Of a periodic set what its box holds, with images, which particle each is, and what the camera sees of it; faults."""
+    assert particles.box is not None
+    inside, pixels = between_faces(camera, particles.box, pixel)
+    found, source, word = with_sources(particles, images, beyond, through)
+    if through is not None:
+        word |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, particles.box, through))
+        inside = past_faces(camera, particles.box)
+    return found, source, inside, pixels, word
 
 
 def _followed(

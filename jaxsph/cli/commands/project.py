@@ -16,7 +16,7 @@ from cyclopts import Parameter
 
 from jaxsph import io
 from jaxsph.analysis.projection.plan import PIXELS
-from jaxsph.analysis.projection.project import project as projected
+from jaxsph.analysis.projection.project import projected
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, require_writable, say_notes, span, wrong_usage
@@ -79,6 +79,10 @@ class Project(groups.Options, groups.Selection, groups.View):
     pixel: Annotated[
         str, option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays")
     ] = PIXELS[0]
+    tolerance: Annotated[
+        float,
+        option("--tolerance", "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"),
+    ] = 0.0
     annotate: Annotated[bool, flag("--annotate", OUTPUT, "of a .png: with a colour bar, and the name of what it shows")] = False
     arrows: Annotated[
         str | None,
@@ -120,7 +124,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     camera = _camera(particles, table, options)
     say("camera", camera.describe())
     clock, started = Clock(), time.perf_counter()
-    image = projected(particles, camera, of, weight, pixel=options.pixel, name=name, unit=columns.unit(options), clock=clock)
+    named = of, weight, name, columns.unit(options)
+    image = projected(clock, particles, camera, named, pixel=options.pixel, tolerance=options.tolerance)
     took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
     seconds = {"plan": time.perf_counter() - started - sum(took.values()), **took}
     _save(image, columns, camera, options, output)
@@ -133,6 +138,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         total = float(image.total())
         say("total", f"{total:.7g} in the image, of {float(np.sum(of)):.7g}")
         voice.report(total=total, of_all=float(np.sum(of)))
+    if (off := dict(image.metadata).get("jaxsph.tolerance")) is not None:
+        say("tolerance", f"wide supports are interpolated, to some {off:.2g} of each one's peak")
     say("time", f"{sum(seconds.values()):.2f} s: " + ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items()))
     lowest, highest = (float(said.min()), float(said.max())) if said.size else (None, None)
     voice.written(output, name=name, lowest=lowest, highest=highest, camera=camera.describe(), seconds=seconds)
@@ -221,7 +228,10 @@ class _Columns:
         coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
         parts = self.table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
-        right, up = (np.asarray(projected(self._particles, coarse, part, weight).values) * labels.factor for part in parts.T)
+        right, up = (
+            np.asarray(projected(Clock(), self._particles, coarse, (part, weight, None, "")).values) * labels.factor
+            for part in parts.T
+        )
         return right, up, name, labels.unit
 
     def _summed(self, weighed: bool = True) -> np.ndarray:
