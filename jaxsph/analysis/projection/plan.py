@@ -67,15 +67,9 @@ class ProjectionPlan:
             raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {self.pixel!r}")
 
     @property
-    def tile_rows(self) -> int:
-        """Of a band."""
-        rows = -(-self.height // TILE)
-        return -(-rows // self.bands)
-
-    @property
     def band_height(self) -> int:
         """Pixel rows of a band."""
-        return self.tile_rows * TILE
+        return -(-self.height // (TILE * self.bands)) * TILE
 
     def rules(self, kernel: str, perspective: bool) -> tuple[Rule, ...]:
         """That particles may follow."""
@@ -108,9 +102,7 @@ class ProjectionPlan:
     def check(self, particles: Particles, camera: Camera, pixel: str) -> None:
         """Raise `ValueError` where the plan is for other shapes than those given."""
         if self.images is not None and particles.box is None:
-            raise ValueError(
-                "`plan` was made for particles with a periodic box, and these have none; make one with `plan_projection`"
-            )
+            raise ValueError("`plan` was made for a periodic box, and these have none; make one with `plan_projection`")
         given = {
             "camera.width": (camera.width, self.width),
             "camera.height": (camera.height, self.height),
@@ -145,8 +137,7 @@ def plan_projection(
 
     Args:
         particles, camera, pixel, tolerance: as for `jaxsph.project`.
-        like: a plan to grow: returned as it is where it has room, else with more; so that one plan, and what is compiled for it,
-            serves all frames of a sequence.
+        like: a plan to grow: returned as it is where it has room, else with more; so that one serves all frames of a sequence.
         memory_limit: bytes of working memory; default 4 GiB, or half of an accelerator's.
 
     Raises:
@@ -170,26 +161,20 @@ def planned(given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, ru
         axis = int(np.argmax(np.abs(np.asarray(camera.axes)[2])))
         through = axis if bool(runs_through(camera, particles.box, axis)) else None
         images = capacity_class(num_ghosts(particles, BESIDE_FACES * float(particles.box.sides.min()), through))
-    bare = ProjectionPlan(
-        *size, pixel, 1, (), tuning_for(particles.support), images, through, *_levels(particles, camera, tolerance)
-    )
+    nested = _levels(particles, camera, tolerance)
+    bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through, *nested)
     seen = bare.see(run, particles, amounts, camera, DOUBT)
-    rules = bare.rules(particles.kernel, camera.is_perspective)
-    counts = {
-        rule: pairs_in_view(one, rule.seen_by(camera))[2:]
-        for rule, one, some in zip(rules, seen.spheres, seen.there, strict=True)
-        if some
-    }
+    each = zip(bare.rules(particles.kernel, camera.is_perspective), seen.spheres, seen.there, strict=True)
+    counts = {rule: pairs_in_view(one, rule.seen_by(camera))[2:] for rule, one, some in each if some}
     while True:
         plain = _lists([one for rule, one in counts.items() if rule.stride == 1], camera, bands)  # one program sorts for all
-        nested = {rule: _lists([one], rule.seen_by(camera), 1) for rule, one in counts.items() if rule.stride > 1}
-        made = dataclasses.replace(
-            bare, bands=bands, lists=tuple(sorted((rule.name, nested.get(rule, plain)) for rule in counts))
-        )
+        coarse = {rule: _lists([one], rule.seen_by(camera), 1) for rule, one in counts.items() if rule.stride > 1}
+        lists = tuple(sorted((rule.name, coarse.get(rule, plain)) for rule in counts))
+        made = dataclasses.replace(bare, bands=bands, lists=lists)
         needed = _bytes(made, list(counts))
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
-        if made.tile_rows == 1:
+        if made.band_height == TILE:
             raise ValueError(
                 f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes; "
                 "raise the limit, or project fewer particles or pixels"

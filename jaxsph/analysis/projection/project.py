@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.analysis.projection.plan import ProjectionPlan, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
-from jaxsph.engine.field.columns import Rule
+from jaxsph.engine.field.columns import SHARES, Rule
 from jaxsph.engine.frame.frame import LISTS
 from jaxsph.engine.frame.stages import stage
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
@@ -45,8 +45,7 @@ from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
 from jaxsph.numerics.version import __version__
 
-_FORETOLD: set[Any] = set()
-"""Kinds of projections whose programs have been compiled side by side."""
+_FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side
 
 
 def project(
@@ -125,8 +124,7 @@ def projected(
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
         asked, plan = plan is not None, plan or planned(given, pixel, tolerance, memory_for(particles.support), run)
         plan.check(particles, camera, pixel)
-        kind = plan, particles.kernel, camera.is_perspective, held.amounts.shape
-        if not traced and kind not in _FORETOLD:
+        if not traced and (kind := (plan, particles.kernel, camera.is_perspective, held.amounts.shape)) not in _FORETOLD:
             run.foresee(lambda forecast: _sums(given, plan, forecast))
             _FORETOLD.add(kind)
         sums, word = _sums(given, plan, Traced() if traced else run)
@@ -188,22 +186,13 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
         weight = array_of(times(some, held.exponents[1] + 2 * digits))
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
     image = Projection(array_of(times(values, first)), weight, area, camera.is_perspective)
-    if digits:
-        _require_held(image, sums)
-    return image
-
-
-def _require_held(image: Projection, sums: list[Array]) -> None:
-    """Raise where amounts over a length squared are no numbers of the dtype, though there are some."""
-    amounts = {"values": image.values} if image.weight is None else {"weight": image.weight}
-    for name, found in amounts.items():
+    if digits:  # of lengths so far from 1, amounts over their square may be no numbers of the dtype
+        what, found = ("values", image.values) if weight is None else ("weight", weight)
         largest = float(np.max(np.abs(found)))
         if bool((np.asarray(sums[-1]) != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
-            what = "overflow" if largest else "underflow"
-            raise ValueError(
-                f"`{name}` of the projection, amounts over a length squared, {what} {found.dtype}: give the amounts in "
-                "another unit, or positions, supports and camera in a larger or smaller one"
-            )
+            beyond = f"{'overflow' if largest else 'underflow'} {found.dtype}: give the amounts in another unit, or all lengths"
+            raise ValueError(f"`{what}` of the projection, amounts over a length squared, {beyond}")
+    return image
 
 
 def _sums(
@@ -213,7 +202,7 @@ def _sums(
     seen = plan.see(run, *given)
     lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
     each = zip(rules, seen.spheres, seen.cameras, strict=True)
-    followed = [(rule, lists[rule.name], *one) for rule, *one in each if rule.name in lists]
+    followed = [(rule, lists[rule.name], spheres, camera) for rule, spheres, camera in each if rule.name in lists]
     missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.name not in lists]
 
     def draw(first_row: Array, nested: bool, height: int) -> tuple[Array, Array]:
@@ -221,7 +210,8 @@ def _sums(
         for rule, sizes, spheres, camera in of_rules:
             made = run.with_host("grid", LISTS, (spheres, camera, first_row), lists=sizes, tuning=plan.tuning)
             shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
-            inputs = [(seen.table(rule), made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
+            table = seen.shares if rule.kind == SHARES else seen.rays
+            inputs = [(table, made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
             static: dict[str, Any] = {"rule": rule, "lists": sizes, "shards": shards, "tuning": plan.tuning}
             found.append(tuple(run.each("cast", sum_columns, inputs, **static)))
             words.append(made.faults)
@@ -240,13 +230,6 @@ def _sums(
     return run.one("image", finish, drawn, height=plan.height, tuning=plan.tuning)  # type: ignore[no-any-return]
 
 
-class Summed(NamedTuple):
-    """Sums of some bundles, and which these are; past the last none."""
-
-    bundle: Int[Array, " bundles"]
-    sums: list[Float[Array, "down across bundles"]]
-
-
 @stage("rule", "lists", "shards", widely=True)
 def sum_columns(
     table: Float[Array, "particles columns"],
@@ -259,8 +242,8 @@ def sum_columns(
     lists: ListPlan,
     shards: int,
     tuning: Tuning,
-) -> Summed:
-    """The `nth` of `shards` of a band: bundles in order of how many particles their lists hold, dealt out like cards."""
+) -> tuple[Int[Array, " bundles"], list[Float[Array, "down across bundles"]]]:
+    """The `nth` of `shards` of a band: bundles, the longest lists first, dealt out like cards; past the last none."""
     bundles, length = lists.num_bundles, made.end - made.start
     chunk = min(rule.chunk(tuning.samples_at_once), -(-bundles // shards))
     room = -(-bundles // (chunk * shards)) * chunk * shards
@@ -272,12 +255,12 @@ def sum_columns(
     at = jnp.asarray(rule.places, camera.dtype)
     each = camera.column(column[safe][:, None] + at[:, None]), camera.row(row[safe][:, None] + at[:, None])
     sums = over_blocks(rule, Given(table, each, jnp.stack([camera.near, camera.far])), windows)
-    return Summed(mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums])
+    return mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums]
 
 
 @stage("height", "width", "channels", "rules", quickly=True)
 def join(
-    found: tuple[tuple[Summed, ...], ...],
+    found: tuple[tuple[Any, ...], ...],
     words: tuple[Int[Array, ""], ...],
     camera: Camera,
     *,
@@ -290,9 +273,9 @@ def join(
     """A band of the image, of all rules and shards; and its fault word."""
     image = [jnp.zeros((height, width), camera.dtype) for _ in range(channels)]
     for (rule, lists), shards in zip(rules, found, strict=True):
-        bundle = jnp.concatenate([shard.bundle for shard in shards])
+        bundle = jnp.concatenate([bundles for bundles, _ in shards])
         for k in range(channels):
-            pixels = rule.pixels_of(jnp.concatenate([shard.sums[k] for shard in shards], -1))
+            pixels = rule.pixels_of(jnp.concatenate([sums[k] for _, sums in shards], -1))
             placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].set(jnp.moveaxis(pixels, -1, 0))
             image[k] += rule.interpolated(lists.as_image(placed[:-1]), height, width)
     return jnp.stack(image, -1), functools.reduce(jnp.bitwise_or, words, jnp.int32(faults.NONE))
@@ -309,7 +292,7 @@ def finish(
     height: int,
     tuning: Tuning,
 ) -> tuple[list[Array], Array]:
-    """The image of its bands, by channels, and all faults; `missing`: whether anybody follows a rule that there is no room for."""
+    """The image of its bands, by channels, and all faults; `missing`: whether anybody follows a rule without room."""
     image = jnp.concatenate(bands)[:height]
     lost = functools.reduce(jnp.logical_or, missing, jnp.zeros((), bool))
     image = image if nested is None else image + nested

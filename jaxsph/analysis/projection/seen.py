@@ -53,10 +53,6 @@ class Seen:
     pixels: Float[Array, "height width"] | None
     faults: Int[Array, ""]
 
-    def table(self, rule: Rule) -> Float[Array, "particles columns"]:
-        """That rules of its kind read."""
-        return self.shares if rule.kind == SHARES and self.shares is not None else self.rays
-
 
 @stage("rules", "pixel", "images", "through", "least", quickly=True)
 def see(
@@ -74,17 +70,10 @@ def see(
 ) -> Seen:
     """Particles as seen by a camera.
 
-    Args:
-        particles: in world space.
-        amounts: that they hold.
-        camera: that sees them.
-        doubt: times what rounding may be off by, within which a decision is left open: what may be live is, and what may follow
-            either of two rules follows both. Theorem: with 2 or more, there are at least the pixels that any other program finds
-            with 0: each is off by less than `ROUNDING` eps of what enters, which margins hold once for itself, and `doubt` times
-            more. Programs round differently, and whole layers of a lattice lie on the border of a decision.
-        rules: that they may follow.
-        pixel, images, through, least: see `ProjectionPlan`.
-        tuning: for the machine.
+    Within `doubt` times what rounding may be off by, decisions are open: what may be live is, and what may follow either of two
+    rules follows both. Theorem: with 2 or more, there are at least the pixels that any other program finds with 0. Each is off by
+    less than `ROUNDING` eps of what enters, which margins hold once for itself, and `doubt` times more. Programs round otherwise,
+    and whole layers of a lattice lie on the border of a decision. For other arguments see `ProjectionPlan`.
 
     Differentiation:
         Tables have derivatives; which rule a particle follows, and which pixels it can touch, is held fixed.

@@ -90,7 +90,7 @@ def test_a_plan_for_a_periodic_set_grows_and_is_for_periodic_sets():
     small, large = (plan_projection(particles, camera) for particles in (few, many))
     grown = plan_projection(many, camera, like=small)
     assert grown.images == large.images > small.images and plan_projection(few, camera, like=grown) == grown
-    with pytest.raises(ValueError, match="a periodic box, and these have none"):
+    with pytest.raises(ValueError, match="for a periodic box, and these have none"):
         js.project(dataclasses.replace(many, box=None), camera, plan=grown)
     with pytest.raises(js.CapacityError):
         js.project(many, camera, plan=dataclasses.replace(large, images=3))
