@@ -17,7 +17,7 @@ from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.field.columns import NESTED, PIXELS, Rule, rules_of
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.planning.measures import pairs_in_view
-from jaxsph.engine.planning.plan import MAX_CAPACITY, fullest_band
+from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
 from jaxsph.engine.runtime.executors import Clock, Executor
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
@@ -148,12 +148,24 @@ def plan_projection(
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)
-    made = planned(given, pixel, tolerance, memory, Clock())
+    made = planned(given, pixel, tolerance, memory, Clock(), ())
     return made if like is None else like.grown(made)
 
 
-def planned(given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Clock) -> ProjectionPlan:
-    """The plan of particles, amounts and a camera, with as few bands as the limit allows."""
+def in_common(given: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Particles and amounts in arrays as long as those of most files are made, which so share programs."""
+    particles, amounts, camera = given
+    room = max(min(tuning_for(particles.support).common_particles, default=0) - particles.capacity, 0)
+    if room == 0:
+        return given
+    padded = array_of(np.pad(np.asarray(amounts), ((0, room), (0, 0))))
+    return particles.padded(particles.capacity + room), padded, camera
+
+
+def planned(
+    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Clock, rooms: tuple[int, ...]
+) -> ProjectionPlan:
+    """The plan of particles, amounts and a camera, with as few bands as the limit allows; with `rooms` for pairs if it does."""
     particles, amounts, camera = given
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
     images = through = None
@@ -167,19 +179,21 @@ def planned(given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, ru
     each = zip(bare.rules(particles.kernel, camera.is_perspective), seen.spheres, seen.there, strict=True)
     counts = {rule: pairs_in_view(one, rule.seen_by(camera))[2:] for rule, one, some in each if some}
     while True:
-        plain = _lists([one for rule, one in counts.items() if rule.stride == 1], camera, bands)  # one program sorts for all
-        coarse = {rule: _lists([one], rule.seen_by(camera), 1) for rule, one in counts.items() if rule.stride > 1}
+        plain = _lists(
+            [one for rule, one in counts.items() if rule.stride == 1], camera, bands, rooms
+        )  # one program sorts for all
+        coarse = {rule: _lists([one], rule.seen_by(camera), 1, rooms) for rule, one in counts.items() if rule.stride > 1}
         lists = tuple(sorted((rule.name, coarse.get(rule, plain)) for rule in counts))
         made = dataclasses.replace(bare, bands=bands, lists=lists)
         needed = _bytes(made, list(counts))
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
-        if made.band_height == TILE:
+        if made.band_height == TILE and not rooms:
             raise ValueError(
                 f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes; "
                 "raise the limit, or project fewer particles or pixels"
             )
-        bands = min(2 * bands, rows)
+        bands, rooms = min(2 * bands, rows) if not rooms else bands, ()
 
 
 def _levels(particles: Particles, camera: Camera, tolerance: float) -> tuple[int, float]:
@@ -194,12 +208,13 @@ def _levels(particles: Particles, camera: Camera, tolerance: float) -> tuple[int
     return (min(int(math.log2(nodes)), MAX_LEVELS) if 1 < nodes < math.inf else 0), least
 
 
-def _lists(counts: list[tuple[np.ndarray, np.ndarray]], camera: Camera, bands: int) -> ListPlan:
+def _lists(counts: list[tuple[np.ndarray, np.ndarray]], camera: Camera, bands: int, rooms: tuple[int, ...]) -> ListPlan:
     """With room for the most of several."""
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     of_band = -(-rows // bands)
     pairs = [max((fullest_band(one[k], of_band) for one in counts), default=0) for k in range(2)]
-    return ListPlan(of_band, columns, capacity_class(pairs[0]), capacity_class(pairs[1]), 1)
+    tiles, bundles = (common_class(most, rooms) if rooms else capacity_class(most) for most in pairs)
+    return ListPlan(of_band, columns, tiles, bundles, 1)
 
 
 def _bytes(plan: ProjectionPlan, rules: list[Rule]) -> int:

@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.analysis.projection.plan import ProjectionPlan, particles_in, planned
+from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.field.columns import SHARES, Rule
@@ -29,7 +30,7 @@ from jaxsph.engine.frame.frame import LISTS
 from jaxsph.engine.frame.stages import stage
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.runtime.executors import Clock, Executor, Traced
-from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for
+from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -122,9 +123,12 @@ def projected(
         given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
         if plan is None and traced:
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
-        asked, plan = plan is not None, plan or planned(given, pixel, tolerance, memory_for(particles.support), run)
-        plan.check(particles, camera, pixel)
-        if not traced and (kind := (plan, particles.kernel, camera.is_perspective, held.amounts.shape)) not in _FORETOLD:
+        asked, machine = plan is not None, particles.support
+        if plan is None:
+            given = in_common(given)
+            plan = planned(given, pixel, tolerance, memory_for(machine), run, tuning_for(machine).common_pairs)
+        plan.check(given[0], camera, pixel)
+        if not traced and (kind := (plan, particles.kernel, camera.is_perspective, given[1].shape)) not in _FORETOLD:
             run.foresee(lambda forecast: _sums(given, plan, forecast))
             _FORETOLD.add(kind)
         sums, word = _sums(given, plan, Traced() if traced else run)
@@ -205,29 +209,28 @@ def _sums(
     followed = [(rule, lists[rule.name], spheres, camera) for rule, spheres, camera in each if rule.name in lists]
     missing = [there for rule, there in zip(rules, seen.there, strict=True) if rule.name not in lists]
 
-    def draw(first_row: Array, nested: bool, height: int) -> tuple[Array, Array]:
-        found, words, of_rules = [], [], [one for one in followed if (one[0].stride > 1) == nested]
-        for rule, sizes, spheres, camera in of_rules:
+    def draw(first_row: Array, nested: bool = False) -> list[tuple[Any, ...]]:
+        found = []
+        for rule, sizes, spheres, camera in followed:
+            if (rule.stride > 1) != nested:
+                continue
             made = run.with_host("grid", LISTS, (spheres, camera, first_row), lists=sizes, tuning=plan.tuning)
             shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
             table = seen.shares if rule.kind == SHARES else seen.rays
             inputs = [(table, made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
             static: dict[str, Any] = {"rule": rule, "lists": sizes, "shards": shards, "tuning": plan.tuning}
-            found.append(tuple(run.each("cast", sum_columns, inputs, **static)))
-            words.append(made.faults)
-        static = {"height": height, "width": plan.width, "channels": given[1].shape[1], "tuning": plan.tuning}
-        static["rules"] = tuple((rule, sizes) for rule, sizes, *_ in of_rules)
-        return run.one("image", join, (tuple(found), tuple(words), seen.cameras[0]), **static)  # type: ignore[no-any-return]
+            found.append((run.each("cast", sum_columns, inputs, **static), made.faults))
+        return found
 
-    band = functools.partial(draw, nested=False, height=plan.band_height)
     rows = [array_of(nth * plan.band_height, jnp.int32) for nth in range(plan.bands)]
     if plan.bands > 1 and isinstance(run, Traced):
-        images, words = map(list, lax.map(jax.checkpoint(band, prevent_cse=False), jnp.stack(rows)))
+        drawn = lax.map(jax.checkpoint(draw, prevent_cse=False), jnp.stack(rows))
+        bands = [jax.tree.map(operator.itemgetter(nth), drawn) for nth in range(plan.bands)]
     else:
-        images, words = map(list, zip(*map(band, rows), strict=True))
-    wide, word = draw(rows[0], True, plan.height) if plan.levels else (None, seen.faults)
-    drawn = tuple(images), (*words, word, seen.faults), tuple(missing), wide, seen.pixels
-    return run.one("image", finish, drawn, height=plan.height, tuning=plan.tuning)  # type: ignore[no-any-return]
+        bands = list(map(draw, rows))
+    found = bands, draw(rows[0], True), missing, seen.pixels, seen.faults, seen.cameras[0]
+    static = {"of_rules": tuple((rule, sizes) for rule, sizes, *_ in followed), "channels": given[1].shape[1]}
+    return run.one("image", join, found, band_height=plan.band_height, tuning=plan.tuning, **static)  # type: ignore[no-any-return]
 
 
 @stage("rule", "lists", "shards", widely=True)
@@ -258,44 +261,37 @@ def sum_columns(
     return mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums]
 
 
-@stage("height", "width", "channels", "rules", quickly=True)
+@stage("of_rules", "channels", "band_height", quickly=True)
 def join(
-    found: tuple[tuple[Any, ...], ...],
-    words: tuple[Int[Array, ""], ...],
+    bands: list[list[Any]],
+    nested: list[Any],
+    missing: list[Bool[Array, ""]],
+    pixels: Float[Array, "height width"] | None,
+    word: Int[Array, ""],
     camera: Camera,
     *,
-    height: int,
-    width: int,
+    of_rules: tuple[tuple[Rule, ListPlan], ...],
     channels: int,
-    rules: tuple[tuple[Rule, ListPlan], ...],
+    band_height: int,
     tuning: Tuning,
-) -> tuple[Float[Array, "height width channels"], Int[Array, ""]]:
-    """A band of the image, of all rules and shards; and its fault word."""
-    image = [jnp.zeros((height, width), camera.dtype) for _ in range(channels)]
-    for (rule, lists), shards in zip(rules, found, strict=True):
-        bundle = jnp.concatenate([bundles for bundles, _ in shards])
-        for k in range(channels):
+) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
+    """The image of what `sum_columns` has of all bands, rules and shards, by channels; and all faults.
+
+    `missing`: whether anybody follows a rule without room.
+    """
+
+    def image(found: list[Any], stride: bool, height: int, k: int) -> Array:
+        total = jnp.zeros((height, camera.width), camera.dtype)
+        for (rule, lists), (shards, _) in zip([one for one in of_rules if (one[0].stride > 1) == stride], found, strict=True):
             pixels = rule.pixels_of(jnp.concatenate([sums[k] for _, sums in shards], -1))
+            bundle = jnp.concatenate([bundles for bundles, _ in shards])
             placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].set(jnp.moveaxis(pixels, -1, 0))
-            image[k] += rule.interpolated(lists.as_image(placed[:-1]), height, width)
-    return jnp.stack(image, -1), functools.reduce(jnp.bitwise_or, words, jnp.int32(faults.NONE))
+            total += rule.interpolated(lists.as_image(placed[:-1]), height, camera.width)
+        return total
 
-
-@stage("height", quickly=True)
-def finish(
-    bands: tuple[Array, ...],
-    words: tuple[Array, ...],
-    missing: tuple[Array, ...],
-    nested: Array | None,
-    pixels: Array | None,
-    *,
-    height: int,
-    tuning: Tuning,
-) -> tuple[list[Array], Array]:
-    """The image of its bands, by channels, and all faults; `missing`: whether anybody follows a rule without room."""
-    image = jnp.concatenate(bands)[:height]
+    of_bands = [jnp.concatenate([image(one, False, band_height, k) for one in bands])[: camera.height] for k in range(channels)]
+    images = [plain + image(nested, True, camera.height, k) if nested else plain for k, plain in enumerate(of_bands)]
+    words = [fault for found in (*bands, nested) for _, fault in found]
     lost = functools.reduce(jnp.logical_or, missing, jnp.zeros((), bool))
-    image = image if nested is None else image + nested
-    word = functools.reduce(jnp.bitwise_or, words) | faults.raised(faults.LIST_OVERFLOW, lost)
-    image = image if pixels is None else image * pixels[..., None]
-    return [image[..., k] for k in range(image.shape[-1])], word
+    word = functools.reduce(jnp.bitwise_or, words, word) | faults.raised(faults.LIST_OVERFLOW, lost)
+    return images if pixels is None else [one * pixels for one in images], word

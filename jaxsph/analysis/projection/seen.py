@@ -176,7 +176,8 @@ def _shares_table(view: Array, support: Array, small: Array, amounts: Array, cam
     """
     x, y, z = view.T
     inverse, pixel = 1 / support, 2 * camera.half_height / camera.height
-    inside = depth_share(kernel, (camera.near - z) * inverse, (camera.far - z) * inverse)
+    ends = (camera.near - z) * inverse, (camera.far - z) * inverse
+    inside = jnp.where((ends[0] <= -1) & (ends[1] >= 1), 1, depth_share(kernel, *ends))
     wide, high, area = inverse, inverse, pixel
     if camera.is_perspective:
         z = jnp.where(small, z, 1)

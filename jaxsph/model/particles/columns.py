@@ -303,10 +303,11 @@ def side_shares(
     """
     at = jnp.clip(edges, -1, 1)[:, None]
     double = 4 * at * at - 2
-    last = before = jnp.zeros_like(at)
-    for row in shares_of(name).polynomials[::-1].astype(at.dtype):  # Clenshaw's recurrence
-        last, before = row[:, None, None] + double * last - before, last
-    values = at * (last - before)
+    odd = [at, at * (double - 1)]
+    for _ in range(TERMS - 2):
+        odd.append(double * odd[-1] - odd[-2])  # T_(n+2) = 2 T_2 T_n - T_(n-2), exactly 1 at the edge of a support
+    rows = shares_of(name).polynomials.astype(at.dtype)
+    values = functools.reduce(jnp.add, [row[:, None, None] * term for row, term in zip(rows[::-1], odd[::-1], strict=True)])
     nearest = jnp.maximum(jnp.maximum(edges[:, :-1], -edges[:, 1:]), 0)
     return values[:, :, 1:] - values[:, :, :-1], nearest**2
 
