@@ -21,9 +21,8 @@ from jaxsph.engine.frame.refinement import refined
 from jaxsph.engine.planning.fit import PLANS, see, seen_by
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request, along_rays, as_asked
-from jaxsph.engine.runtime.device_executors import OnDevices
 from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
-from jaxsph.engine.runtime.executors import Clock, Traced
+from jaxsph.engine.runtime.executors import Clock, OnDevices, Traced
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths

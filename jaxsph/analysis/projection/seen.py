@@ -14,8 +14,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.footprint import pixel_ranges
-from jaxsph.engine.access.lists import Spheres
 from jaxsph.engine.access.resolution import ROUNDING, unresolved
+from jaxsph.engine.access.view import Spheres
 from jaxsph.engine.field.columns import CUT, LARGE, SHARES, SMALL, SMOOTH, Rule
 from jaxsph.engine.frame.stages import stage
 from jaxsph.engine.planning.viewing import camera_usable

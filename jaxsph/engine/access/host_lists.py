@@ -29,15 +29,12 @@ from jaxsph.engine.access.lists import (
     BundleLists,
     ListPlan,
     Ranges,
-    Sphere,
-    Spheres,
     bundle_ranges,
     children_mask,
     on_nodes,
     touched_bundles,
 )
-from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.view import Viewed
+from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
@@ -146,7 +143,7 @@ class _Pairs(NamedTuple):
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames="lists")
-def find_sides(ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
+def find_sides(ordered: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
     """What all particles of a band are picked by."""
     ranges, kind = bundle_ranges(on_nodes(ordered, camera), lists, first_row), _small(lists)
     nowhere = (ranges.right <= ranges.left) | (ranges.bottom <= ranges.top)
@@ -182,7 +179,7 @@ def find_touched(
         sides = [(word >> (bits * nth)) & ((1 << bits) - 1) for word in words for nth in range(4 // len(words))]
         ranges = Ranges(*(side.astype(jnp.int32) for side in sides))
         places = down.astype(jnp.int32), across.astype(jnp.int32)
-        return children_mask(touched_bundles(Sphere(*sphere.T), ranges, camera, first_row, *places))
+        return children_mask(touched_bundles(sphere.T, ranges, camera, first_row, *places))
 
     # apart from each other the two vectorise: together they take four times as long
     found: Array = fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))

@@ -14,17 +14,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Int, Shaped
 
 from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.footprint import side_distances, touches
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Spheres
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
@@ -98,20 +98,6 @@ class BundleLists:
     faults: Int[Array, ""]
 
 
-@tree()
-class Spheres:
-    """Where spheres are in view space, how far they reach, and which pixels they can touch: all that lists are made from."""
-
-    x: Float[Array, " particles"]
-    y: Float[Array, " particles"]
-    z: Float[Array, " particles"]
-    reach: Float[Array, " particles"]
-    left: Int[Array, " particles"]
-    right: Int[Array, " particles"]
-    top: Int[Array, " particles"]
-    bottom: Int[Array, " particles"]
-
-
 def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Array, Array]:
     """Pixel row and column of each bundle's upper left corner; `first_row` is the band's first pixel row."""
     bundle = jnp.arange(plan.num_bundles, dtype=jnp.int32)
@@ -121,7 +107,7 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
     return row, column
 
 
-def build_lists(ordered: Ordered | Spheres, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
+def build_lists(ordered: Spheres, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`; of a strided camera, by its nodes."""
     ordered = on_nodes(ordered, camera)
     ranges = bundle_ranges(ordered, plan, first_row)
@@ -130,7 +116,7 @@ def build_lists(ordered: Ordered | Spheres, camera: Camera, plan: ListPlan, firs
     return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
 
 
-def on_nodes(ordered: Ordered | Spheres, camera: Camera) -> Ordered | Spheres:
+def on_nodes(ordered: Spheres, camera: Camera) -> Spheres:
     """With the nodes that a strided camera's rays go through counted instead of pixels."""
     if camera.stride == 1:
         return ordered
@@ -159,7 +145,7 @@ class Ranges:
     bottom: Int[Array, " particles"]
 
 
-def bundle_ranges(ordered: Ordered | Spheres, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
+def bundle_ranges(ordered: Spheres, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
     """Bundle columns and rows, counted from the band's corner, of the pixels that each particle can touch."""
     left, right = ordered.left, ordered.right
     top = jnp.maximum(ordered.top - first_row, 0)
@@ -297,11 +283,11 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
 
 
 def _touched_children(
-    ordered: Ordered | Spheres, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
+    ordered: Spheres, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
 ) -> Int[Array, " pairs"]:
     """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
     rank, tile = pairs
-    sphere = Sphere(*(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach)))
+    sphere = tuple(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
     found = Ranges(*(side[rank] for side in (ranges.left, ranges.right, ranges.top, ranges.bottom)))
     tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
     down, across = (place[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
@@ -309,19 +295,10 @@ def _touched_children(
     return jnp.where(tile < plan.num_tiles, mask, 0)
 
 
-class Sphere(NamedTuple):
-    """Where particles are in view space, and how far they reach."""
-
-    x: Float[Array, " pairs"]
-    y: Float[Array, " pairs"]
-    z: Float[Array, " pairs"]
-    reach: Float[Array, " pairs"]
-
-
 def touched_bundles(
-    sphere: Sphere, ranges: Ranges, camera: Camera, first_row: Any, down: Int[Array, " pairs"], across: Int[Array, " pairs"]
+    sphere: Iterable[Array], ranges: Ranges, camera: Camera, first_row: Any, down: Array, across: Array
 ) -> list[Bool[Array, " pairs"]]:
-    """Whether spheres meet the pyramids of rays of the four bundles of tiles, given by row and column in the band."""
+    """Whether spheres (x, y, z, reach) meet the pyramids of rays of the four bundles of tiles, by row and column in the band."""
     x, y, z, reach = sphere
     columns: list[tuple[Array, tuple[Array, Array]]] = []
     rows: list[tuple[Array, tuple[Array, Array]]] = []

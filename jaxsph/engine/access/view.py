@@ -27,34 +27,43 @@ DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of i
 DEAD_CLASS = 255
 
 
-@dataclasses.dataclass(frozen=True)
-class Columns:
-    """Particles in view space; those that no sample can meet are not `live`, and their numbers are 0.
+@tree()
+class Spheres:
+    """Spheres in view space: all that lists are made from.
 
     Attributes:
         x, y, z: view coordinates, length units.
         reach: the support widened by the rounding of coordinates: what lies outside has weight zero in floating point.
-        scale, size: the particle's strength m = V / H^3, of which the largest is 2^LIFT, folded into its lengths:
-            `size = m^(1/n)` and `scale = size / H`, with n the degree of its kernel.
-        quantity: that is carried; of two, that of colours.
-        live: whether any sample can meet the particle.
         left, right, top, bottom: first and last column, first and last row of pixels whose rays can meet it; none where
             `left > right` or `top > bottom`.
-        extinction_quantity: the second that is carried; None where there is one alone.
     """
 
     x: Float[Array, " particles"]
     y: Float[Array, " particles"]
     z: Float[Array, " particles"]
     reach: Float[Array, " particles"]
-    scale: Float[Array, " particles"]
-    size: Float[Array, " particles"]
-    quantity: Float[Array, " particles"]
-    live: Bool[Array, " particles"]
     left: Int[Array, " particles"]
     right: Int[Array, " particles"]
     top: Int[Array, " particles"]
     bottom: Int[Array, " particles"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns(Spheres):
+    """Of particles; those that no sample can meet are not `live`, and their numbers are 0.
+
+    Attributes:
+        scale, size: the particle's strength m = V / H^3, of which the largest is 2^LIFT, folded into its lengths:
+            `size = m^(1/n)` and `scale = size / H`, with n the degree of its kernel.
+        quantity: that is carried; of two, that of colours.
+        live: whether any sample can meet the particle.
+        extinction_quantity: the second that is carried; None where there is one alone.
+    """
+
+    scale: Float[Array, " particles"]
+    size: Float[Array, " particles"]
+    quantity: Float[Array, " particles"]
+    live: Bool[Array, " particles"]
     extinction_quantity: Float[Array, " particles"] | None = dataclasses.field(default=None, kw_only=True)
 
     @property

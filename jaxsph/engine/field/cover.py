@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import Block, fetch, known_at, particle_at, quantities_of
+from jaxsph.engine.field.fetch import Block, fetch, known_at, particle_at
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
@@ -162,7 +162,7 @@ def _quantities_at(
     """Of particles at places in the windows of slabs, all quantities one after the other, relative to the slabs' references."""
     entry = task.entry
     particles = [particle_at(rank, entry.begin[..., None], entry.length[..., None], at.astype(jnp.int32))[0] for at in places]
-    both = list(zip(quantities_of(ordered), entry.references, strict=True))
+    both = list(zip(ordered.quantities, entry.references, strict=True))
     return [quantity[particle] - reference[:, None] for quantity, reference in both for particle in particles]
 
 

@@ -52,12 +52,6 @@ def particle_at(
     return known_at(rank, jnp.clip(place, 0, rank.shape[0] - 1)), index < length.sum(0)
 
 
-def quantities_of(ordered: Ordered) -> tuple[Float[Array, " particles"], ...]:
-    """All that is summed up of particles besides their weights."""
-    second = ordered.extinction_quantity
-    return (ordered.quantity,) if second is None else (ordered.quantity, second)
-
-
 def fetch(
     ordered: Ordered,
     rank: Int[Array, " pairs"],
@@ -69,7 +63,7 @@ def fetch(
     particle, inside = particle_at(rank, *windows, index)
     x, y, z, scale, size, *quantities = (
         known_at(column, particle)
-        for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *quantities_of(ordered))
+        for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *ordered.quantities)
     )
     relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
     return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)

@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import Block, fetch, quantities_of
+from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
@@ -39,7 +39,7 @@ PARTS = {False: (), True: (8,)}  # of the slabs of a task, that have loops of th
 def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows."""
     zero = jnp.zeros((*task.depth.shape, task.v.shape[1], task.u.shape[1]), task.depth.dtype)
-    sums = sums_of([zero] * (1 + len(quantities_of(ordered))))
+    sums = sums_of([zero] * (1 + len(ordered.quantities)))
     for turns in task.turns(BLOCK, PARTS[task.crowded]):
         add = functools.partial(_add, ordered, rank, turns.task, kernel)
         sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
@@ -73,7 +73,7 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: s
 
 def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """Sums (tasks, samples, 1, rays) at every sample of slabs, from all particles of their windows."""
-    sums = sums_of([jnp.zeros(task.shape, task.depth.dtype)] * (1 + len(quantities_of(ordered))))
+    sums = sums_of([jnp.zeros(task.shape, task.depth.dtype)] * (1 + len(ordered.quantities)))
     for turns in task.turns(BLOCK, PARTS[task.crowded]):
         add = functools.partial(_add_scattered, ordered, rank, turns.task, kernel)
         sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)

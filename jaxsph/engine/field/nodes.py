@@ -20,7 +20,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, coarser_windows
-from jaxsph.engine.field.fetch import Block, fetch, quantities_of
+from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.interpolation import spread_subsamples
 from jaxsph.engine.field.lattice import GAP, REACH, Lattice, Region, node_at
 from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE
@@ -91,7 +91,7 @@ def sum_at_nodes(
         return tuple(old.at[target].set(new, mode="promise_in_bounds") for old, new in zip(sums, found.all, strict=True))
 
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
-    start = (nothing,) * (1 + len(quantities_of(grid.ordered)))
+    start = (nothing,) * (1 + len(grid.ordered.quantities))
     weight, *weighted = (value.reshape(shape) for value in lax.fori_loop(0, (number + chunk - 1) // chunk, march, start))
     spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
     return Lattice(weight, tuple(weighted), references, region, spent)
@@ -144,7 +144,7 @@ def gather_nodes(
         return with_block(sums, [weighed(k) for k in range(BLOCK)])
 
     zero = jnp.zeros((s.shape[0], v.shape[0], u.shape[0], s.shape[1]), s.dtype)
-    start = sums_of([zero] * (1 + len(quantities_of(ordered))))
+    start = sums_of([zero] * (1 + len(ordered.quantities)))
     return lax.fori_loop(0, (total.max() + BLOCK - 1) // BLOCK, add_block, start)
 
 

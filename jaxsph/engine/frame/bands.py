@@ -27,8 +27,7 @@ from jaxsph.engine.frame.refinement import refined
 from jaxsph.engine.planning.measures import measure
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
-from jaxsph.engine.runtime.device_executors import Devices, OnDevices
-from jaxsph.engine.runtime.executors import Clock, Executor
+from jaxsph.engine.runtime.executors import Clock, Devices, Executor, OnDevices
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas

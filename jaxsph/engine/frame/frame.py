@@ -17,9 +17,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
-from jaxsph.engine.access.lists import BundleLists, ListPlan, Spheres
+from jaxsph.engine.access.lists import BundleLists, ListPlan
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.view import Viewed
+from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.adjoint import KEPT, CastMethod
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.field.lattice import Lattice
@@ -47,7 +47,7 @@ from jaxsph.engine.frame.stages import (
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
-from jaxsph.engine.runtime.executors import Clock, Executor, Forecast, HostStage
+from jaxsph.engine.runtime.executors import Executor, HostStage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
@@ -79,48 +79,34 @@ def find_windows(
     return grid_of_lists(ordered, made, camera, first_row, lists, samples, beside)._replace(lists=None)  # type: ignore[arg-type]
 
 
-def _order(run: Clock, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
+def _order(run: Any, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
     if found is None:
-        found = depth_order(viewed, cores_at_hand())
-        run.mark(stage)
+        shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
+        found = run.by_host(stage, lambda: depth_order(viewed, cores_at_hand()), shape)
     ordered: Ordered = run.one(stage, order, (viewed, camera, found), **static)
     return ordered
 
 
-def _order_foreseen(run: Forecast, stage: str, viewed: Viewed, camera: Camera, found: Found, **static: Any) -> Ordered:
-    shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32) if found is None else found
-    ordered: Ordered = run.one(stage, order, (viewed, camera, shape), **static)
-    return ordered
-
-
 def _lists(
-    run: Clock, stage: str, ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **_: Any
+    run: Any, stage: str, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **_: Any
 ) -> BundleLists:
-    sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
+    sides = run.one(stage, find_sides, (spheres, camera, first_row), lists=lists)
     view = (sides.spheres, sides.bundles, camera, first_row)
     touched = run.program(stage, find_touched, (*view, pair_shapes(lists)))
-    made = build_lists_on_host(sides, lambda pairs: touched(*view, pairs), lists, cores_at_hand())
-    run.mark(stage)
+    test, threads = (lambda pairs: touched(*view, pairs)), cores_at_hand()
+    made: BundleLists = run.by_host(stage, lambda: build_lists_on_host(sides, test, lists, threads), list_shapes(lists))
     return made
 
 
-def _lists_foreseen(
-    run: Forecast, stage: str, ordered: Ordered | Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, **_: Any
-) -> BundleLists:
-    sides = run.one(stage, find_sides, (ordered, camera, first_row), lists=lists)
-    run.one(stage, find_touched, (sides.spheres, sides.bundles, camera, first_row, pair_shapes(lists)))
-    return list_shapes(lists)
-
-
-def _grid(lists_of: Any, run: Any, stage: str, *seen: Any, **static: Any) -> BandGrid:
-    made = lists_of(run, stage, *seen, **static)
+def _grid(run: Any, stage: str, *seen: Any, **static: Any) -> BandGrid:
+    made = _lists(run, stage, *seen, **static)
     grid: BandGrid = run.one(stage, find_windows, (seen[0], made, *seen[1:]), **static)
     return grid._replace(lists=made)
 
 
-ORDER = HostStage(order, _order, _order_foreseen)
-LISTS = HostStage(make_lists, _lists, _lists_foreseen)
-MAKE_GRID = HostStage(make_grid, functools.partial(_grid, _lists), functools.partial(_grid, _lists_foreseen))
+ORDER = HostStage(order, _order)
+LISTS = HostStage(make_lists, _lists)
+MAKE_GRID = HostStage(make_grid, _grid)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.layers import Drawn, Layers, OfShards, crop, of_band
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.runtime.device_executors import OnMesh
+from jaxsph.engine.runtime.executors import OnMesh
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

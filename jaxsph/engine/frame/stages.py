@@ -17,10 +17,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents
-from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, Spheres, build_lists, bundle_origins
+from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
-from jaxsph.engine.access.view import Viewed
+from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.cast.march import RayResult

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan, Spheres, nodes_between
-from jaxsph.engine.access.view import Viewed
+from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan, nodes_between
+from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.control.pilot import PilotPlan
@@ -116,7 +116,7 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
 
 
 def pairs_in_view(
-    viewed: Viewed | Spheres, camera: Camera
+    viewed: Spheres, camera: Camera
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
     """Which particles are in view, the pixels that they can touch, and how many tiles and bundles in each row of tiles."""
     sides = [np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom)]

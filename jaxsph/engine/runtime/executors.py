@@ -1,20 +1,27 @@
 """Ways to run the stages of a frame: for real and timed, as a forecast of what will be compiled, or as part of a trace.
 
-A frame is written once, as calls `run.one(stage, function, arguments, **static)` of jitted functions.
+A frame is written once, as calls `run.one(stage, function, arguments, **static)` of jitted functions. Of several devices each
+runs some of the shards of a band, and the first what is not of a shard. Nothing is exchanged but what stages are given: programs
+are those of one device, and so are the bits of an image.
 """
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsph.engine.runtime.programs import PROGRAMS, Programs
+from jaxsph.engine.runtime.programs import PROGRAMS, Programs, shapes_of
 from jaxsph.engine.runtime.tuning import Tuning
+
+Devices = tuple[jax.Device, ...]
 
 
 class HostStage(NamedTuple):
@@ -22,25 +29,29 @@ class HostStage(NamedTuple):
 
     Attributes:
         function: the stage as one jitted function.
-        on_host: the same, given a `Clock` to run programs by.
-        foreseen: the shapes that it returns, given a `Forecast` to have those programs compiled by.
+        on_host: the same, given a `Clock` or a `Forecast` to run programs by, and the host.
     """
 
     function: Any
     on_host: Callable[..., Any]
-    foreseen: Callable[..., Any]
 
 
 class AllShards:
     """Of executors that run every shard of a band."""
 
-    def own(self, of_shards: Sequence[Any]) -> list[Any]:
+    def own(self, of_shards: list[Any]) -> list[Any]:
         """All."""
-        return list(of_shards)
+        return of_shards
 
-    def pooled(self, of_shards: Sequence[Any]) -> list[Any]:
-        """What is given."""
-        return list(of_shards)
+    pooled = own
+
+    def with_host(
+        self: Any, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable
+    ) -> Any:
+        """Done in part by the host where that pays."""
+        if not tuning.sorts_on_host:
+            return self.one(stage, made.function, arguments, tuning=tuning, **static)
+        return made.on_host(self, stage, *arguments, tuning=tuning, **static)
 
 
 class Clock(AllShards):
@@ -52,7 +63,7 @@ class Clock(AllShards):
         self._last = time.perf_counter()
 
     @property
-    def devices(self) -> tuple[jax.Device, ...]:
+    def devices(self) -> Devices:
         """That are chosen; none where all is done wherever arrays are."""
         return ()
 
@@ -88,11 +99,9 @@ class Clock(AllShards):
         self.mark(stage)
         return results
 
-    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
-        """Done in part by the host where that pays."""
-        if not tuning.sorts_on_host:
-            return self.one(stage, made.function, arguments, tuning=tuning, **static)
-        result = jax.block_until_ready(made.on_host(self, stage, *arguments, tuning=tuning, **static))
+    def by_host(self, stage: str, work: Callable[[], Any], shapes: Any) -> Any:
+        """What the host makes, for a stage that is under way."""
+        result = jax.block_until_ready(work())
         self.mark(stage)
         return result
 
@@ -134,11 +143,13 @@ class Forecast(AllShards):
         """The same for several arguments of the same shapes."""
         return [self.one(stage, function, inputs[0], **static)] * len(inputs)
 
-    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable) -> Any:
-        """The shapes that a stage returns; its programs' compilation has begun."""
-        if not tuning.sorts_on_host:
-            return self.one(stage, made.function, arguments, tuning=tuning, **static)
-        return made.foreseen(self, stage, *arguments, tuning=tuning, **static)
+    def by_host(self, stage: str, work: Callable[[], Any], shapes: Any) -> Any:
+        """The shapes of what the host will make."""
+        return shapes
+
+    def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """As `one`."""
+        return self.one(stage, function, arguments, **static)
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, as all are runs of the same program."""
@@ -166,6 +177,100 @@ class Traced(AllShards):
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, with room for all."""
         return 1, most
+
+
+def placed(tree: Any, device: jax.Device) -> Any:
+    """Shapes of arrays, on a device."""
+    place = jax.sharding.SingleDeviceSharding(device)
+
+    def shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place, weak_type=leaf.weak_type)
+
+    return jax.tree.map(shape, shapes_of(tree))
+
+
+class OnDevices(Clock):
+    """Runs compiled programs, the shards of a band in turn on each of some devices."""
+
+    def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
+        super().__init__(programs)
+        self._devices = devices
+        self._copies: dict[tuple[int, jax.Device], tuple[Any, Any]] = {}
+
+    @property
+    def devices(self) -> Devices:
+        """As given."""
+        return self._devices
+
+    def _forecast(self) -> Forecast:
+        return ForecastOnDevices(self.devices, self._programs)
+
+    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        """Each on its device, side by side."""
+        places = [self.devices[nth % len(self.devices)] for nth in range(len(inputs))]
+        pairs = list(zip(inputs, places, strict=True))
+        begun = [self._programs.get(function, placed(arguments, device), static) for arguments, device in pairs]
+        programs = [program.compiled.result() for program in begun]
+        self.mark("compile")
+        results = side_by_side(programs, self._given(pairs))
+        self.mark(stage)
+        return results
+
+    def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
+        """That of the first device."""
+        return super().program(stage, function, placed(arguments, self.devices[0]), **static)
+
+    def _given(self, pairs: list[tuple[tuple[Any, ...], jax.Device]]) -> list[tuple[Any, ...]]:
+        """Arguments where they are wanted; what several calls in a row are given is copied once."""
+        before, self._copies = self._copies, {}
+
+        def put(leaf: Any, device: jax.Device) -> Any:
+            key = id(leaf), device
+            made = self._copies.get(key) or before.get(key) or (leaf, jax.device_put(leaf, device))
+            self._copies[key] = made
+            return made[1]
+
+        return [jax.tree.map(functools.partial(put, device=device), some) for some, device in pairs]
+
+
+class ForecastOnDevices(Forecast):
+    """Has the programs of each device compiled that a frame will need."""
+
+    def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
+        super().__init__(programs)
+        self.devices = devices
+
+    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """The shapes that `function` returns on the first device."""
+        return super().one(stage, function, placed(arguments, self.devices[0]), **static)
+
+    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        """The same for each device that has any."""
+        own = inputs[: len(self.devices)]
+        found = [
+            Forecast.one(self, stage, function, placed(one, device), **static)
+            for one, device in zip(own, self.devices, strict=False)
+        ]
+        return [found[nth % len(found)] for nth in range(len(inputs))]
+
+
+class OnMesh(Traced):
+    """Calls the functions of one shard, as part of a program that each device of a mesh runs for its own (`jax.shard_map`)."""
+
+    def __init__(self, mesh: jax.sharding.Mesh) -> None:
+        self.mesh = mesh
+
+    def own(self, of_shards: list[Any]) -> list[Any]:
+        """That of this device."""
+        nth = lax.axis_index(self.mesh.axis_names)
+        return [jax.tree.map(lambda *values: jnp.stack(values)[nth], *of_shards)]
+
+    def pooled(self, of_shards: list[Any]) -> list[Any]:
+        """Those of all devices."""
+        (own,) = of_shards
+        leaves, structure = jax.tree.flatten(own)
+        found = [lax.all_gather(leaf, self.mesh.axis_names) for leaf in leaves]
+        return [jax.tree.unflatten(structure, [leaf[nth] for leaf in found]) for nth in range(self.mesh.size)]
 
 
 Executor = Clock | Forecast | Traced
