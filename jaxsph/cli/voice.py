@@ -98,11 +98,6 @@ def _prose(line: str) -> None:
         held.append(line)
 
 
-def warn(command: str, text: str) -> None:
-    """A line on stderr that even who wants quiet should see, but not beside the one line of a command that fails."""
-    _prose(f"jaxsph {command}: {text}")
-
-
 def notice(text: str) -> None:
     """A line on stderr, at once where a person waits."""
     if not _VOICE[0].quiet:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import scenes
@@ -29,7 +28,6 @@ CHECK = 64
 """Rows and columns of pixels, about, that are compared with the float64 reference."""
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(groups.Options):
     """Options of the command."""
@@ -40,10 +38,7 @@ class Demo(groups.Options):
     size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default 512x512)")] = (512, 512)
 
 
-DEMO = Demo()
-
-
-def demo(*, asked: Demo = DEMO) -> None:
+def demo(*, asked: Demo = Demo()) -> None:
     """Render a built-in scene and measure its error; write an EXR and a PNG."""
     width, height = asked.size
     outputs = [Path(f"{asked.output}{suffix}") for suffix in IMAGES]

@@ -11,8 +11,6 @@ import platform
 import sys
 from typing import Annotated
 
-from cyclopts import Parameter
-
 from jaxsph.cli import cache as kept
 from jaxsph.cli import voice
 from jaxsph.cli.options import groups
@@ -25,7 +23,6 @@ WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pyn
 SHELLS = ("bash", "zsh", "fish")
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Doctor(groups.Options):
     """Options of the command."""
@@ -33,10 +30,7 @@ class Doctor(groups.Options):
     completion: Annotated[str | None, groups.choice("--completion", SHELLS, groups.OWN, "print what completes commands")] = None
 
 
-OPTIONS = Doctor()
-
-
-def doctor(*, asked: Doctor = OPTIONS) -> None:
+def doctor(*, asked: Doctor = Doctor()) -> None:
     """Say versions, devices and the cache; or print a script by which a shell completes commands, options and names."""
     if asked.completion is not None:
         script = app().generate_completion(shell=asked.completion)  # type: ignore[arg-type]

@@ -9,8 +9,6 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from jaxsph.analysis.explanation.explain import explain as explained
 from jaxsph.analysis.explanation.explain import pixel_of
 from jaxsph.cli import look as cli_look
@@ -23,7 +21,6 @@ from jaxsph.cli.options.settings import as_medium, settings_of
 from jaxsph.cli.voice import say
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Explain(groups.Options, groups.Draft, groups.SurfaceLook, groups.View, groups.Beside, groups.Source):
     """Options of the command."""
@@ -32,15 +29,7 @@ class Explain(groups.Options, groups.Draft, groups.SurfaceLook, groups.View, gro
     output: Annotated[Path | None, output("a figure too: .png, .pdf or .svg")] = None
 
 
-EXPLAIN = Explain()
-
-
-def explain(
-    file: Annotated[str | None, Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")] = None,
-    /,
-    *,
-    asked: Explain = EXPLAIN,
-) -> None:
+def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explain = Explain()) -> None:
     """Say what the error bound of a pixel is made of, and what its ray meets."""
     options = dataclasses.replace(asked, source=file)
     settings = settings_of(options)

@@ -8,8 +8,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from jaxsph import io
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
@@ -24,21 +22,12 @@ from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(groups.Options, groups.Beside, groups.Source):
     """Options of the command."""
 
 
-INFO = Info()
-
-
-def info(
-    file: Annotated[str | None, Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")] = None,
-    /,
-    *,
-    asked: Info = INFO,
-) -> None:
+def info(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Info = Info()) -> None:
     """Say what a file holds, and what `render` would show of it."""
     options = dataclasses.replace(asked, source=file)
     cli_scene.require_something(options)

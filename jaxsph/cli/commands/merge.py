@@ -21,15 +21,11 @@ from jaxsph.model import Settings
 from jaxsph.scale import parts as tiles
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Merge(groups.Options):
     """Options of the command."""
 
     output: Annotated[Path | None, output(".exr or .png")] = None
-
-
-MERGE = Merge()
 
 
 def suffix(options: Any) -> str:
@@ -51,7 +47,7 @@ def check_tile(options: Any, settings: Settings, output: Path) -> None:
 
 def merge(
     *files: Annotated[Path, Parameter(help="all parts of one picture, those of `jaxsph render --tile I/N`, in any order")],
-    asked: Merge = MERGE,
+    asked: Merge = Merge(),
 ) -> None:
     """Read the parts, put them together, and write the picture."""
     if asked.output is None or not files:

@@ -33,7 +33,6 @@ from jaxsph.cli.console import (
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
-from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import refuse_input
@@ -45,7 +44,7 @@ from jaxsph.model.clips.clips import Clip
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.task import FrameFile, FramesError, Source, Still
+from jaxsph.sequence.task import FrameFile, FramesError, Still
 
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
@@ -64,7 +63,6 @@ EVERY = 5.0
 FORMATS = ("png", "exr")
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
@@ -107,12 +105,9 @@ class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, gro
         return max(snapshots, round(SECONDS * self.fps))
 
 
-MOVIE = Movie()
-
-
 def movie(
     *files: Annotated[str, Parameter(help="a file, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")],
-    asked: Movie = MOVIE,
+    asked: Movie = Movie(),
 ) -> None:
     """Say what is shown, render the frames that are not there, and write the movie.
 
@@ -125,7 +120,10 @@ def movie(
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
         sources, camera, shown, center, up = _sequence(options) if len(options.source) > 1 else _still(options)
-        path = _path(options, camera, shown, sized)
+        path = None
+        if options.camera is not None:
+            size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
+            path = io.read_camera_path(options.camera, shown=shown, **size)
         number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = options.number_of_frames(path, number)
         if options.orbit is not None:
@@ -139,7 +137,10 @@ def movie(
             refuse_input(frame)
         pattern = folder / f"{{:05d}}.{options.frame_format}"
         at_once = 1 if client is None else max(len(client.nthreads()), 1)
-        rendered = render_frames(_moments(sources, frames), cameras, settings, client, output=pattern)
+        moments: Any = sources
+        if isinstance(sources, Snapshots):  # evenly in time from the first to the last
+            moments = sources.moments(np.linspace(sources.times[0], sources.times[-1], frames).tolist())
+        rendered = render_frames(moments, cameras, settings, client, output=pattern)
         files_made, failed = _written(rendered, frames, folder, at_once)
         if files_made:
             _write(files_made, frames, options, cameras[0], output)
@@ -212,7 +213,7 @@ def _client_of(options: Any) -> Iterator[Any]:
 
 def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any, Any]:
     """Snapshots, their camera, what there ever is to see, what is asked to be in the middle, and what is up."""
-    sources, camera, shown = snapshots_of(options, gaps=options.gaps, strict=options.strict)
+    sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
     center = None if options.width is None else np.mean(shown.bounds(), 0)
     return sources, camera, shown, center, sources.survey.report.up
 
@@ -230,21 +231,6 @@ def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
     return Still(scene), camera, cli_where.left_by(scene.within, shown), opened.center, opened.up
-
-
-def _moments(sources: Still | Snapshots, frames: int) -> Still | Sequence[Source]:
-    """Of a sequence, evenly in time from the first snapshot to the last."""
-    if isinstance(sources, Still):
-        return sources
-    return sources.moments(np.linspace(sources.times[0], sources.times[-1], frames).tolist())
-
-
-def _path(options: Any, camera: Camera, shown: Bounded, sized: bool) -> CameraPath | None:
-    """Key frames, if there is a file of them, of its own size unless another is asked for."""
-    if options.camera is None:
-        return None
-    size = {"width": camera.width, "height": camera.height} if sized else {}
-    return io.read_camera_path(options.camera, shown=shown, **size)
 
 
 class _OnPath(Sequence[Camera]):

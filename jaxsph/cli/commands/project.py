@@ -55,7 +55,6 @@ ARROWS = 20
 """Across a picture."""
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Project(groups.Options, groups.Selection, groups.View):
     """Options of the command."""
@@ -96,10 +95,7 @@ class Project(groups.Options, groups.Selection, groups.View):
     ] = None
 
 
-PROJECT = Project()
-
-
-def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = PROJECT) -> None:
+def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
     """Project, write, and say.
 
     NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a column

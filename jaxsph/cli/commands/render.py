@@ -6,17 +6,19 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from cyclopts import Parameter
 
 import jaxsph
-from jaxsph.cli import disk, voice
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.commands import merge
 from jaxsph.cli.console import (
@@ -28,25 +30,36 @@ from jaxsph.cli.console import (
     progress,
     refuse,
     require_writable,
+    span,
     tell_if_unseen,
     time_line,
 )
 from jaxsph.cli.options import groups, values, words
 from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, flag, option, output
-from jaxsph.cli.options.settings import SETTINGS, as_medium, devices_of, settings_of, stem_of
+from jaxsph.cli.options.settings import SCENE, SETTINGS, as_medium, devices_of, settings_of, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
+from jaxsph.io.disk.index import index_path
 from jaxsph.io.images.image_files import write_image
 from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
+from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
+from jaxsph.scale.on_disk import OnDisk
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
 WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: after FILE, here)"
+DIGITS = 4
+FRACTIONS = 10**DIGITS
+"""Of a GiB, to which memory is named."""
+OTHERS = ("volume", "points", "iso", "support", "where", "share", "center", "width", "clip")
+"""Options of what cannot be rendered part by part."""
+OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
+SEEN = 0.013, 0.065
+"""99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(groups.Options, groups.Draft, groups.Key, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
@@ -71,15 +84,9 @@ class Render(groups.Options, groups.Draft, groups.Key, groups.SurfaceLook, group
     ] = None
 
 
-RENDER = Render()
-OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
-SEEN = 0.013, 0.065
-"""99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
-
-
 def render(
     *files: Annotated[str, Parameter(help="files of particles or of volumes, or scene:NAME[:particles=N,frame=K]")],
-    asked: Render = RENDER,
+    asked: Render = Render(),
 ) -> None:
     """Make a picture of each source that is given, or of the parts that stand for it."""
     render_each(dataclasses.replace(asked, source=list(files)), _render)
@@ -141,7 +148,7 @@ def _render(options: Any) -> None:
     _check_background(options, output)
     if options.from_disk is not None:
         refuse(options, ("surface", "surface_of"), "is for particles that are in memory; leave out --from-disk")
-        image, camera = disk.render_options(options, settings)
+        image, camera = _from_disk(options, settings)
         image = dataclasses.replace(image, metadata=(*image.metadata, words.header("render", options.words, part=False)))
         _save(image, options, output)
         _say_written(output, image, camera, settings, options)
@@ -174,6 +181,56 @@ def _render(options: Any) -> None:
     _say_written(output, image, camera, settings, options)
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
         tell_if_unseen(options.command, output, [image.color])
+
+
+def _from_disk(options: Any, settings: Settings) -> tuple[Image, Camera]:
+    """The picture of a snapshot that stays on disk, and its camera.
+
+    Raises `UsageError`: options that need all particles at once.
+    """
+    if options.source is None or options.source.startswith(SCENE):
+        raise UsageError("--from-disk is for a snapshot file")
+    refuse(options, OTHERS, "needs all particles at once; leave out --from-disk")
+    if options.box != "file":
+        raise UsageError("--box-size needs all particles at once; leave out --from-disk")
+    if options.progressive or options.screen == "quadtree" or cli_look.has_key(options):
+        raise UsageError("--from-disk renders the image pane by pane; leave out --progressive, --screen and --annotate")
+    with progress("index", " reads") as show:
+        on_disk = OnDisk.open(
+            options.source,
+            options.color_by,
+            kernel=options.kernel,
+            part_type=options.part_type,
+            opacity_by=options.opacity_by or "auto",
+            progress=show,
+        )
+    say("file", f"{options.source}: {len(on_disk):,} particles in {len(on_disk.snapshot.files)} files")
+    if on_disk.snapshot.first.box_size is not None:
+        say("note", "periodic box: supports do not reach across its faces")
+    say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.file):,} runs")
+    name, values = on_disk.quantities[0], np.asarray(on_disk.sample.quantity)[np.asarray(on_disk.sample.valid)]
+    say("quantity", f"{name}, {span(values)} of a sample of {len(values):,}")
+    if len(on_disk.quantities) > 1:
+        say("opacity", f"by {on_disk.quantities[1]}")
+    transfer = cli_look.look(on_disk.sample, options, name)
+    camera = cli_where.camera_of(on_disk, cli_where.upward(options))
+    say("camera", camera_line(camera))
+    started = time.perf_counter()
+    try:
+        with progress("render", " panes") as show:
+            image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * values.GIB), progress=show)
+    except TooLittleMemoryError as error:
+        raise ValueError(_too_little(options, error)) from error
+    say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
+    say("time", time_line(image, time.perf_counter() - started))
+    return image, camera
+
+
+def _too_little(options: Any, error: TooLittleMemoryError) -> str:
+    """In words of the command line: the least memory that works, rounded up to what is written of it."""
+    option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
+    least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS
+    return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
 
 
 def _how_wrong(image: Image, settings: Settings, progressive: bool) -> str:

@@ -35,7 +35,6 @@ from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips.shapes import Plane
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Slice(groups.Options, groups.Key, groups.Look, groups.View, groups.Source):
     """Options of the command."""
@@ -63,10 +62,7 @@ class Slice(groups.Options, groups.Key, groups.Look, groups.View, groups.Source)
     output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")] = None
 
 
-SLICE = Slice()
-
-
-def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = SLICE) -> None:
+def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
     if options.plane is not None and options.view is not None:

@@ -25,7 +25,6 @@ from jaxsph.plot.transfer_figure import transfer_figure
 OF_SOURCES = ("color_by", "save", "colormap", "range", "norm", "preset", "optical_depth", "transfer")
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Transfer(groups.Options, groups.Key, groups.Look, groups.View, groups.Source):
     """Options of the command."""
@@ -39,11 +38,8 @@ class Transfer(groups.Options, groups.Key, groups.Look, groups.View, groups.Sour
     ] = 2000
 
 
-TRANSFER = Transfer()
-
-
 def transfer(
-    file: Annotated[str, Parameter(help="a file, scene:NAME, or a saved function (.json)")], /, *, asked: Transfer = TRANSFER
+    file: Annotated[str, Parameter(help="a file, scene:NAME, or a saved function (.json)")], /, *, asked: Transfer = Transfer()
 ) -> None:
     """Draw a transfer function over what rays meet."""
     options = dataclasses.replace(asked, source=file)

@@ -22,7 +22,6 @@ from jaxsph.cli.console import UsageError, camera_line
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
 from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
-from jaxsph.cli.sequence import snapshots_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
 from jaxsph.io.opening import read_scene as opening
@@ -42,7 +41,6 @@ SECONDS = 1.0
 """How long the end waits for a picture that is being made."""
 
 
-@Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
     """Options of the command."""
@@ -56,14 +54,11 @@ class View(groups.Options, groups.Control, groups.SurfaceLook, groups.View, grou
     no_browser: Annotated[bool, flag("--no-browser", OWN, "print the address alone")] = False
 
 
-VIEW = View()
-
-
 def view(
     *files: Annotated[
         str, Parameter(help="a file of particles or of a volume, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")
     ],
-    asked: View = VIEW,
+    asked: View = View(),
 ) -> bool:
     """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
     if not files:
@@ -79,7 +74,7 @@ def view(
     if len(files) == 1:
         scene, camera, _ = cli_scene.scene_of(options)
     else:
-        snapshots, camera, _ = snapshots_of(options, gaps=True, strict=False)
+        snapshots, camera, _ = cli_scene.snapshots_of(options, gaps=True, strict=False)
         scene, timeline = timeline_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
     settings = _settings(options, scene)
     say("camera", camera_line(camera, options))

@@ -31,6 +31,7 @@ QUALITY = Group("Quality", sort_key=5)
 MEANS = Group("Means", sort_key=6)
 OWN = Group("Of this command", sort_key=0)
 COMMON = Group("Of all commands", sort_key=9)
+FILE = Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")
 NOT_HERE = Parameter(parse=False)
 """An attribute of a group that Python shares which a command does not offer."""
 POINTS = ("type", "radius", "opacity", "color", "colormap")
