@@ -218,7 +218,8 @@ def _from_disk(options: Any, settings: Settings) -> tuple[Image, Camera]:
     started = time.perf_counter()
     try:
         with progress("render", " panes") as show:
-            image = render_from_disk(on_disk, transfer, camera, settings, memory=int(options.from_disk * values.GIB), progress=show)
+            memory = int(options.from_disk * values.GIB)
+            image = render_from_disk(on_disk, transfer, camera, settings, memory=memory, progress=show)
     except TooLittleMemoryError as error:
         raise ValueError(_too_little(options, error)) from error
     say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import Block, fetch
+from jaxsph.engine.field.fetch import fetch
 from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
@@ -67,7 +67,7 @@ def pull_gather(
 
     def fetched(index: Array) -> tuple[Array, list[Array]]:
         particle, block = fetch(ordered, rank, windows, index, entry.references)
-        return particle, [column[:, None] for column in _columns(block)]
+        return particle, [column[:, None] for column in (block.x, block.y, block.z, block.scale, block.size, *block.quantities)]
 
     def add_block(nth: Array, so_far: GatherCotangents) -> GatherCotangents:
         particle, particles = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[:, None])
@@ -83,10 +83,6 @@ def pull_gather(
 def columns_of(table: Float[Array, "particles 8"]) -> dict[str, Float[Array, " particles"]]:
     """Cotangents of particles by name, of rows of them."""
     return {name: table[:, k] for k, name in enumerate(COLUMNS)}
-
-
-def _columns(block: Block) -> tuple[Array, ...]:
-    return block.x, block.y, block.z, block.scale, block.size, *block.quantities
 
 
 def _slabs_last(values: tuple[Array, ...], shape: tuple[int, ...]) -> list[Array]:

@@ -120,7 +120,7 @@ def dealing(devices: Devices, pairs: Sequence[int], least_shards: int, whole: bo
     A band goes to the group that has the fewest pairs so far, the fullest bands first: no group then has more than 4/3 of the
     pairs of the best dealing's fullest group (Graham 1969).
     """
-    number = _num_groups(len(devices), len(pairs), whole)
+    number = 1 if whole else len(devices) if len(pairs) >= MANY * len(devices) else math.gcd(len(devices), len(pairs))
     size = len(devices) // number
     groups = tuple(devices[first : first + size] for first in range(0, len(devices), size))
     load, bands = [0] * number, [[] for _ in range(number)]  # type: ignore[var-annotated]
@@ -130,12 +130,6 @@ def dealing(devices: Devices, pairs: Sequence[int], least_shards: int, whole: bo
         bands[least].append(band)
     shards = -(-least_shards // size) * size
     return Dealing(groups, tuple(tuple(sorted(one)) for one in bands), shards)
-
-
-def _num_groups(devices: int, bands: int, whole: bool) -> int:
-    if whole:
-        return 1
-    return devices if bands >= MANY * devices else math.gcd(devices, bands)
 
 
 def _side_by_side(work: Work, dealt: Dealing, clock: Clock, told: _Told) -> list[Band]:

@@ -219,8 +219,11 @@ class Frame:
         """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
         if isinstance(self.plan.control, PilotPlan):
             return self._ask_pilot(grid, self.plan.control, run)
-        controlled = self.limits is not None and self.plan.control is not None
-        return (self._bound(grid, run) if controlled else self.leave(grid, run)), None
+        if self.limits is None or self.plan.control is None:
+            return self.leave(grid, run), None
+        inputs = [(grid, self.shown, self.limits, nth) for nth in self._each(run)]
+        static = {"shards": self.shards, "control": self.plan.control, **self._cast}
+        return run.each("adapt", decide_by_bounds, inputs, **static), None
 
     def leave(self, grid: Grid, run: Executor, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
@@ -243,11 +246,6 @@ class Frame:
         lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
         return [run.one("adapt", decide_by_pilot, (grid, self.shown, self.limits, lattice), **self._cast)], lattice
-
-    def _bound(self, grid: Grid, run: Executor) -> list[Decided]:
-        inputs = [(grid, self.shown, self.limits, nth) for nth in self._each(run)]
-        static = {"shards": self.shards, "control": self.plan.control, **self._cast}
-        return run.each("adapt", decide_by_bounds, inputs, **static)
 
 
 def _between_samples(media: tuple[Medium, ...], plan: Plan) -> bool:

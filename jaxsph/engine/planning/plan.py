@@ -261,7 +261,8 @@ def common_class(count: int, sizes: tuple[int, ...]) -> int:
 
 def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
     """What suits supports of those sizes."""
-    slab_samples = slab_samples or _choose_slab_samples(measures.depth_extent)
+    if not slab_samples:  # deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter
+        slab_samples = next((size for size in SLAB_SAMPLES if measures.depth_extent <= 6 * size), SLAB_SAMPLES[-1])
     kind = _kind(settings)
     nodes = _choose_nodes(measures.depth_extent, measures.diameter, slab_samples) if kind is PilotPlan else None
     fine = 2 if measures.diameter >= FINE_DIAMETER else 4  # a support covers what is a few times narrower
@@ -412,14 +413,6 @@ def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Sp
     pixels = max((n for n in NODE_PIXELS if diameter >= 2 * MIN_NODES_REACHED[0] * n), default=FINEST.pixels)
     samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * MIN_NODES_REACHED[1] * n), default=FINEST.samples)
     return Spacing(pixels, min(samples, slab_samples))
-
-
-def _choose_slab_samples(depth_extent: float) -> int:
-    """Deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter."""
-    for slab_samples in SLAB_SAMPLES:
-        if depth_extent <= 6 * slab_samples:
-            return slab_samples
-    return SLAB_SAMPLES[-1]
 
 
 def _choose_runs(pairs: int, tuning: Tuning) -> int:

@@ -24,6 +24,16 @@ from jaxsph.engine.runtime.tuning import Tuning
 Devices = tuple[jax.Device, ...]
 
 
+def placed(tree: Any, device: jax.Device) -> Any:
+    """Shapes of arrays, on a device."""
+    place = jax.sharding.SingleDeviceSharding(device)
+
+    def shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place, weak_type=leaf.weak_type)
+
+    return jax.tree.map(shape, shapes_of(tree))
+
+
 class HostStage(NamedTuple):
     """A stage that the host does part of, where a frame is run stage by stage and its tuning says so.
 
@@ -55,25 +65,19 @@ class AllShards:
 
 
 class Clock(AllShards):
-    """Runs compiled programs and tells the seconds of each stage, compile time apart."""
+    """Runs compiled programs, wherever arrays are or on some devices; and tells the seconds of each stage, compile time apart."""
+
+    devices: Devices = ()
 
     def __init__(self, programs: Programs = PROGRAMS) -> None:
         self.seconds = {"plan": 0.0, "compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0, "image": 0.0}
         self._programs = programs
         self._last = time.perf_counter()
 
-    @property
-    def devices(self) -> Devices:
-        """That are chosen; none where all is done wherever arrays are."""
-        return ()
-
     def foresee(self, draw: Callable[[Forecast], Any]) -> None:
         """Have all that `draw` runs compiled side by side."""
-        draw(self._forecast())
+        draw(Forecast(self._programs, self.devices))
         self.mark("compile")
-
-    def _forecast(self) -> Forecast:
-        return Forecast(self._programs)
 
     def mark(self, stage: str) -> None:
         """Book the time since the last mark."""
@@ -130,18 +134,20 @@ def side_by_side(programs: Sequence[Callable[..., Any]], inputs: Sequence[tuple[
 
 
 class Forecast(AllShards):
-    """Has programs compiled side by side that a frame will need, without running any: results are shapes."""
+    """Has programs compiled side by side that a frame will need, on all its devices, without running any: results are shapes."""
 
-    def __init__(self, programs: Programs = PROGRAMS) -> None:
-        self._programs = programs
+    def __init__(self, programs: Programs = PROGRAMS, devices: Devices = ()) -> None:
+        self._programs, self._devices = programs, devices
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """The shapes that `function` returns; its compilation has begun."""
-        return self._programs.get(function, arguments, static).result
+        return self.each(stage, function, [arguments], **static)[0]
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes."""
-        return [self.one(stage, function, inputs[0], **static)] * len(inputs)
+        """The same for several arguments of the same shapes, once for each device that has any."""
+        own = [placed(given, device) for given, device in zip(inputs, self._devices, strict=False)] or inputs[:1]
+        found = [self._programs.get(function, given, static).result for given in own]
+        return [found[nth % len(found)] for nth in range(len(inputs))]
 
     def by_host(self, stage: str, work: Callable[[], Any], shapes: Any) -> Any:
         """The shapes of what the host will make."""
@@ -179,31 +185,13 @@ class Traced(AllShards):
         return 1, most
 
 
-def placed(tree: Any, device: jax.Device) -> Any:
-    """Shapes of arrays, on a device."""
-    place = jax.sharding.SingleDeviceSharding(device)
-
-    def shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place, weak_type=leaf.weak_type)
-
-    return jax.tree.map(shape, shapes_of(tree))
-
-
 class OnDevices(Clock):
     """Runs compiled programs, the shards of a band in turn on each of some devices."""
 
     def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
         super().__init__(programs)
-        self._devices = devices
+        self.devices = devices
         self._copies: dict[tuple[int, jax.Device], tuple[Any, Any]] = {}
-
-    @property
-    def devices(self) -> Devices:
-        """As given."""
-        return self._devices
-
-    def _forecast(self) -> Forecast:
-        return ForecastOnDevices(self.devices, self._programs)
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """Each on its device, side by side."""
@@ -231,27 +219,6 @@ class OnDevices(Clock):
             return made[1]
 
         return [jax.tree.map(functools.partial(put, device=device), some) for some, device in pairs]
-
-
-class ForecastOnDevices(Forecast):
-    """Has the programs of each device compiled that a frame will need."""
-
-    def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
-        super().__init__(programs)
-        self.devices = devices
-
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """The shapes that `function` returns on the first device."""
-        return super().one(stage, function, placed(arguments, self.devices[0]), **static)
-
-    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for each device that has any."""
-        own = inputs[: len(self.devices)]
-        found = [
-            Forecast.one(self, stage, function, placed(one, device), **static)
-            for one, device in zip(own, self.devices, strict=False)
-        ]
-        return [found[nth % len(found)] for nth in range(len(inputs))]
 
 
 class OnMesh(Traced):
