@@ -188,12 +188,6 @@ class Mixed(Beside):
     mix: Annotated[str | None, choice("--mix", MIXES, DATA, "how parts mix colours", show=False)] = None
 
 
-def require_length(text: str) -> None:
-    """Know before a file is read that a width is a length, whatever its unit."""
-    found = MEASURE.fullmatch(text)
-    length_of(text if found is None else float(found[1]), "width", None)
-
-
 _SIZE = option("--size", "WxH", values.size, CAMERA, "pixels (default 512x512)")
 _UP = option("--up", "X,Y,Z", values.place, CAMERA, "upward direction (default: that of the kind of file, else 0,1,0)")
 _CENTER = option("--center", "X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass")
@@ -232,8 +226,9 @@ class View(opening.View):
         if self.width == "all":
             object.__setattr__(self, "width", None)
             object.__setattr__(self, "frame_all", True)
-        if isinstance(self.width, str):
-            require_length(self.width)
+        if isinstance(self.width, str):  # known before a file is read to be a length, whatever its unit
+            found = MEASURE.fullmatch(self.width)
+            length_of(self.width if found is None else float(found[1]), "width", None)
         if self.clip and self.clips is None:
             if any(one.clip is None for one in self.clip) and len(self.clip) > 1:
                 raise ValueError("--clip none stands alone: it shows everything")

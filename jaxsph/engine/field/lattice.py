@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid, unshard
+from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.numerics.trees import tree
 
@@ -98,11 +97,3 @@ def node_at(shape: tuple[int, ...], layer: Array, row: Array, column: Array) -> 
     """Where in memory nodes are, of a lattice of (layers, rows, columns) in all."""
     _, rows, columns = shape
     return ((REACH + layer) * rows + row) * columns + column
-
-
-def sum_shards(shards: tuple[Lattice, ...]) -> Lattice:
-    """The lattice of all bundles, of those whose other bundles' nodes are zero: every `len(shards)`-th bundle each."""
-    values = [(shard.weight, shard.weighted) for shard in shards]
-    weight, weighted = jax.tree.map(lambda first, *others: sum(others, first), *values)
-    evaluations = unshard(tuple(shard.evaluations for shard in shards))
-    return dataclasses.replace(shards[0], weight=weight, weighted=weighted, evaluations=evaluations)

@@ -60,10 +60,6 @@ def disclaimed(image: Image, word: Int[Array, ""]) -> Image:
 
 def faults_of_settings(settings: Settings) -> Int[Array, ""]:
     """Fault bit of traced numbers of `settings` that are out of range; what is known has been checked before."""
-    return faults.raised(faults.BAD_SETTINGS, ~_usable(settings))
-
-
-def _usable(settings: Settings) -> Bool[Array, ""]:
     tolerance, relax, least = settings.tolerance, settings.relax, settings.min_transmittance
     usable = jnp.asarray(True)
     if is_traced(tolerance):
@@ -74,7 +70,7 @@ def _usable(settings: Settings) -> Bool[Array, ""]:
         usable &= (least >= 0) & (least < 0.5)
     if tolerance is not None and is_traced(tolerance, least):
         usable &= ~(jnp.asarray(least) >= tolerance) | (jnp.asarray(least) == 0) | (jnp.asarray(tolerance) == 0)
-    return usable
+    return faults.raised(faults.BAD_SETTINGS, ~usable)
 
 
 def with_ended_rays(image: Image, settings: Settings) -> Image:
@@ -84,13 +80,6 @@ def with_ended_rays(image: Image, settings: Settings) -> Image:
     let_through = lax.stop_gradient(image.transmittance)
     left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
     return dataclasses.replace(image, error_bound=image.error_bound + left_out)
-
-
-def with_unknown(image: Image, plan: Plan, formulas: Formulas) -> Image:
-    """With no error told of surfaces where nothing is compared: infinite."""
-    if not formulas.surfaces or plan.quadtree is not None or plan.cast.doublings:
-        return image
-    return dataclasses.replace(image, error_bound=array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype))
 
 
 def missed(image: Image, settings: Settings) -> Int[Array, ""] | int:
@@ -163,7 +152,9 @@ def _image(drawn: Drawn, settings: Settings, plan: Plan, formulas: Formulas) -> 
     image = Image(*of_pixels, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:
         image = with_ended_rays(image, settings)
-    image = with_unknown(image, plan, formulas)
+    elif formulas.surfaces and not plan.cast.doublings:  # of surfaces where nothing is compared no error is known
+        unknown = array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype)
+        image = dataclasses.replace(image, error_bound=unknown)
     return image, drawn.faults | missed(image, settings)
 
 

@@ -68,15 +68,10 @@ def over(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
 
     mapped = jax.shard_map(of_arrays, mesh=mesh, in_specs=Spec(), out_specs=Spec(mesh.axis_names), check_vma=False)
     # copied, as their tangents may be NumPy's, which `shard_map` takes for constants
-    return placed_on(mapped([jnp.copy(leaves[nth]) for nth in given]), mesh, Spec())
-
-
-def placed_on(tree: Any, mesh: Mesh, where: Spec) -> Any:
-    """Arrays of a trace, on the devices of a mesh."""
-    place = NamedSharding(mesh, where)
+    found, place = mapped([jnp.copy(leaves[nth]) for nth in given]), NamedSharding(mesh, Spec())
     if all(kind is AxisType.Explicit for kind in mesh.axis_types):
-        return jax.reshard(tree, place)
-    return jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), tree)
+        return jax.reshard(found, place)
+    return jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), found)
 
 
 def apart(tree: Any, number: int) -> tuple[Any, ...]:

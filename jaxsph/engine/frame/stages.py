@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents
+from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents, unshard
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
@@ -28,7 +28,7 @@ from jaxsph.engine.control.adapt import ControlPlan, adapt, probe
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.engine.control.ranges import tables_of_parts
-from jaxsph.engine.field.lattice import Lattice, region_of, sum_shards
+from jaxsph.engine.field.lattice import Lattice, region_of
 from jaxsph.engine.field.nodes import sum_at_nodes
 from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.engine.media.shown import RayLimits, Shown
@@ -207,8 +207,10 @@ def sum_shard(
 
 @stage(quickly=True)
 def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
-    """That of a band, of those of its shards."""
-    return sum_shards(lattices)
+    """That of a band, of those of its shards: the nodes of other shards' bundles are zero."""
+    weight, weighted = jax.tree.map(lambda *values: sum(values[1:], values[0]), *((one.weight, one.weighted) for one in lattices))
+    evaluations = unshard(tuple(one.evaluations for one in lattices))
+    return dataclasses.replace(lattices[0], weight=weight, weighted=weighted, evaluations=evaluations)
 
 
 @stage("shards", "cast", "halo", quickly=True)

@@ -114,7 +114,8 @@ class VolumeMedium(Medium):
             for begin, end in zip(first, last, strict=True)
         ]
         places = [jnp.concatenate(pair, 1) for pair in zip(coordinates, ends, strict=True)]
-        quantity = self.grid.interpolate(self.grid.moved_inside(places))
+        nearest = [clamped(at, 0, points - 1) for at, points in zip(places, self.grid.values.shape, strict=True)]
+        quantity = self.grid.interpolate(nearest)
         return AlongSlab(quantity[:, :-2], quantity[:, -2], quantity[:, -1], entry, leaving)
 
     def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, tuple[Array, ...]]:

@@ -15,7 +15,7 @@ from jaxsph.engine.access.grid import SlabExtents
 from jaxsph.engine.access.macrocells import Occupancy
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.trees import tree
 
 ROUNDING = 32  # eps of view coordinates that a computed grid coordinate may be off by: six products, their sums, and the box's
@@ -60,10 +60,6 @@ class VolumeGrid:
         """Whether points lie in the box of the grid."""
         within = [(at >= 0) & (at <= points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
         return within[0] & within[1] & within[2]
-
-    def moved_inside(self, coordinates: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
-        """The nearest points of the box."""
-        return [clamped(at, 0, points - 1) for at, points in zip(coordinates, self.values.shape, strict=True)]
 
     def clipped(
         self, begin: list[Float[Array, "..."]], end: list[Float[Array, "..."]]

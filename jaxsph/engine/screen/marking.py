@@ -72,7 +72,8 @@ def leaves_of(canvas: Canvas, sides: tuple[int, ...], tolerance: Array) -> tuple
     every = lattices(canvas.light, canvas.known, 1, 2 * sides[0])
     for side, (coarser, corners) in zip(sides, itertools.pairwise(every[:-1]), strict=True):
         norm, largest, split, hidden, _ = _of_side(canvas, coarser, corners, side, tolerance)
-        there = _children(there & ~whole, norm.shape) if found else jnp.ones(norm.shape, bool)
+        children = jnp.repeat(jnp.repeat(there & ~whole, 2, 0), 2, 1) if found else jnp.ones(norm.shape, bool)
+        there = children[: norm.shape[0], : norm.shape[1]]
         whole = there & _has_unknown(canvas, norm.shape, side)
         found.append(Leaves(jnp.where(whole, norm, 0), jnp.where(whole, largest, 0), whole & split, whole & hidden, side))
     squares = jnp.stack([(leaves.norm**2).sum() for leaves in found]).sum()
@@ -145,11 +146,6 @@ def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: 
     for split, side in zip(marked, sides, strict=True):
         wanted |= pixels_of_nodes(nodes_of_leaves(split, canvas.shape, side // 2), canvas.shape, side // 2)
     return wanted & ~canvas.known
-
-
-def _children(split: Bool[Array, "rows columns"], shape: tuple[int, ...]) -> Bool[Array, "rows columns"]:
-    """The leaves that split ones were split into."""
-    return jnp.repeat(jnp.repeat(split, 2, 0), 2, 1)[: shape[0], : shape[1]]
 
 
 def _has_unknown(canvas: Canvas, leaves: tuple[int, ...], side: int) -> Bool[Array, "rows columns"]:
