@@ -18,22 +18,19 @@ class Command(NamedTuple):
 
     Attributes:
         kind: by which commands are told apart in the help.
-        module: of `jaxsph.cli.commands`, which has a function of the command's name; imported when it is asked for.
         text: what it does.
         examples: how it is called.
     """
 
     kind: str
-    module: str
     text: str
     examples: tuple[str, ...]
 
 
 PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
-COMMANDS = {
+COMMANDS = {  # each a function of its name, in a module of its name, which is imported when it is asked for
     "render": Command(
         PICTURES,
-        "render",
         "make a picture; what you do not say is chosen, and said",
         (
             "jaxsph render snap_042.hdf5",
@@ -43,52 +40,43 @@ COMMANDS = {
     ),
     "project": Command(
         PICTURES,
-        "project",
         "integrate along rays: column densities, means",
         ("jaxsph project snap_042.hdf5 --view z -o column.png", "jaxsph project snap_042.hdf5 --of Temperature --weight mass"),
     ),
     "slice": Command(
         PICTURES,
-        "slice",
         "show a quantity on a plane",
         ("jaxsph slice snap_042.hdf5 -o slice.png", "jaxsph slice snap_042.hdf5 --plane 0,0,0,1,0,0 --color-by Density"),
     ),
     "movie": Command(
         PICTURES,
-        "movie",
         "make a movie of a file, or of a sequence of files",
         ("jaxsph movie snap_042.hdf5 --orbit 360", "jaxsph movie snap_*.hdf5 -o run.mp4"),
     ),
     "view": Command(
         PICTURES,
-        "view",
         "look around in the browser, and change colours and opacity",
         ("jaxsph view snap_042.hdf5", "jaxsph view scene:mixer --size 800x600 --port 8765 --no-browser"),
     ),
-    "info": Command(DATA, "info", "say what a file holds, and what `render` would show of it", ("jaxsph info snap_042.hdf5",)),
+    "info": Command(DATA, "say what a file holds, and what `render` would show of it", ("jaxsph info snap_042.hdf5",)),
     "transfer": Command(
         DATA,
-        "transfer",
         "draw a transfer function over what rays meet",
         ("jaxsph transfer snap_042.hdf5 --save look.json", "jaxsph transfer look.json"),
     ),
-    "merge": Command(PARTS, "merge", "make a picture of the parts of `render --tile`", ("jaxsph merge part_*.exr -o whole.exr",)),
-    "sweep": Command(QUALITY, "sweep", "measure error against tolerance against time", ("jaxsph sweep scene:mixer -o sweep",)),
+    "merge": Command(PARTS, "make a picture of the parts of `render --tile`", ("jaxsph merge part_*.exr -o whole.exr",)),
+    "sweep": Command(QUALITY, "measure error against tolerance against time", ("jaxsph sweep scene:mixer -o sweep",)),
     "explain": Command(
         QUALITY,
-        "explain",
         "explain a pixel: its error bound by source, and what its ray meets",
         (
             "jaxsph explain snap_042.hdf5 --pixel 120 200",
             "jaxsph explain scene:mixer --pixel 256 256 --integrator segments --tolerance 0.01 -o pixel.png",
         ),
     ),
-    "demo": Command(QUALITY, "demo", "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
+    "demo": Command(QUALITY, "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
     "doctor": Command(
-        SYSTEM,
-        "doctor",
-        "say versions, devices and the cache",
-        ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"'),
+        SYSTEM, "say versions, devices and the cache", ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"')
     ),
 }
 EXIT_CODES = (
@@ -110,7 +98,7 @@ def app() -> App:
         default_parameter=Parameter(negative=""),
     )
     for name, command in COMMANDS.items():
-        path = f"jaxsph.cli.commands.{command.module}:{name}"
+        path = f"jaxsph.cli.commands.{name}:{name}"
         examples = "\n".join(f"  {example}" for example in command.examples)
         text = f"{command.text[0].upper()}{command.text[1:]}."
         made.command(path, name=name, help=text, group=command.kind, help_prologue=f"Examples:\n{examples}")
